@@ -1,0 +1,316 @@
+"""The adjoint of one control step, written by hand: the solver is never differentiated.
+
+A substep solves r(q, v, a, u) = M a + c - tau - J'f = 0, then v' = v + h a and q' = q (+) h v'. With g the adjoint that
+reaches a, lambda = -M^-1 g by two sweeps with the stored factor, and W_i the twist of link i under lambda,
+
+    phi = sum_i W_i . (I_i a_i + v_i x* I_i v_i - f_i) - lambda . tau
+
+is a scalar whose partial derivatives in q, v and u are the answer. Per link, adj_a = I W, adj_w = its net force,
+adj_v = I (W x v) - W x* I v + v x* I W + contacts, and adj_p is the wrench on its pose. Turning a subtree together with
+all its motion leaves phi's inertial part unchanged, so after summing over subtrees only the parent's quantities enter:
+
+    adj_q += adj_p.S - (adj_v - v_p x* adj_a).(S x v_p) - adj_w.(S x W_p) - adj_a.(S x a_p) - lambda dtau/dq
+    adj_v += (adj_v - (v_p + v_i) x* adj_a).S - lambda dtau/dv
+    adj_u -= lambda gear
+
+The adjoint of a rotation lives in the body's tangent space; quaternions appear where gradients enter and leave.
+"""
+
+from functools import lru_cache
+
+import warp as wp
+
+from diffsim.kernels.contact import contact_law
+from diffsim.kernels.forward import MODULE_OPTIONS
+from diffsim.kernels.joint import joint_law
+from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.model import Shape, types
+from diffsim.kernels.spatial import spatial
+
+
+@lru_cache(maxsize=None)
+def backward_kernel(shape: Shape) -> wp.Kernel:
+    t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
+    T, vec3, vec6, mat3, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
+    join, force_at, point_velocity, momentum, exp_quat = (
+        sp.join,
+        sp.force_at,
+        sp.point_velocity,
+        sp.momentum,
+        sp.exp_quat,
+    )
+    load, place_links, sphere_state = kin.load, kin.place_links, kin.sphere_state
+    contact = contact_law(T)
+    touches, contact_force = contact.touches, contact.contact_force
+    contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
+    uses = shape.features
+    passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
+    NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
+    FIRST = 0 if FLOATING else 1
+    VADR, QADR = shape.dof0 - 1, shape.dof0 - 1 + int(FLOATING)
+    NQ, NV, BASE = shape.nq, shape.nv, 7 * (shape.nlink - 1)
+
+    @wp.func
+    def exp_adjoint(r: vec3, g: vec3):
+        """Adjoint of q' = q exp(r): (of r, of q), g and both in the body's tangent space: J_r(r)' g and Exp(r) g."""
+        angle = wp.length(r)
+        k1 = T(0.5) - angle * angle / T(24.0)
+        k2 = T(1.0) / T(6.0) - angle * angle / T(120.0)
+        if angle > T(2e-2):
+            k1 = (T(1.0) - wp.cos(angle)) / (angle * angle)
+            k2 = (angle - wp.sin(angle)) / (angle * angle * angle)
+        rg = wp.cross(r, g)
+        rrg = wp.cross(r, rg)
+        return g + k1 * rg + k2 * rrg, g + (T(1.0) - k2 * angle * angle) * rg + k1 * rrg
+
+    @wp.func
+    def solve_base(ck_f: t.array3, row: int, e: int, b: vec6):
+        """I^-1 b with the base's stored Cholesky factor."""
+        a = b
+        for r in range(6):
+            y = a[r]
+            for k in range(r):
+                y = y - load(ck_f, row, BASE + r * (r + 1) / 2 + k, e) * a[k]
+            a[r] = y * load(ck_f, row, BASE + r * (r + 1) / 2 + r, e)
+        for rr in range(6):
+            r = 5 - rr
+            y = a[r]
+            for k in range(r + 1, 6):
+                y = y - load(ck_f, row, BASE + k * (k + 1) / 2 + r, e) * a[k]
+            a[r] = y * load(ck_f, row, BASE + r * (r + 1) / 2 + r, e)
+        return a
+
+    @wp.func
+    def link_adjoint(m: Model, i: int, R: mat3, x: vec3, V: vec6, A: vec6, W: vec6, height: T, h: T, theta: T):
+        """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position."""
+        com = x + R * m.com[i]
+        inertia = R * m.inertia[i] * wp.transpose(R)
+        Iv = momentum(m.mass[i], com, inertia, V)
+        adj_a = momentum(m.mass[i], com, inertia, W)
+        adj_w = momentum(m.mass[i], com, inertia, A) + wp.spatial_cross_dual(V, Iv)
+        adj_v = momentum(m.mass[i], com, inertia, wp.spatial_cross(W, V))
+        adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
+        adj_p = vec6()
+        if wp.static(CONTACT):
+            for k in range(m.contact_begin[i], m.contact_begin[i + 1]):
+                p, v, depth = sphere_state(m, k, R, x, V, height, h, theta)
+                if touches(m, depth, v):
+                    fc = contact_force(m, depth, v)
+                    f = vec3(fc[0], fc[1], fc[2])
+                    g_f = -point_velocity(W, p)
+                    a = vec3()
+                    hi = T(0.0)
+                    if wp.static(IMPLICIT):
+                        hi = h
+                        a = point_velocity(A, p) + m.gravity
+                        B = contact_resistance(m, depth, fc[3], h, theta)
+                        f = f - wp.cw_mul(B, a)
+                    g = contact_adjoint(m, depth, v, a, g_f, hi, theta)
+                    g_v = vec3(g[0], g[1], g[2])
+                    wrench = force_at(p, f)
+                    G = force_at(p, g_v)
+                    g_p = vec3(T(0.0), T(0.0), g[3])
+                    g_p = g_p + wp.cross(g_v, wp.spatial_top(V)) - wp.cross(f, wp.spatial_top(W))
+                    if wp.static(IMPLICIT):
+                        g_a = -wp.cw_mul(B, g_f)
+                        GA = force_at(p, g_a)
+                        g_p = g_p + wp.cross(g_a, wp.spatial_top(A))
+                        adj_a = adj_a + GA
+                        adj_v = adj_v + wp.spatial_cross_dual(V, GA)
+                        adj_p = adj_p + wp.spatial_cross_dual(A, GA)
+                    adj_w = adj_w - wrench
+                    adj_v = adj_v + G
+                    # The lowest point follows the sphere's centre, not the body's material.
+                    centre = p + vec3(T(0.0), T(0.0), m.contact_radius[k])
+                    adj_p = adj_p + force_at(centre, g_p)
+                    adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
+        return adj_a, adj_v, adj_w, adj_p
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def backward(
+        # model
+        m: Model,
+        h: T,
+        theta: T,
+        substeps: int,
+        first: int,
+        # checkpoint in
+        row0: int,
+        ck_q: t.array3,
+        ck_v: t.array3,
+        ck_a: t.array3,
+        ck_f: t.array3,
+        # the state that came in (its quaternion may not be of unit length), and whether the step was contained
+        qpos: t.array2,
+        nonfinite: wp.array(dtype=wp.bool),
+        # gradient in
+        g_qpos_out: t.array2,
+        g_qvel_out: t.array2,
+        # gradient out
+        g_qpos: t.array2,
+        g_qvel: t.array2,
+        g_ctrl: t.array2,
+        nonfinite_gradients: wp.array(dtype=int),
+    ):
+        e = first + wp.tid()
+        R = wp.zeros(shape=NL, dtype=mat3)
+        x = wp.zeros(shape=NL, dtype=vec3)
+        S = wp.zeros(shape=NL, dtype=vec6)
+        V = wp.zeros(shape=NL, dtype=vec6)
+        A = wp.zeros(shape=NL, dtype=vec6)
+        W = wp.zeros(shape=NL, dtype=vec6)
+        adj_a = wp.zeros(shape=NL, dtype=vec6)
+        adj_v = wp.zeros(shape=NL, dtype=vec6)
+        adj_w = wp.zeros(shape=NL, dtype=vec6)
+        adj_p = wp.zeros(shape=NL, dtype=vec6)
+        q = wp.zeros(shape=NL, dtype=T)
+        qd = wp.zeros(shape=NL, dtype=T)
+        gq = wp.zeros(shape=NL, dtype=T)
+        gqd = wp.zeros(shape=NL, dtype=T)
+        gtau = wp.zeros(shape=NL, dtype=T)
+        lam = wp.zeros(shape=NL, dtype=T)
+        u = wp.zeros(shape=NL, dtype=T)
+        for i in range(1, NL):
+            gq[i] = g_qpos_out[e, QADR + i]
+            gqd[i] = g_qvel_out[e, VADR + i]
+        R[0] = wp.identity(3, dtype=T)
+        if wp.static(FLOATING):
+            # Of a unit quaternion r, turned by the body-frame rotation vector d: dr = r (d, 0) / 2.
+            end = row0 + substeps - 1
+            w = vec3(load(ck_v, end, 3, e), load(ck_v, end, 4, e), load(ck_v, end, 5, e))
+            w = w + h * vec3(load(ck_a, end, 3, e), load(ck_a, end, 4, e), load(ck_a, end, 5, e))
+            rot = quat(load(ck_q, end, 4, e), load(ck_q, end, 5, e), load(ck_q, end, 6, e), load(ck_q, end, 3, e))
+            rot = wp.normalize(rot * exp_quat(h * w))
+            gr4 = quat(g_qpos_out[e, 4], g_qpos_out[e, 5], g_qpos_out[e, 6], g_qpos_out[e, 3])
+            turn = wp.quat_inverse(rot) * gr4
+            gp = vec3(g_qpos_out[e, 0], g_qpos_out[e, 1], g_qpos_out[e, 2])
+            gr = T(0.5) * vec3(turn[0], turn[1], turn[2])
+            gv = vec3(g_qvel_out[e, 0], g_qvel_out[e, 1], g_qvel_out[e, 2])
+            gw = vec3(g_qvel_out[e, 3], g_qvel_out[e, 4], g_qvel_out[e, 5])
+
+        for sub in range(substeps):
+            row = row0 + substeps - 1 - sub
+            # 1. the state of this substep, and the adjoint of the integrator
+            height = m.carrier_height
+            A[0] = join(vec3(), -m.gravity)
+            for i in range(1, NL):
+                q[i] = load(ck_q, row, QADR + i, e)
+                qd[i] = load(ck_v, row, VADR + i, e)
+                gqd[i] = gqd[i] + h * gq[i]
+            if wp.static(FLOATING):
+                rot = quat(load(ck_q, row, 4, e), load(ck_q, row, 5, e), load(ck_q, row, 6, e), load(ck_q, row, 3, e))
+                v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
+                w = vec3(load(ck_v, row, 3, e), load(ck_v, row, 4, e), load(ck_v, row, 5, e))
+                vdot = vec3(load(ck_a, row, 0, e), load(ck_a, row, 1, e), load(ck_a, row, 2, e)) - m.gravity
+                wdot = vec3(load(ck_a, row, 3, e), load(ck_a, row, 4, e), load(ck_a, row, 5, e))
+                g_turn, gr_start = exp_adjoint(h * (w + h * wdot), gr)
+                gv = gv + h * gp
+                gw = gw + h * g_turn
+                gr = gr_start
+                height = height + load(ck_q, row, 2, e)
+                R[0] = wp.quat_to_matrix(rot)
+                V[0] = join(R[0] * w, v)
+                A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v))
+            height = place_links(m, q, R, x, S, height)
+            for i in range(1, NL):
+                p = m.parent[i]
+                V[i] = V[p] + S[i] * qd[i]
+                A[i] = A[p] + S[i] * load(ck_a, row, VADR + i, e) + wp.spatial_cross(V[i], S[i] * qd[i])
+                W[i] = vec6()
+            # 2. lambda = -M^-1 g; on the way in, W holds the articulated bias force
+            W[0] = vec6()
+            for j in range(1, NL):
+                i = NL - j
+                p = m.parent[i]
+                ui = -h * gqd[i] - wp.dot(S[i], W[i])
+                u[i] = ui
+                if wp.static(FLOATING) or p > 0:
+                    Ui = vec6()
+                    for k in range(6):
+                        Ui[k] = load(ck_f, row, 7 * (i - 1) + k, e)
+                    W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, row, 7 * (i - 1) + 6, e))
+            if wp.static(FLOATING):
+                W[0] = solve_base(ck_f, row, e, join(R[0] * gw, gv) * (-h) - W[0])
+            for i in range(1, NL):
+                p = m.parent[i]
+                UW = T(0.0)
+                for k in range(6):
+                    UW = UW + load(ck_f, row, 7 * (i - 1) + k, e) * W[p][k]
+                lam[i] = (u[i] - UW) * load(ck_f, row, 7 * (i - 1) + 6, e)
+                W[i] = W[p] + S[i] * lam[i]
+            # 3. the partial derivatives of phi, link by link
+            for i in range(FIRST, NL):
+                la, lv, lw, lp = link_adjoint(m, i, R[i], x[i], V[i], A[i], W[i], height, h, theta)
+                adj_a[i] = la
+                adj_v[i] = lv
+                adj_w[i] = lw
+                adj_p[i] = lp
+            # 4. inward: sum over subtrees, project on the joints
+            for j in range(1, NL):
+                i = NL - j
+                p = m.parent[i]
+                qi = q[i]
+                if wp.static(IMPLICIT):
+                    qi = qi + theta * h * qd[i]
+                gain = passive_gain(m, i, qi)
+                kv = gain[1]
+                if wp.static(IMPLICIT):
+                    kv = kv + theta * h * gain[0]
+                xv = adj_v[i] - wp.spatial_cross_dual(V[p], adj_a[i])
+                gq[i] = (
+                    gq[i]
+                    + wp.dot(adj_p[i], S[i])
+                    - wp.dot(xv, wp.spatial_cross(S[i], V[p]))
+                    - wp.dot(adj_w[i], wp.spatial_cross(S[i], W[p]))
+                    - wp.dot(adj_a[i], wp.spatial_cross(S[i], A[p]))
+                    - lam[i] * gain[0]
+                )
+                gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[i], adj_a[i]), S[i]) - lam[i] * kv
+                gtau[i] = gtau[i] - lam[i]
+                if wp.static(FLOATING) or p > 0:
+                    adj_a[p] = adj_a[p] + adj_a[i]
+                    adj_v[p] = adj_v[p] + adj_v[i]
+                    adj_w[p] = adj_w[p] + adj_w[i]
+                    adj_p[p] = adj_p[p] + adj_p[i]
+            if wp.static(FLOATING):
+                # The floating base is a translation, whose "parent" twists are pure linear ones, then a ball joint.
+                vp = join(vec3(), v)
+                wl = join(vec3(), wp.spatial_bottom(W[0]))
+                ap = join(vec3(), vdot)
+                xv = adj_v[0] - wp.spatial_cross_dual(vp, adj_a[0])
+                tq = adj_p[0] - wp.spatial_cross_dual(vp, xv)
+                tq = tq - wp.spatial_cross_dual(wl, adj_w[0]) - wp.spatial_cross_dual(ap, adj_a[0])
+                tw = xv - wp.spatial_cross_dual(V[0], adj_a[0])
+                gp = gp + wp.spatial_bottom(adj_p[0])
+                gr = gr + wp.transpose(R[0]) * wp.spatial_top(tq)
+                gv = gv + wp.spatial_bottom(xv)
+                gw = gw + wp.transpose(R[0]) * wp.spatial_top(tw)
+
+        # A gradient that left the finite numbers, or of a contained step, is zero.
+        finite = bool(True)
+        for i in range(1, NL):
+            finite = finite and wp.isfinite(gq[i]) and wp.isfinite(gqd[i]) and wp.isfinite(gtau[i])
+        if wp.static(FLOATING):
+            for k in range(3):
+                finite = finite and wp.isfinite(gp[k]) and wp.isfinite(gr[k]) and wp.isfinite(gv[k]) and wp.isfinite(gw[k])
+        contained = nonfinite[e]
+        if not finite and not contained:
+            nonfinite_gradients[e] = nonfinite_gradients[e] + 1
+        keep = finite and not contained
+        for k in range(NU):
+            g_ctrl[e, k] = wp.where(keep, gtau[m.motor_link[k]] * m.gear[k], T(0.0))
+        for i in range(1, NL):
+            g_qpos[e, QADR + i] = wp.where(keep, gq[i], T(0.0))
+            g_qvel[e, VADR + i] = wp.where(keep, gqd[i], T(0.0))
+        if wp.static(FLOATING):
+            # The forward step normalises the quaternion that comes in, so its gradient is tangent and scales by 1/|r|.
+            r0 = quat(qpos[e, 4], qpos[e, 5], qpos[e, 6], qpos[e, 3])
+            g4 = (wp.normalize(r0) * quat(gr[0], gr[1], gr[2], T(0.0))) * (T(2.0) / wp.length(r0))
+            for k in range(3):
+                g_qpos[e, k] = wp.where(keep, gp[k], T(0.0))
+                g_qpos[e, 4 + k] = wp.where(keep, g4[k], T(0.0))
+                g_qvel[e, k] = wp.where(keep, gv[k], T(0.0))
+                g_qvel[e, 3 + k] = wp.where(keep, gw[k], T(0.0))
+            g_qpos[e, 3] = wp.where(keep, g4[3], T(0.0))
+
+    return backward

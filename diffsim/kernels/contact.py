@@ -1,0 +1,79 @@
+"""The contact law of one sphere on the ground plane, Eq. 3, and its adjoint.
+
+With depth d < 0, point velocity v and its normal component v_z (the rate of d),
+
+    f_n = (k_d v_z - k_n) d,   f_t = -c v_t,   c = min(k_t, mu f_n / |v_t|),
+
+active where f_n > 0, so the ground never pulls: for k_d v_z >= k_n the sphere leaves faster than the ground can push.
+At zero slip c = k_t without a division.
+
+Implicit step: the law is linear in the acceleration a of the point, f = f(d + theta h v_z, v) - B a, with
+B = diag(h c, h c, theta h^2 k_n - h k_d d) and c lagged; the explicit law is B = 0, h_implicit = theta = 0.
+"""
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.model import types
+
+
+@lru_cache(maxsize=None)
+def contact_law(dtype: type) -> SimpleNamespace:
+    t = types(dtype)
+    T, vec3, Model = dtype, t.vec3, t.Model
+    vec4 = wp.types.vector(4, T)
+
+    @wp.func
+    def touches(m: Model, d: T, v: vec3):
+        return d < T(0.0) and m.k_d * v[2] < m.k_n
+
+    @wp.func
+    def friction_viscosity(m: Model, f_n: T, v: vec3):
+        """(c, 1 if sliding else 0)."""
+        speed = wp.sqrt(v[0] * v[0] + v[1] * v[1])
+        c = m.k_t
+        sliding = T(0.0)
+        if m.k_t * speed > m.mu * f_n:
+            c = m.mu * f_n / speed
+            sliding = T(1.0)
+        return c, sliding
+
+    @wp.func
+    def contact_force(m: Model, d: T, v: vec3):
+        """Force on the sphere, and the effective viscosity c of friction, as (f, c)."""
+        f_n = (m.k_d * v[2] - m.k_n) * d
+        c, sliding = friction_viscosity(m, f_n, v)
+        return vec4(-c * v[0], -c * v[1], f_n, c)
+
+    @wp.func
+    def contact_resistance(m: Model, d: T, c: T, h: T, theta: T):
+        """The diagonal of B."""
+        return vec3(h * c, h * c, theta * h * h * m.k_n - h * m.k_d * d)
+
+    @wp.func
+    def contact_adjoint(m: Model, d: T, v: vec3, a: vec3, g: vec3, h: T, theta: T):
+        """(adjoint of v, adjoint of d at the start of the step) of g . f(d + theta h v_z, v, a); h = 0 if explicit."""
+        s = m.k_d * v[2] - m.k_n
+        f_n = s * d
+        c, sliding = friction_viscosity(m, f_n, v)
+        g_n = g[2]
+        gx = -c * g[0]
+        gy = -c * g[1]
+        if sliding > T(0.0):
+            # f_t - h c a_t = -c (v_t + h a_t) with c = mu f_n / |v_t|
+            speed2 = v[0] * v[0] + v[1] * v[1]
+            g_c = -(g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
+            g_n = g_n + g_c * m.mu / wp.sqrt(speed2)
+            gx = gx - g_c * c * v[0] / speed2
+            gy = gy - g_c * c * v[1] / speed2
+        g_d = g_n * s + g[2] * h * m.k_d * a[2]
+        return vec4(gx, gy, g_n * m.k_d * d + theta * h * g_d, g_d)
+
+    return SimpleNamespace(
+        touches=touches,
+        contact_force=contact_force,
+        contact_resistance=contact_resistance,
+        contact_adjoint=contact_adjoint,
+    )

@@ -1,0 +1,261 @@
+"""One control step: all substeps of all environments in one launch, one thread per environment.
+
+A substep is Featherstone's articulated-body algorithm (RBDA, Table 7.1) about the carrier's current position in world
+axes, then semi-implicit Euler with the exact quaternion exponential. Its factorisation (U and 1/d of each joint, the
+base's Cholesky factor) is what the paper caches as the factored mass matrix; the adjoint solves with it again.
+"""
+
+from functools import lru_cache
+
+import warp as wp
+
+from diffsim.kernels.contact import contact_law
+from diffsim.kernels.joint import joint_law
+from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.model import Shape, types
+from diffsim.kernels.spatial import spatial
+
+MODULE_OPTIONS = {"enable_backward": False, "max_unroll": 6}
+
+
+@lru_cache(maxsize=None)
+def forward_kernel(shape: Shape) -> wp.Kernel:
+    t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
+    T, vec3, vec6, mat3, mat6, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model
+    scalars, vec3s, mat3s, vec6s = t.array, wp.array(dtype=vec3), wp.array(dtype=mat3), wp.array(dtype=vec6)
+    join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
+    load, store, place_links, sphere_state = kin.load, kin.store, kin.place_links, kin.sphere_state
+    contact = contact_law(T)
+    touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
+    uses = shape.features
+    joint = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses)
+    passive_force, passive_gain = joint.passive_force, joint.passive_gain
+    NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
+    FIRST = 0 if FLOATING else 1  # the first link with inertia
+    VADR, QADR = shape.dof0 - 1, shape.dof0 - 1 + int(FLOATING)  # link i's joint in qvel and qpos
+    NQ, NV = shape.nq, shape.nv
+
+    @wp.func
+    def link_inertia(m: Model, i: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
+        """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
+        com = x + R * m.com[i]
+        inertia = R * m.inertia[i] * wp.transpose(R)
+        mass = m.mass[i]
+        Ib = mass * wp.skew(com)
+        Ia = inertia - Ib * wp.skew(com)
+        Id = wp.diag(vec3(mass, mass, mass))
+        F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
+        if wp.static(CONTACT):
+            for k in range(m.contact_begin[i], m.contact_begin[i + 1]):
+                p, v, depth = sphere_state(m, k, R, x, V, height, h, theta)
+                if touches(m, depth, v):
+                    fc = contact_force(m, depth, v)
+                    f = vec3(fc[0], fc[1], fc[2])
+                    if wp.static(IMPLICIT):
+                        B = contact_resistance(m, depth, fc[3], h, theta)
+                        f = f - wp.cw_mul(B, m.gravity)
+                        D = wp.diag(B)
+                        PB = wp.skew(p) * D
+                        Ia = Ia - PB * wp.skew(p)
+                        Ib = Ib + PB
+                        Id = Id + D
+                    F = F - force_at(p, f)
+        return Ia, Ib, Id, F
+
+    @wp.func
+    def factor_base(Ia: mat3, Ib: mat3, Id: mat3, b: vec6):
+        """Cholesky factor (reciprocal diagonal) of the base's articulated inertia, and the solution of I a = b."""
+        L = mat6()
+        for r in range(3):
+            for c in range(3):
+                L[r, c] = Ia[r, c]
+                L[3 + r, c] = Ib[c, r]
+                L[3 + r, 3 + c] = Id[r, c]
+        a = vec6()
+        for r in range(6):
+            for c in range(r):
+                s = L[r, c]
+                for k in range(c):
+                    s = s - L[r, k] * L[c, k]
+                L[r, c] = s * L[c, c]
+            s = L[r, r]
+            y = b[r]
+            for k in range(r):
+                s = s - L[r, k] * L[r, k]
+                y = y - L[r, k] * a[k]
+            L[r, r] = T(1.0) / wp.sqrt(s)
+            a[r] = y * L[r, r]
+        for rr in range(6):
+            r = 5 - rr
+            y = a[r]
+            for k in range(r + 1, 6):
+                y = y - L[k, r] * a[k]
+            a[r] = y * L[r, r]
+        return L, a
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def forward(
+        # model
+        m: Model,
+        h: T,
+        theta: T,
+        substeps: int,
+        # state in
+        first: int,
+        qpos: t.array2,
+        qvel: t.array2,
+        ctrl: t.array2,
+        # checkpoint out: rows row0 .. row0 + substeps - 1, written if record is 1
+        record: int,
+        row0: int,
+        ck_q: t.array3,
+        ck_v: t.array3,
+        ck_a: t.array3,
+        ck_f: t.array3,
+        # state out
+        qpos_out: t.array2,
+        qvel_out: t.array2,
+        nonfinite: wp.array(dtype=wp.bool),
+    ):
+        e = first + wp.tid()
+        R = wp.zeros(shape=NL, dtype=mat3)
+        x = wp.zeros(shape=NL, dtype=vec3)
+        S = wp.zeros(shape=NL, dtype=vec6)
+        V = wp.zeros(shape=NL, dtype=vec6)
+        C = wp.zeros(shape=NL, dtype=vec6)
+        A = wp.zeros(shape=NL, dtype=vec6)
+        P = wp.zeros(shape=NL, dtype=vec6)
+        U = wp.zeros(shape=NL, dtype=vec6)
+        Ia = wp.zeros(shape=NL, dtype=mat3)
+        Ib = wp.zeros(shape=NL, dtype=mat3)
+        Id = wp.zeros(shape=NL, dtype=mat3)
+        dinv = wp.zeros(shape=NL, dtype=T)
+        u = wp.zeros(shape=NL, dtype=T)
+        q = wp.zeros(shape=NL, dtype=T)
+        qd = wp.zeros(shape=NL, dtype=T)
+        motor = wp.zeros(shape=NL, dtype=T)
+        for k in range(NU):
+            motor[m.motor_link[k]] = motor[m.motor_link[k]] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+        for i in range(1, NL):
+            q[i] = qpos[e, QADR + i]
+            qd[i] = qvel[e, VADR + i]
+        R[0] = wp.identity(3, dtype=T)
+        if wp.static(FLOATING):
+            pos = vec3(qpos[e, 0], qpos[e, 1], qpos[e, 2])
+            rot = wp.normalize(quat(qpos[e, 4], qpos[e, 5], qpos[e, 6], qpos[e, 3]))
+            v = vec3(qvel[e, 0], qvel[e, 1], qvel[e, 2])
+            w = vec3(qvel[e, 3], qvel[e, 4], qvel[e, 5])
+
+        for sub in range(substeps):
+            row = row0 + sub
+            height = m.carrier_height
+            if wp.static(FLOATING):
+                R[0] = wp.quat_to_matrix(rot)
+                V[0] = join(R[0] * w, v)
+                height = height + pos[2]
+                if record == 1:
+                    for k in range(3):
+                        store(ck_q, row, k, e, pos[k])
+                        store(ck_q, row, 4 + k, e, rot[k])
+                        store(ck_v, row, k, e, v[k])
+                        store(ck_v, row, 3 + k, e, w[k])
+                    store(ck_q, row, 3, e, rot[3])
+            # 1. outward: poses, velocities, velocity products, inertias and bias forces
+            height = place_links(m, q, R, x, S, height)
+            for i in range(1, NL):
+                V[i] = V[m.parent[i]] + S[i] * qd[i]
+                C[i] = wp.spatial_cross(V[i], S[i] * qd[i])
+                if record == 1:
+                    store(ck_q, row, QADR + i, e, q[i])
+                    store(ck_v, row, VADR + i, e, qd[i])
+            for i in range(FIRST, NL):
+                ia, ib, id, force = link_inertia(m, i, R[i], x[i], V[i], height, h, theta)
+                Ia[i] = ia
+                Ib[i] = ib
+                Id[i] = id
+                P[i] = force
+            # 2. inward: articulated inertias
+            for j in range(1, NL):
+                i = NL - j
+                p = m.parent[i]
+                sa = wp.spatial_top(S[i])
+                sl = wp.spatial_bottom(S[i])
+                Ua = Ia[i] * sa + Ib[i] * sl
+                Ul = sa * Ib[i] + Id[i] * sl
+                Ui = join(Ua, Ul)
+                d = wp.dot(S[i], Ui) + m.armature[i]
+                qi = q[i]
+                if wp.static(IMPLICIT):
+                    qi = qi + theta * h * qd[i]
+                    gain = passive_gain(m, i, qi)
+                    d = d - theta * h * h * gain[0] - h * gain[1]
+                di = T(1.0) / d
+                ui = motor[i] + passive_force(m, i, qi, qd[i]) - wp.dot(S[i], P[i])
+                if wp.static(FLOATING) or p > 0:
+                    va = Ua * di
+                    vl = Ul * di
+                    ca = wp.spatial_top(C[i])
+                    cl = wp.spatial_bottom(C[i])
+                    bias = join(Ia[i] * ca + Ib[i] * cl, ca * Ib[i] + Id[i] * cl)
+                    P[p] = P[p] + P[i] + bias + join(va, vl) * (ui - wp.dot(Ui, C[i]))
+                    Ia[p] = Ia[p] + Ia[i] - wp.outer(Ua, va)
+                    Ib[p] = Ib[p] + Ib[i] - wp.outer(Ua, vl)
+                    Id[p] = Id[p] + Id[i] - wp.outer(Ul, vl)
+                U[i] = Ui
+                dinv[i] = di
+                u[i] = ui
+                if record == 1:
+                    for k in range(6):
+                        store(ck_f, row, 7 * (i - 1) + k, e, Ui[k])
+                    store(ck_f, row, 7 * (i - 1) + 6, e, di)
+            # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base) and the new state
+            A[0] = join(vec3(), -m.gravity)
+            if wp.static(FLOATING):
+                L, a0 = factor_base(Ia[0], Ib[0], Id[0], -P[0])
+                A[0] = a0
+                wdot = wp.transpose(R[0]) * wp.spatial_top(a0)
+                vdot = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + m.gravity
+                if record == 1:
+                    n = int(7 * (NL - 1))
+                    for r in range(6):
+                        for c in range(r + 1):
+                            store(ck_f, row, n, e, L[r, c])
+                            n = n + 1
+                    for k in range(3):
+                        store(ck_a, row, k, e, vdot[k])
+                        store(ck_a, row, 3 + k, e, wdot[k])
+                v = v + h * vdot
+                w = w + h * wdot
+                pos = pos + h * v
+                rot = wp.normalize(rot * exp_quat(h * w))
+            for i in range(1, NL):
+                ai = A[m.parent[i]] + C[i]
+                qdd = (u[i] - wp.dot(U[i], ai)) * dinv[i]
+                A[i] = ai + S[i] * qdd
+                qd[i] = qd[i] + h * qdd
+                q[i] = q[i] + h * qd[i]
+                if record == 1:
+                    store(ck_a, row, VADR + i, e, qdd)
+
+        # An environment that left the finite numbers is handed back as it came.
+        finite = bool(True)
+        if wp.static(FLOATING):
+            for k in range(3):
+                finite = finite and wp.isfinite(pos[k]) and wp.isfinite(v[k]) and wp.isfinite(w[k]) and wp.isfinite(rot[k])
+                qpos_out[e, k] = pos[k]
+                qpos_out[e, 4 + k] = rot[k]
+                qvel_out[e, k] = v[k]
+                qvel_out[e, 3 + k] = w[k]
+            qpos_out[e, 3] = rot[3]
+        for i in range(1, NL):
+            finite = finite and wp.isfinite(q[i]) and wp.isfinite(qd[i])
+            qpos_out[e, QADR + i] = q[i]
+            qvel_out[e, VADR + i] = qd[i]
+        nonfinite[e] = not finite
+        if not finite:
+            for k in range(NQ):
+                qpos_out[e, k] = qpos[e, k]
+            for k in range(NV):
+                qvel_out[e, k] = qvel[e, k]
+
+    return forward

@@ -1,0 +1,46 @@
+"""The passive force of a hinge or slide: spring, damper and limit (Eq. 4), with its derivatives beside it."""
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.model import types
+
+
+@lru_cache(maxsize=None)
+def joint_law(dtype: type, stiffness: bool, damping: bool, limit: bool) -> SimpleNamespace:
+    t = types(dtype)
+    T, Model = dtype, t.Model
+    vec2 = wp.types.vector(2, T)
+
+    @wp.func
+    def passive_force(m: Model, i: int, q: T, qd: T):
+        force = T(0.0)
+        if wp.static(stiffness):
+            force = force - m.stiffness[i] * (q - m.spring_ref[i])
+        if wp.static(damping):
+            force = force - m.damping[i] * qd
+        if wp.static(limit):
+            if q < m.lower[i]:
+                force = force + m.k_limit * (m.lower[i] - q) - m.d_limit * qd
+            if q > m.upper[i]:
+                force = force + m.k_limit * (m.upper[i] - q) - m.d_limit * qd
+        return force
+
+    @wp.func
+    def passive_gain(m: Model, i: int, q: T):
+        """(d force / d q, d force / d qd)."""
+        kq = T(0.0)
+        kv = T(0.0)
+        if wp.static(stiffness):
+            kq = kq - m.stiffness[i]
+        if wp.static(damping):
+            kv = kv - m.damping[i]
+        if wp.static(limit):
+            if q < m.lower[i] or q > m.upper[i]:
+                kq = kq - m.k_limit
+                kv = kv - m.d_limit
+        return vec2(kq, kv)
+
+    return SimpleNamespace(passive_force=passive_force, passive_gain=passive_gain)

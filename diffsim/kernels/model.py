@@ -1,0 +1,144 @@
+"""What the kernels read: the shape of a scene, which decides the code, and its numbers, which decide nothing but values."""
+
+import dataclasses
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from diffsim.scene import Scene
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """Everything the generated code depends on. Scenes of equal shape share their compiled kernels."""
+
+    nlink: int
+    nu: int
+    carrier: int
+    features: frozenset[str]
+    dtype: type
+    implicit: bool
+    env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, environment, component]
+
+    @property
+    def floating(self) -> bool:
+        return "floating" in self.features
+
+    @property
+    def dof0(self) -> int:
+        """Degrees of freedom of the base: joint i is dof0 + i - 1 in qvel."""
+        return 6 if self.floating else 0
+
+    @property
+    def nv(self) -> int:
+        return self.dof0 + self.nlink - 1
+
+    @property
+    def nq(self) -> int:
+        return self.nv + int(self.floating)
+
+    @property
+    def nfactor(self) -> int:
+        """Numbers of the cached factorisation: U and 1/d of each joint, the base's packed Cholesky factor."""
+        return 7 * (self.nlink - 1) + (21 if self.floating else 0)
+
+
+def shape_of(scene: Scene, dtype: type, implicit: bool, env_last: bool) -> Shape:
+    return Shape(scene.nlink, scene.nu, scene.carrier, scene.features, dtype, implicit, env_last)
+
+
+@lru_cache(maxsize=None)
+def types(dtype: type) -> SimpleNamespace:
+    """Warp's vector types of one precision, and the struct of a scene's numbers."""
+    vec3, mat3 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
+
+    @wp.struct
+    class Model:
+        parent: wp.array(dtype=int)
+        slide: wp.array(dtype=int)
+        # R = R_parent (turn0 + sin q turn1 + cos q turn2); axis and position in the parent's frame
+        turn0: wp.array(dtype=mat3)
+        turn1: wp.array(dtype=mat3)
+        turn2: wp.array(dtype=mat3)
+        position: wp.array(dtype=vec3)
+        axis: wp.array(dtype=vec3)
+        mass: wp.array(dtype=dtype)
+        com: wp.array(dtype=vec3)
+        inertia: wp.array(dtype=mat3)
+        armature: wp.array(dtype=dtype)
+        damping: wp.array(dtype=dtype)
+        stiffness: wp.array(dtype=dtype)
+        spring_ref: wp.array(dtype=dtype)
+        lower: wp.array(dtype=dtype)
+        upper: wp.array(dtype=dtype)
+        motor_link: wp.array(dtype=int)
+        gear: wp.array(dtype=dtype)
+        motor_bias: wp.array(dtype=dtype)
+        contact_begin: wp.array(dtype=int)  # spheres of link i are contact_begin[i] .. contact_begin[i + 1]
+        contact_position: wp.array(dtype=vec3)
+        contact_radius: wp.array(dtype=dtype)
+        gravity: vec3
+        carrier_height: dtype  # of the carrier's frame over the ground at q = 0 (fixed base), or minus the ground's height
+        k_n: dtype
+        k_d: dtype
+        k_t: dtype
+        mu: dtype
+        k_limit: dtype
+        d_limit: dtype
+
+    return SimpleNamespace(
+        dtype=dtype,
+        vec3=vec3,
+        mat3=mat3,
+        vec6=wp.types.vector(6, dtype),
+        mat6=wp.types.matrix((6, 6), dtype),
+        quat=wp.types.quaternion(dtype),
+        array=wp.array(dtype=dtype),
+        array2=wp.array2d(dtype=dtype),
+        array3=wp.array3d(dtype=dtype),
+        Model=Model,
+    )
+
+
+def model_of(scene: Scene, dtype: type, device: str) -> Any:
+    """The scene's numbers as a Warp struct on a device."""
+    t = types(dtype)
+    model = t.Model()
+
+    def put(values: Any, kind: type) -> wp.array:
+        values = np.ascontiguousarray(values)
+        # Warp gives an empty array no address; one unread element keeps the struct uniform.
+        return wp.array(values if len(values) else np.zeros((1, *values.shape[1:])), dtype=kind, device=device)
+
+    skew = np.cross(np.eye(3)[None], scene.axis[:, None])  # skew(a) b = a x b
+    hinge = np.where(scene.slide, 0.0, 1.0)[:, None, None]
+    r, square = scene.rotation, skew @ skew
+    cos, sin = np.cos(scene.joint_ref)[:, None, None], np.sin(scene.joint_ref)[:, None, None]
+    axis = np.einsum("nij,nj->ni", r, scene.axis)
+    # Rodrigues for the angle q - ref, expanded by the sum formulas: the kernels then need no reference.
+    model.turn0 = put(r @ (np.eye(3) + hinge * square), t.mat3)
+    model.turn1 = put(hinge * (r @ (skew * cos - square * sin)), t.mat3)
+    model.turn2 = put(-hinge * (r @ (square * cos + skew * sin)), t.mat3)
+    position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * axis
+    model.position, model.axis = put(position, t.vec3), put(axis, t.vec3)
+    model.parent, model.slide = put(scene.parent, int), put(scene.slide.astype(np.int32), int)
+    model.com, model.inertia = put(scene.com, t.vec3), put(scene.inertia, t.mat3)
+    for name in ("mass", "armature", "damping", "stiffness", "spring_ref", "lower", "upper", "gear", "motor_bias"):
+        setattr(model, name, put(getattr(scene, name), dtype))
+    model.motor_link = put(scene.motor_link, int)
+    begin = np.searchsorted(scene.contact_link, np.arange(scene.nlink + 1)).astype(np.int32)
+    model.contact_begin = put(begin, int)
+    model.contact_position, model.contact_radius = put(scene.contact_position, t.vec3), put(scene.contact_radius, dtype)
+    model.gravity = t.vec3(*scene.gravity)
+    # Along the chain of slides that ends at the carrier nothing turns, so the offsets add up as they are.
+    frame, height = np.eye(3), 0.0
+    for i in range(1, scene.carrier + 1):
+        height += (frame @ position[i])[2]
+        frame = frame @ r[i]
+    model.carrier_height = dtype(height - scene.ground_height)
+    for name in ("k_n", "k_d", "k_t", "mu", "k_limit", "d_limit"):
+        setattr(model, name, dtype(getattr(scene, name)))
+    return model

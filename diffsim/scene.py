@@ -1,0 +1,416 @@
+"""MJCF -> Scene: the arrays the kernels read, and which features the scene uses."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+# Defaults of the penalty constants, each overridden by <custom><numeric name="..."/></custom> in the MJCF.
+PENALTY_DEFAULTS = {
+    "k_n": 2e4,  # contact stiffness, N/m (Eq. 3)
+    "k_d": 1e3,  # contact damping, N s/m per metre of depth (Eq. 3)
+    "k_t": 1e3,  # friction stiffness, N s/m (Eq. 3)
+    "mu": 0.9,  # coefficient of friction (Eq. 3)
+    "k_limit": 1e3,  # joint limit stiffness, N/m or N m/rad (Eq. 4)
+    "d_limit": 0.0,  # joint limit damping, active beyond the limit only
+}
+
+
+class SceneError(ValueError):
+    """An MJCF file that is missing, broken, or holds something that is not simulated; names the element."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """One articulated robot over a ground plane, in MuJoCo's conventions: SI units, z up.
+
+    Link 0 is the base: the floating body, or the world if the base is fixed. Each further link has one hinge or slide,
+    in MuJoCo's order of degrees of freedom; bodies with several joints become several links, welded bodies are merged.
+    A link's frame sits at its joint's anchor: R = R_parent rotation Rot(axis, q - q_ref).
+
+    Attributes (nlink rows each unless said):
+        parent: index of the parent link (the base's own is 0).
+        slide: True where the joint is a slide, False for a hinge.
+        rotation, position: (3, 3) and (3,), the frame in the parent's frame at the reference configuration.
+        axis: (3,) unit joint axis in the link's frame.
+        joint_ref: q at the reference configuration (MJCF `ref`).
+        mass, com, inertia: kg, (3,) m in the link's frame, (3, 3) kg m^2 about the centre of mass, link axes.
+        armature, damping, stiffness, spring_ref, lower, upper: of the joint; bounds are infinite where unlimited.
+        motor_link, gear, motor_bias: (nu,) joint force = gear * ctrl + motor_bias for ctrl in [-1, 1] over ctrlrange.
+        contact_link, contact_position, contact_radius: (nc,), (nc, 3), (nc,) spheres that may touch the ground.
+        k_n, k_d, k_t, mu, k_limit, d_limit: penalty constants, see PENALTY_DEFAULTS.
+    """
+
+    name: str
+    path: str
+    mj_model: mujoco.MjModel
+    floating: bool
+    nq: int
+    nv: int
+    parent: Index
+    slide: NDArray[np.bool_]
+    rotation: Array
+    position: Array
+    axis: Array
+    joint_ref: Array
+    mass: Array
+    com: Array
+    inertia: Array
+    armature: Array
+    damping: Array
+    stiffness: Array
+    spring_ref: Array
+    lower: Array
+    upper: Array
+    motor_link: Index
+    gear: Array
+    motor_bias: Array
+    contact_link: Index
+    contact_position: Array
+    contact_radius: Array
+    gravity: Array
+    ground_height: float
+    k_n: float
+    k_d: float
+    k_t: float
+    mu: float
+    k_limit: float
+    d_limit: float
+
+    @property
+    def nlink(self) -> int:
+        return len(self.parent)
+
+    @property
+    def nu(self) -> int:
+        return len(self.gear)
+
+    @property
+    def ncontact(self) -> int:
+        return len(self.contact_radius)
+
+    @property
+    def qpos0(self) -> Array:
+        """(nq,) the reference configuration of the MJCF."""
+        return np.array(self.mj_model.qpos0)
+
+    @property
+    def features(self) -> frozenset[str]:
+        """What this scene uses; the generated kernels hold nothing else."""
+        limited = np.isfinite(self.lower) | np.isfinite(self.upper)
+        present = {
+            "floating": self.floating,
+            "hinge": bool((~self.slide[1:]).any()),
+            "slide": bool(self.slide[1:].any()),
+            "contact": self.ncontact > 0,
+            "limit": bool(limited.any()) and (self.k_limit > 0 or self.d_limit > 0),
+            "stiffness": bool(self.stiffness.any()),
+            "damping": bool(self.damping.any()),
+            "motor": self.nu > 0,
+        }
+        return frozenset(name for name, used in present.items() if used)
+
+    @property
+    def carrier(self) -> int:
+        """The link that carries the origin of the spatial vectors, so that no digits are lost far from the world's.
+
+        The floating base itself; of a planar robot the end of the massless slides between it and the world, whose
+        motion is a pure translation of everything else; otherwise the fixed base.
+        """
+        link = 0
+        while not self.floating and link + 1 < self.nlink and self.slide[link + 1]:
+            children = np.flatnonzero(self.parent[1:] == link) + 1
+            if len(children) != 1 or self.mass[link] > 0 or link in self.contact_link:
+                break
+            link += 1
+        return link
+
+    def without(self, *features: str) -> Scene:
+        """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping".
+
+        Raises:
+            ValueError: a feature that cannot be left out.
+        """
+        n = self.nlink
+        gone: dict[str, dict[str, Any]] = {
+            "contact": {
+                "contact_link": np.zeros(0, np.int32),
+                "contact_position": np.zeros((0, 3)),
+                "contact_radius": np.zeros(0),
+            },
+            "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
+            "stiffness": {"stiffness": np.zeros(n)},
+            "damping": {"damping": np.zeros(n)},
+        }
+        changes: dict[str, Any] = {}
+        for feature in features:
+            if feature not in gone:
+                raise ValueError(f"cannot leave out {feature!r}; choose from {', '.join(gone)}")
+            changes |= gone[feature]
+        return dataclasses.replace(self, **changes)
+
+
+def load_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read an MJCF file.
+
+    Raises:
+        SceneError: the file is missing or broken, or holds an element that is not simulated (named in the message).
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise SceneError(f"robot file {str(path)!r} does not exist")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except ValueError as error:
+        raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
+    return _Reader(model, file).scene()
+
+
+class _Reader:
+    """Walks a compiled MjModel once, body by body."""
+
+    def __init__(self, model: mujoco.MjModel, file: Path) -> None:
+        self.m = model
+        self.file = file
+        self.links: list[dict[str, Any]] = []
+        self.joint_link: dict[int, int] = {}
+        # Of each body: its link (-1: fixed to the world of a floating scene) and its pose in the link's frame.
+        self.body: list[tuple[int, Array, Array]] = [(-1, np.eye(3), np.zeros(3))]
+
+    def scene(self) -> Scene:
+        m = self.m
+        self._reject_unsupported()
+        floating = bool(m.njnt and (m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+        if not floating:
+            self._add_link(parent=0)
+            self.body[0] = (0, np.eye(3), np.zeros(3))
+        for body in range(1, m.nbody):
+            self._read_body(body)
+        if not self.links or (len(self.links) == 1 and not floating):
+            raise self._error("no joint: there is nothing to simulate")
+        columns = {key: np.array([link[key] for link in self.links]) for key in self.links[0]}
+        mass = columns.pop("mass")
+        com = columns.pop("moment") / np.where(mass > 0, mass, 1.0)[:, None]
+        about_origin = columns.pop("inertia")
+        inertia = about_origin + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
+        columns["parent"] = columns["parent"].astype(np.int32)
+        return Scene(
+            name=self.file.stem,
+            path=str(self.file),
+            mj_model=m,
+            floating=floating,
+            nq=m.nq,
+            nv=m.nv,
+            mass=mass,
+            com=com,
+            inertia=inertia,
+            gravity=np.array(m.opt.gravity),
+            **columns,
+            **self._motors(),
+            **self._contacts(),
+            **self._penalties(),
+        )
+
+    def _error(self, text: str) -> SceneError:
+        return SceneError(f"{self.file.name}: {text}")
+
+    def _name(self, kind: mujoco.mjtObj, index: int) -> str:
+        label = str(kind).rsplit("mjOBJ_", 1)[-1].lower()
+        return f"{label} {mujoco.mj_id2name(self.m, kind, index) or f'number {index}'!r}"
+
+    def _reject_unsupported(self) -> None:
+        m, obj, joint = self.m, mujoco.mjtObj, mujoco.mjtJoint
+        for kind, count in ((obj.mjOBJ_EQUALITY, m.neq), (obj.mjOBJ_TENDON, m.ntendon), (obj.mjOBJ_PAIR, m.npair)):
+            if count:
+                raise self._error(f"{self._name(kind, 0)}: not simulated")
+        if m.opt.density or m.opt.viscosity or np.any(m.opt.wind):
+            raise self._error("option density, viscosity or wind: a fluid is not simulated")
+        for j in range(m.njnt):
+            name, dof = self._name(obj.mjOBJ_JOINT, j), m.jnt_dofadr[j]
+            if m.jnt_type[j] == joint.mjJNT_BALL:
+                raise self._error(f"{name}: ball joints are not simulated; use free, hinge or slide")
+            if m.dof_frictionloss[dof]:
+                raise self._error(f"{name}: frictionloss is not simulated")
+            if m.jnt_type[j] == joint.mjJNT_FREE:
+                if m.dof_armature[dof] or m.dof_damping[dof] or m.jnt_stiffness[j]:
+                    raise self._error(f"{name}: a free joint has no armature, damping or stiffness here")
+                if j or m.body_parentid[m.jnt_bodyid[j]]:
+                    raise self._error(f"{name}: one free joint, of the first moving body, is simulated")
+
+    def _add_link(self, parent: int, joint: int = -1, **values: Any) -> int:
+        m = self.m
+        dof, adr = (m.jnt_dofadr[joint], m.jnt_qposadr[joint]) if joint >= 0 else (-1, -1)
+        moving = joint >= 0 and m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE
+        limited = moving and m.jnt_limited[joint]
+        link = {
+            "parent": parent,
+            "slide": moving and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE,
+            "rotation": np.eye(3),
+            "position": np.zeros(3),
+            "axis": np.array(m.jnt_axis[joint]) if moving else np.zeros(3),
+            "joint_ref": m.qpos0[adr] if moving else 0.0,
+            "armature": m.dof_armature[dof] if moving else 0.0,
+            "damping": m.dof_damping[dof] if moving else 0.0,
+            "stiffness": m.jnt_stiffness[joint] if moving else 0.0,
+            "spring_ref": m.qpos_spring[adr] if moving else 0.0,
+            "lower": m.jnt_range[joint, 0] if limited else -np.inf,
+            "upper": m.jnt_range[joint, 1] if limited else np.inf,
+            "mass": 0.0,
+            "moment": np.zeros(3),
+            "inertia": np.zeros((3, 3)),
+        }
+        self.links.append(link | values)
+        self.joint_link[joint] = len(self.links) - 1
+        return len(self.links) - 1
+
+    def _read_body(self, body: int) -> None:
+        m = self.m
+        link, parent_rotation, parent_position = self.body[m.body_parentid[body]]
+        rotation = parent_rotation @ _matrix(m.body_quat[body])
+        position = parent_position + parent_rotation @ m.body_pos[body]
+        joints = range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])
+        if joints and m.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE:
+            link = self._add_link(parent=0, joint=joints[0])
+            rotation, position = np.eye(3), np.zeros(3)
+        else:
+            if joints and link < 0:
+                raise self._error(f"{self._name(mujoco.mjtObj.mjOBJ_BODY, body)}: a second base beside a floating one")
+            for joint in joints:
+                anchor = np.array(m.jnt_pos[joint])
+                link = self._add_link(
+                    parent=link, joint=joint, rotation=rotation, position=position + rotation @ anchor
+                )
+                rotation, position = np.eye(3), -anchor
+        self.body.append((link, rotation, position))
+        if link >= 0:
+            self._add_inertia(self.links[link], body, rotation, position)
+
+    def _add_inertia(self, link: dict[str, Any], body: int, rotation: Array, position: Array) -> None:
+        m = self.m
+        mass = m.body_mass[body]
+        principal = rotation @ _matrix(m.body_iquat[body])
+        com = position + rotation @ m.body_ipos[body]
+        link["mass"] += mass
+        link["moment"] = link["moment"] + mass * com
+        about_com = principal @ np.diag(m.body_inertia[body]) @ principal.T
+        link["inertia"] = link["inertia"] + about_com - mass * _skew(com) @ _skew(com)
+
+    def _motors(self) -> dict[str, Any]:
+        m = self.m
+        link, gear, bias = [], [], []
+        for a in range(m.nu):
+            name = self._name(mujoco.mjtObj.mjOBJ_ACTUATOR, a)
+            joint = m.actuator_trnid[a, 0]
+            if (
+                m.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT
+                or m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+                or m.actuator_dyntype[a] != mujoco.mjtDyn.mjDYN_NONE
+                or m.actuator_gaintype[a] != mujoco.mjtGain.mjGAIN_FIXED
+                or m.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_NONE
+                or m.actuator_forcelimited[a]
+            ):
+                raise self._error(f"{name}: only motors on a hinge or slide, without a force range, are simulated")
+            low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
+            scale = m.actuator_gear[a, 0] * m.actuator_gainprm[a, 0]
+            link.append(self.joint_link[joint])
+            gear.append(scale * (high - low) / 2)
+            bias.append(scale * (high + low) / 2)
+        return {"motor_link": np.array(link, np.int32), "gear": np.array(gear), "motor_bias": np.array(bias)}
+
+    def _contacts(self) -> dict[str, Any]:
+        m = self.m
+        data = mujoco.MjData(m)
+        mujoco.mj_kinematics(m, data)
+        static = [g for g in range(m.ngeom) if m.body_weldid[m.geom_bodyid[g]] == 0]
+        moving = [g for g in range(m.ngeom) if m.body_weldid[m.geom_bodyid[g]] != 0]
+        touched = [s for s in static if any(self._collide(s, g) for g in moving)]
+        spheres: list[tuple[int, Array, float]] = []
+        height = 0.0
+        for plane in touched:
+            name = self._name(mujoco.mjtObj.mjOBJ_GEOM, plane)
+            if m.geom_type[plane] != mujoco.mjtGeom.mjGEOM_PLANE or len(touched) > 1:
+                raise self._error(f"{name}: contact is simulated with one ground plane only")
+            if not np.allclose(data.geom_xmat[plane].reshape(3, 3)[:, 2], [0.0, 0.0, 1.0]):
+                raise self._error(f"{name}: the ground plane must be horizontal")
+            height = float(data.geom_xpos[plane, 2])
+            for g in moving:
+                if self._collide(plane, g):
+                    spheres += self._spheres(g)
+        spheres = self._outer_spheres(spheres)
+        return {
+            "contact_link": np.array([s[0] for s in spheres], np.int32),
+            "contact_position": np.array([s[1] for s in spheres]).reshape(-1, 3),
+            "contact_radius": np.array([s[2] for s in spheres]),
+            "ground_height": height,
+        }
+
+    def _collide(self, a: int, b: int) -> bool:
+        m = self.m
+        masks = m.geom_contype[a] & m.geom_conaffinity[b] or m.geom_contype[b] & m.geom_conaffinity[a]
+        low, high = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
+        return bool(masks) and (int(low) << 16) + int(high) not in m.exclude_signature
+
+    def _spheres(self, geom: int) -> list[tuple[int, Array, float]]:
+        m, kind = self.m, mujoco.mjtGeom
+        link, rotation, position = self.body[m.geom_bodyid[geom]]
+        axes = rotation @ _matrix(m.geom_quat[geom])
+        centre = position + rotation @ m.geom_pos[geom]
+        size = m.geom_size[geom]
+        if m.geom_type[geom] == kind.mjGEOM_SPHERE:
+            return [(link, centre, size[0])]
+        if m.geom_type[geom] == kind.mjGEOM_CAPSULE:
+            return [(link, centre + s * size[1] * axes[:, 2], size[0]) for s in (-1.0, 1.0)]
+        if m.geom_type[geom] == kind.mjGEOM_BOX:
+            signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
+            return [(link, centre + axes @ (s * size), 0.0) for s in signs]
+        raise self._error(
+            f"{self._name(mujoco.mjtObj.mjOBJ_GEOM, geom)}: only spheres, capsules and boxes may touch the ground; "
+            "set contype and conaffinity to 0 if it is only drawn"
+        )
+
+    def _outer_spheres(self, spheres: list[tuple[int, Array, float]]) -> list[tuple[int, Array, float]]:
+        """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""
+
+        def seen_from_parent(link: int, centre: Array) -> tuple[int, Array]:
+            # A centre on the hinge's anchor does not move in the parent's frame.
+            while link > 0 and not self.links[link]["slide"] and np.linalg.norm(centre) < 1e-6:
+                centre, link = self.links[link]["position"], self.links[link]["parent"]
+            return link, centre
+
+        kept: list[tuple[int, Array, float]] = []
+        for link, centre, radius in sorted(spheres, key=lambda s: -s[2]):
+            home, place = seen_from_parent(link, centre)
+            others = [(*seen_from_parent(sphere[0], sphere[1]), sphere[2]) for sphere in kept]
+            if not any(o == home and np.linalg.norm(p - place) + radius <= r + 1e-6 for o, p, r in others):
+                kept.append((link, centre, radius))
+        return sorted(kept, key=lambda s: s[0])
+
+    def _penalties(self) -> dict[str, float]:
+        m = self.m
+        values = dict(PENALTY_DEFAULTS)
+        for n in range(m.nnumeric):
+            name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_NUMERIC, n)
+            if name in values:
+                values[name] = float(m.numeric_data[m.numeric_adr[n]])
+                if not (np.isfinite(values[name]) and values[name] >= 0):
+                    raise self._error(f"numeric {name!r} is {values[name]}, must be finite and not negative")
+        return values
+
+
+def _matrix(quaternion: Array) -> Array:
+    result = np.zeros(9)
+    mujoco.mju_quat2Mat(result, np.asarray(quaternion, float))
+    return result.reshape(3, 3)
+
+
+def _skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

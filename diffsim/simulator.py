@@ -1,0 +1,268 @@
+"""Simulator: the buffers of a batch of environments, and the launches of its kernels."""
+
+from __future__ import annotations
+
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+import warp as wp
+
+from diffsim.bridge import ControlStep
+from diffsim.kernels.backward import backward_kernel
+from diffsim.kernels.forward import forward_kernel
+from diffsim.kernels.model import model_of, shape_of
+from diffsim.scene import Scene
+
+INTEGRATORS = ("semi_implicit", "implicit")
+WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
+# Below this many link-substeps in a launch (about 50 us of work), waking a thread costs more than it saves.
+MIN_WORK_PER_THREAD = 400
+
+
+class Simulator:
+    """A batch of independent copies of one scene, stepped by control steps of equal length.
+
+    Holds the checkpoints of up to `horizon` differentiable control steps in a ring: a backward pass must come before
+    its steps are overwritten (asserted). Steps that need no gradient store nothing.
+
+    Args:
+        scene: what is simulated.
+        num_envs: number of copies N.
+        control_dt: seconds of one control step.
+        substeps: integration steps in one control step.
+        horizon: differentiable control steps that can be alive at once.
+        integrator: "semi_implicit" (Euler) or "implicit" (linearly implicit in damping, friction and, scaled by theta,
+            stiffness; docs/physics.md).
+        theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); used by "implicit" only.
+        device: "cpu" or a CUDA device.
+        dtype: torch.float32 or torch.float64.
+        threads: CPU threads of the kernels; default all cores.
+
+    Raises:
+        ValueError: an argument out of range, with what is allowed.
+
+    Attributes:
+        nonfinite: (N,) bool, environments whose last step left the finite numbers. Their state is returned as it was
+            before that step and its gradient is zero; other environments are not touched.
+        nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
+        seconds: wall seconds spent in kernels on the CPU, {"forward": ..., "backward": ...}.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int,
+        control_dt: float = 1 / 60,
+        substeps: int = 16,
+        horizon: int = 1,
+        integrator: str = "semi_implicit",
+        theta: float = 0.0,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float32,
+        threads: int | None = None,
+    ) -> None:
+        for name, value in (("num_envs", num_envs), ("substeps", substeps), ("horizon", horizon), ("threads", threads)):
+            if value is not None and (not isinstance(value, int) or value < 1):
+                raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
+        if not control_dt > 0:
+            raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
+        if integrator not in INTEGRATORS:
+            raise ValueError(f"unknown integrator {integrator!r}; choose from {', '.join(INTEGRATORS)}")
+        if not 0 <= theta <= 1:
+            raise ValueError(f"theta is {theta!r}, must lie in [0, 1]")
+        if dtype not in WARP_DTYPE:
+            raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
+        self.device = check_device(device)
+        self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
+        self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
+        self.control_dt, self.substeps, self.horizon = control_dt, substeps, horizon
+        self.integrator, self.theta = integrator, theta if integrator == "implicit" else 0.0
+        self.seconds = {"forward": 0.0, "backward": 0.0}
+
+        real, cuda = WARP_DTYPE[dtype], self.device.type == "cuda"
+        shape = shape_of(scene, real, integrator == "implicit", env_last=cuda)
+        self._kernels = {"forward": forward_kernel(shape), "backward": backward_kernel(shape)}
+        self._model = model_of(scene, real, str(self.device))
+        self._commands: dict[tuple[str, int, int], wp.Launch] = {}
+        # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
+        self._block_dim = 8 if num_envs <= 256 else 32
+        self._chunks = self._split(threads, shape.nlink)
+        self._pool = ThreadPoolExecutor(len(self._chunks) - 1) if len(self._chunks) > 1 else None
+
+        def tensor(*size: int, of: torch.dtype = dtype) -> torch.Tensor:
+            return torch.zeros(size, dtype=of, device=self.device)
+
+        n, slots = num_envs, horizon + 1  # the last slot serves steps that record nothing
+        self._in = [tensor(slots, n, k) for k in (self.nq, self.nv, self.nu)]
+        self._out = [tensor(n, k) for k in (self.nq, self.nv)]
+        self._nonfinite = tensor(slots, n, of=torch.bool)
+        self._g_in = [tensor(n, k) for k in (self.nq, self.nv)]
+        self._g_out = [tensor(n, k) for k in (self.nq, self.nv, self.nu)]
+        self._checkpoint: list[wp.array] | None = None
+        self._nfactor = shape.nfactor
+        self._layout = (2, n) if cuda else (1, n)
+        self._slot, self._last = 0, horizon
+        self._version = [0] * horizon
+        self.nonfinite_gradients = tensor(n, of=torch.int32)
+
+    @property
+    def nonfinite(self) -> torch.Tensor:
+        return self._nonfinite[self._last]
+
+    def step(
+        self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Advance all environments by one control step, differentiable in all three arguments.
+
+        Args:
+            qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, normalised here.
+            qvel: (N, nv) MuJoCo's generalised velocities; of a free joint the linear one in the world's frame, the
+                angular one in the body's.
+            ctrl: (N, nu) one number per motor, [-1, 1] over its control range, constant over the step, not clipped.
+
+        Returns:
+            qpos, qvel after the step, of the same shapes.
+
+        Raises:
+            ValueError: an argument of the wrong shape, dtype or device.
+        """
+        for name, value, width in (("qpos", qpos, self.nq), ("qvel", qvel, self.nv), ("ctrl", ctrl, self.nu)):
+            self.check_tensor(name, value, width)
+        recorded = torch.is_grad_enabled() and (qpos.requires_grad or qvel.requires_grad or ctrl.requires_grad)
+        if not recorded:
+            return self._forward(self.horizon, qpos, qvel, ctrl)
+        slot = self._slot
+        self._slot = (slot + 1) % self.horizon
+        return ControlStep.apply(self, slot, qpos, qvel, ctrl)
+
+    def rewind(self) -> None:
+        """Let the next differentiable step use the first checkpoint: the start of a new window."""
+        self._slot = 0
+
+    def check_tensor(self, name: str, value: torch.Tensor, width: int) -> None:
+        """Raise ValueError unless value is a (num_envs, width) tensor of the simulator's dtype on its device."""
+        if not isinstance(value, torch.Tensor):
+            raise ValueError(f"{name} is a {type(value).__name__}, must be a torch.Tensor")
+        wanted = (self.num_envs, width)
+        if tuple(value.shape) != wanted:
+            raise ValueError(f"{name} has shape {tuple(value.shape)}, must be {wanted} (environments, numbers each)")
+        if value.dtype != self.dtype:
+            raise ValueError(f"{name} has dtype {value.dtype}, must be {self.dtype}")
+        if value.device != self.device:
+            raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
+
+    # -- called by bridge.ControlStep ---------------------------------------------------------------------------------
+
+    def _forward(self, slot: int, *state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        for buffer, value in zip(self._in, state, strict=True):
+            buffer[slot].copy_(value.detach())
+        self._last = slot
+        if slot < self.horizon:
+            self._version[slot] += 1
+        self._launch("forward", slot)
+        return self._out[0].clone(), self._out[1].clone()
+
+    def _backward(self, slot: int, version: int, g_qpos: torch.Tensor, g_qvel: torch.Tensor) -> list[torch.Tensor]:
+        if self._version[slot] != version:
+            raise RuntimeError(
+                f"backward through a control step whose checkpoint was overwritten: at most {self.horizon} "
+                "differentiable steps can be alive; build the simulator with a larger horizon"
+            )
+        self._g_in[0].copy_(g_qpos)
+        self._g_in[1].copy_(g_qvel)
+        self._launch("backward", slot)
+        return [g.clone() for g in self._g_out]
+
+    # -- launches -----------------------------------------------------------------------------------------------------
+
+    def _split(self, threads: int | None, nlink: int) -> list[tuple[int, int]]:
+        """(first environment, count) of each thread's share."""
+        n = self.num_envs
+        if self.device.type == "cuda":
+            return [(0, n)]
+        wanted = threads or min(available_cores(), max(1, n * self.substeps * nlink // MIN_WORK_PER_THREAD))
+        bounds = [n * k // min(wanted, n) for k in range(min(wanted, n) + 1)]
+        return [(a, b - a) for a, b in zip(bounds, bounds[1:], strict=False)]
+
+    def _launch(self, kernel: str, slot: int) -> None:
+        if self.device.type == "cuda":
+            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+            with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
+                self._command(kernel, slot, 0).launch()
+            return
+        start = time.perf_counter()
+        commands = [self._command(kernel, slot, k) for k in range(len(self._chunks))]
+        # Warp runs a CPU kernel on the calling thread and releases the interpreter lock meanwhile.
+        waiting = [self._pool.submit(c.launch) for c in commands[1:]] if self._pool else []
+        commands[0].launch()
+        for future in waiting:
+            future.result()
+        self.seconds[kernel] += time.perf_counter() - start
+
+    def _command(self, kernel: str, slot: int, chunk: int) -> wp.Launch:
+        """A launch with its arguments packed once: packing costs more than a small kernel."""
+        key = (kernel, slot, chunk)
+        if key not in self._commands:
+            first, count = self._chunks[chunk]
+            self._commands[key] = wp.launch(
+                self._kernels[kernel],
+                dim=count,
+                inputs=self._arguments(kernel, slot, first),
+                device=str(self.device),
+                block_dim=self._block_dim,
+                record_cmd=True,
+            )
+        return self._commands[key]
+
+    def _arguments(self, kernel: str, slot: int, first: int) -> list[Any]:
+        record = slot < self.horizon
+        if self._checkpoint is None and record:
+            self._checkpoint = self._rows(self.horizon * self.substeps)
+        rows = self._checkpoint if record and self._checkpoint else self._rows(0)
+        row0 = slot * self.substeps if record else 0
+        real = WARP_DTYPE[self.dtype]
+        head = [self._model, real(self.control_dt / self.substeps), real(self.theta), self.substeps, first]
+        state = [wp.from_torch(buffer[slot]) for buffer in self._in]
+        nonfinite = wp.from_torch(self._nonfinite[slot])
+        if kernel == "forward":
+            out = [wp.from_torch(buffer) for buffer in self._out]
+            return [*head, *state, int(record), row0, *rows, *out, nonfinite]
+        gradients = [wp.from_torch(buffer) for buffer in (*self._g_in, *self._g_out, self.nonfinite_gradients)]
+        return [*head, row0, *rows, state[0], nonfinite, *gradients]
+
+    def _rows(self, count: int) -> list[wp.array]:
+        """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
+        where, n = self._layout
+        widths = (self.nq, self.nv, self.nv, self._nfactor)
+        sizes = [(count, k, n) if where == 2 else (count, n, k) for k in widths]
+        return [wp.zeros(size, dtype=WARP_DTYPE[self.dtype], device=str(self.device)) for size in sizes]
+
+
+def available_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_device(device: str | torch.device) -> torch.device:
+    """The device, with an index if it is a GPU.
+
+    Raises:
+        ValueError: neither the CPU nor a CUDA device that is there.
+    """
+    try:
+        result = torch.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda") from error
+    if result.type not in ("cpu", "cuda"):
+        raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda")
+    if result.type == "cuda":
+        if not torch.cuda.is_available():
+            raise ValueError(f"device {str(device)!r} asked for, but PyTorch sees no CUDA GPU here; choose cpu")
+        count = torch.cuda.device_count()
+        if (result.index or 0) >= count:
+            raise ValueError(f"device {str(device)!r} asked for, but there are {count} CUDA GPUs")
+        result = torch.device("cuda", torch.cuda.current_device() if result.index is None else result.index)
+    return result

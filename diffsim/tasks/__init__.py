@@ -1,0 +1,14 @@
+"""The tasks, one file each."""
+
+from __future__ import annotations
+
+from .ant import Ant
+from .base import Task
+from .cartpole import CartPole
+from .half_cheetah import HalfCheetah
+from .hopper import Hopper
+from .humanoid import Humanoid
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid)}
+
+__all__ = ["TASKS", "Task"]

@@ -1,0 +1,65 @@
+"""What a task is: where its robot is, how an episode starts, what is observed and rewarded, and when it ends.
+
+The methods are differentiable torch on batches of any leading shape; they make no tensor from Python data and never
+wait for the device, so they can be captured into a CUDA graph. Equations and tables are those of the SHAC paper (Xu et
+al. 2022, appendix A.3); what it leaves open (start states, substeps) follows its public benchmark. World frame, z up.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+
+class Task:
+    """A task. Subclasses fill in the attributes and the methods `observe` and `reward`.
+
+    An episode starts uniformly in start +- spread / 2, where both list qpos, then qvel.
+    """
+
+    name: ClassVar[str]
+    asset: ClassVar[str]  # MJCF file in diffsim/assets
+    substeps: ClassVar[int]  # simulation steps per control step
+    obs_dim: ClassVar[int]
+    num_random: ClassVar[int]  # random numbers per reset
+    episode_length: ClassVar[int] = 1000  # control steps
+    control_dt: ClassVar[float] = 1 / 60  # s
+    min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
+    start: tuple[float, ...]
+    spread: tuple[float, ...]
+
+    def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
+        self._start = torch.tensor(self.start, device=device, dtype=dtype)
+        self._spread = torch.tensor(self.spread, device=device, dtype=dtype)
+
+    def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
+        """Start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).
+
+        rand = 0.5 everywhere gives the unperturbed start.
+        """
+        qpos, qvel = torch.addcmul(self._start, rand - 0.5, self._spread).chunk(2, dim=-1)
+        return qpos, qvel
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        """Observation (..., obs_dim) of qpos (..., nq) and qvel (..., nv).
+
+        action (..., nu) is the one that led there, clipped to [-1, 1]; zeros at the start of an episode.
+        """
+        raise NotImplementedError
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Reward (...) of action (..., nu), clipped to [-1, 1], which led to obs (..., obs_dim)."""
+        raise NotImplementedError
+
+    def terminated(self, obs: Tensor) -> Tensor:
+        """Whether the robot has fallen: bool (...)."""
+        if self.min_height is None:
+            return torch.zeros_like(obs[..., 0], dtype=torch.bool)
+        return obs[..., 0] < self.min_height
+
+
+def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:
+    """R_height of Eqs. 16-17 and 21-22: with D = clip(delta, -1, upper) [m], -200 D^2 below zero and slope D above."""
+    return slope * delta.clamp(0.0, upper) - 200.0 * delta.clamp(-1.0, 0.0).square()

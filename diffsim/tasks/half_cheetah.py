@@ -1,0 +1,28 @@
+"""HalfCheetah, appendix A.3.2: a two-legged robot in the plane y = 0 runs forward."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .base import Task
+
+
+class HalfCheetah(Task):
+    """qpos = (x, height above 1 m, pitch, 6 joints) [m, rad]; action: 200 N m per joint."""
+
+    name = "half_cheetah"
+    asset = "half_cheetah.xml"
+    substeps = 16
+    obs_dim = 17
+    num_random = 18
+    start = (0.0, -0.2) + (0.0,) * 16
+    spread = (0.2,) * 9 + (0.5,) * 9
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        """Table 7: height, pitch, 6 joints, then the rates of x, height, pitch and joints."""
+        return torch.cat((qpos[..., 1:], qvel), dim=-1)
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Eq. 14: v_x - 0.1 |a|^2."""
+        return obs[..., 8] - 0.1 * action.square().sum(-1)
