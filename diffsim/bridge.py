@@ -15,7 +15,7 @@ class ControlStep(torch.autograd.Function):
     """qpos, qvel, ctrl -> qpos, qvel. The simulator's checkpoint slot holds what backward needs; no tensor is saved."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, sim: Simulator, slot: int, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         result = sim._forward(slot, qpos, qvel, ctrl)
@@ -24,5 +24,5 @@ class ControlStep(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_qpos: torch.Tensor, g_qvel: torch.Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+    def backward(ctx: Any, g_qpos: torch.Tensor, g_qvel: torch.Tensor) -> tuple[Any, ...]:
         return (None, None, *ctx.sim._backward(ctx.slot, ctx.version, g_qpos, g_qvel))

@@ -20,8 +20,8 @@ class DiffEnv(VectorEnv):
     """A batch of episodes of one task, differentiable in the actions and through the states between them.
 
     Actions are clipped to [-1, 1]. A step that ends an episode returns the first observation of the next one
-    (gymnasium's SAME_STEP autoreset); the last one of the old episode is info["final_obs"]. No gradient crosses a reset.
-    Up to `horizon` differentiable steps make a window, which `detach` ends; under torch.no_grad there is no limit.
+    (gymnasium's SAME_STEP autoreset); the last one of the old episode is info["final_obs"]. No gradient crosses a
+    reset. Up to `horizon` differentiable steps make a window, which `detach` ends; under torch.no_grad there is no limit.
 
     Args:
         task: task on the simulator's device and dtype.
@@ -60,7 +60,16 @@ class DiffEnv(VectorEnv):
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
         self.sim = Simulator(
-            scene, num_envs, task.control_dt, substeps or task.substeps, horizon, integrator, theta, device, dtype, threads
+            scene,
+            num_envs,
+            task.control_dt,
+            substeps or task.substeps,
+            horizon,
+            integrator,
+            theta,
+            device,
+            dtype,
+            threads,
         )
         self.device, self.dtype = self.sim.device, dtype
         real = np.float32 if dtype == torch.float32 else np.float64
@@ -77,6 +86,8 @@ class DiffEnv(VectorEnv):
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
+        self.qpos, self.qvel, self._obs = (torch.empty(0),) * 3
+        self._starts, self._time = (torch.empty(0),) * 3, 0
         self._restart()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
@@ -86,7 +97,7 @@ class DiffEnv(VectorEnv):
         self._restart()
         return self._obs, {}
 
-    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:  # type: ignore[override]
+    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """One control step of all environments.
 
         Args:
@@ -107,12 +118,14 @@ class DiffEnv(VectorEnv):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
             raise ValueError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
-        recorded = torch.is_grad_enabled() and (action.requires_grad or self.qpos.requires_grad or self.qvel.requires_grad)
+        recorded = torch.is_grad_enabled() and (
+            action.requires_grad or self.qpos.requires_grad or self.qvel.requires_grad
+        )
         if self._time == self.horizon:
             if recorded:
                 raise RuntimeError(
-                    f"horizon of {self.horizon} differentiable steps exceeded: call env.detach() to start a new window, "
-                    "step under torch.no_grad(), or make the environment with a larger horizon"
+                    f"horizon of {self.horizon} differentiable steps exceeded: call env.detach() to start a new "
+                    "window, step under torch.no_grad(), or make the environment with a larger horizon"
                 )
             self._draw_starts()
         start_qpos, start_qvel, start_obs = (start[self._time] for start in self._starts)
@@ -150,6 +163,18 @@ class DiffEnv(VectorEnv):
         self.sim.rewind()
         self._draw_starts()
         return self._obs
+
+    def pin(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Move the state into memory of its own, where a captured window can start again and again; see graph.py."""
+        self.qpos, self.qvel, self._obs = (x.detach().clone() for x in (self.qpos, self.qvel, self._obs))
+        return self.qpos, self.qvel, self._obs
+
+    def carry_over(self, start: tuple[Tensor, Tensor, Tensor]) -> None:
+        """End a captured window: write the state back to where it started, as returned by `pin`."""
+        with torch.no_grad():
+            for to, value in zip(start, (self.qpos, self.qvel, self._obs), strict=True):
+                to.copy_(value)
+        self.qpos, self.qvel, self._obs = start
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Put all environments into given states, keeping their episode clocks; returns the observation (N, obs_dim).

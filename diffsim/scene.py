@@ -197,7 +197,7 @@ class _Reader:
             self._read_body(body)
         if not self.links or (len(self.links) == 1 and not floating):
             raise self._error("no joint: there is nothing to simulate")
-        columns = {key: np.array([link[key] for link in self.links]) for key in self.links[0]}
+        columns: dict[str, Any] = {key: np.array([link[key] for link in self.links]) for key in self.links[0]}
         mass = columns.pop("mass")
         com = columns.pop("moment") / np.where(mass > 0, mass, 1.0)[:, None]
         about_origin = columns.pop("inertia")
@@ -394,9 +394,9 @@ class _Reader:
                 kept.append((link, centre, radius))
         return sorted(kept, key=lambda s: s[0])
 
-    def _penalties(self) -> dict[str, float]:
+    def _penalties(self) -> dict[str, Any]:
         m = self.m
-        values = dict(PENALTY_DEFAULTS)
+        values: dict[str, Any] = dict(PENALTY_DEFAULTS)
         for n in range(m.nnumeric):
             name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_NUMERIC, n)
             if name in values:

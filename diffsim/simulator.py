@@ -112,9 +112,7 @@ class Simulator:
     def nonfinite(self) -> torch.Tensor:
         return self._nonfinite[self._last]
 
-    def step(
-        self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Advance all environments by one control step, differentiable in all three arguments.
 
         Args:

@@ -16,7 +16,7 @@ all its motion leaves phi's inertial part unchanged, so after summing over subtr
 The adjoint of a rotation lives in the body's tangent space; quaternions appear where gradients enter and leave.
 """
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
@@ -28,7 +28,7 @@ from diffsim.kernels.model import Shape, types
 from diffsim.kernels.spatial import spatial
 
 
-@lru_cache(maxsize=None)
+@cache
 def backward_kernel(shape: Shape) -> wp.Kernel:
     t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
     T, vec3, vec6, mat3, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
@@ -48,7 +48,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
     FIRST = 0 if FLOATING else 1
     VADR, QADR = shape.dof0 - 1, shape.dof0 - 1 + int(FLOATING)
-    NQ, NV, BASE = shape.nq, shape.nv, 7 * (shape.nlink - 1)
+    BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
 
     @wp.func
     def exp_adjoint(r: vec3, g: vec3):
@@ -287,12 +287,14 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 gw = gw + wp.transpose(R[0]) * wp.spatial_top(tw)
 
         # A gradient that left the finite numbers, or of a contained step, is zero.
-        finite = bool(True)
+        finite = True
         for i in range(1, NL):
             finite = finite and wp.isfinite(gq[i]) and wp.isfinite(gqd[i]) and wp.isfinite(gtau[i])
         if wp.static(FLOATING):
             for k in range(3):
-                finite = finite and wp.isfinite(gp[k]) and wp.isfinite(gr[k]) and wp.isfinite(gv[k]) and wp.isfinite(gw[k])
+                finite = (
+                    finite and wp.isfinite(gp[k]) and wp.isfinite(gr[k]) and wp.isfinite(gv[k]) and wp.isfinite(gw[k])
+                )
         contained = nonfinite[e]
         if not finite and not contained:
             nonfinite_gradients[e] = nonfinite_gradients[e] + 1

@@ -11,7 +11,7 @@ Implicit step: the law is linear in the acceleration a of the point, f = f(d + t
 B = diag(h c, h c, theta h^2 k_n - h k_d d) and c lagged; the explicit law is B = 0, h_implicit = theta = 0.
 """
 
-from functools import lru_cache
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
@@ -19,7 +19,7 @@ import warp as wp
 from diffsim.kernels.model import types
 
 
-@lru_cache(maxsize=None)
+@cache
 def contact_law(dtype: type) -> SimpleNamespace:
     t = types(dtype)
     T, vec3, Model = dtype, t.vec3, t.Model

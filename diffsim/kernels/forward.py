@@ -5,7 +5,7 @@ axes, then semi-implicit Euler with the exact quaternion exponential. Its factor
 base's Cholesky factor) is what the paper caches as the factored mass matrix; the adjoint solves with it again.
 """
 
-from functools import lru_cache
+from functools import cache
 
 import warp as wp
 
@@ -18,13 +18,12 @@ from diffsim.kernels.spatial import spatial
 MODULE_OPTIONS = {"enable_backward": False, "max_unroll": 6}
 
 
-@lru_cache(maxsize=None)
+@cache
 def forward_kernel(shape: Shape) -> wp.Kernel:
     t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
     T, vec3, vec6, mat3, mat6, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model
-    scalars, vec3s, mat3s, vec6s = t.array, wp.array(dtype=vec3), wp.array(dtype=mat3), wp.array(dtype=vec6)
     join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
-    load, store, place_links, sphere_state = kin.load, kin.store, kin.place_links, kin.sphere_state
+    store, place_links, sphere_state = kin.store, kin.place_links, kin.sphere_state
     contact = contact_law(T)
     touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
     uses = shape.features
@@ -238,10 +237,12 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                     store(ck_a, row, VADR + i, e, qdd)
 
         # An environment that left the finite numbers is handed back as it came.
-        finite = bool(True)
+        finite = True
         if wp.static(FLOATING):
             for k in range(3):
-                finite = finite and wp.isfinite(pos[k]) and wp.isfinite(v[k]) and wp.isfinite(w[k]) and wp.isfinite(rot[k])
+                finite = (
+                    finite and wp.isfinite(pos[k]) and wp.isfinite(v[k]) and wp.isfinite(w[k]) and wp.isfinite(rot[k])
+                )
                 qpos_out[e, k] = pos[k]
                 qpos_out[e, 4 + k] = rot[k]
                 qvel_out[e, k] = v[k]

@@ -1,6 +1,6 @@
 """The passive force of a hinge or slide: spring, damper and limit (Eq. 4), with its derivatives beside it."""
 
-from functools import lru_cache
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
@@ -8,7 +8,7 @@ import warp as wp
 from diffsim.kernels.model import types
 
 
-@lru_cache(maxsize=None)
+@cache
 def joint_law(dtype: type, stiffness: bool, damping: bool, limit: bool) -> SimpleNamespace:
     t = types(dtype)
     T, Model = dtype, t.Model

@@ -1,6 +1,6 @@
 """Stages that the forward and the backward kernel share: where each link is, and its contact spheres."""
 
-from functools import lru_cache
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
@@ -9,7 +9,7 @@ from diffsim.kernels.model import Shape, types
 from diffsim.kernels.spatial import spatial
 
 
-@lru_cache(maxsize=None)
+@cache
 def kinematics(shape: Shape) -> SimpleNamespace:
     t = types(shape.dtype)
     T, vec3, vec6, mat3, Model, array = shape.dtype, t.vec3, t.vec6, t.mat3, t.Model, t.array

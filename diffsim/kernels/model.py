@@ -1,7 +1,7 @@
-"""What the kernels read: the shape of a scene, which decides the code, and its numbers, which decide nothing but values."""
+"""What the kernels read: the shape of a scene, which decides their code, and its numbers, which do not."""
 
 import dataclasses
-from functools import lru_cache
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -50,7 +50,7 @@ def shape_of(scene: Scene, dtype: type, implicit: bool, env_last: bool) -> Shape
     return Shape(scene.nlink, scene.nu, scene.carrier, scene.features, dtype, implicit, env_last)
 
 
-@lru_cache(maxsize=None)
+@cache
 def types(dtype: type) -> SimpleNamespace:
     """Warp's vector types of one precision, and the struct of a scene's numbers."""
     vec3, mat3 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
@@ -81,7 +81,9 @@ def types(dtype: type) -> SimpleNamespace:
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
         gravity: vec3
-        carrier_height: dtype  # of the carrier's frame over the ground at q = 0 (fixed base), or minus the ground's height
+        carrier_height: (
+            dtype  # of the carrier's frame over the ground at q = 0 (fixed base), or minus the ground's height
+        )
         k_n: dtype
         k_d: dtype
         k_t: dtype

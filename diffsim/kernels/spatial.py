@@ -3,7 +3,7 @@
 Warp has the rest: spatial_top/bottom, spatial_cross (motion x motion), spatial_cross_dual (motion x* force), skew.
 """
 
-from functools import lru_cache
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
@@ -11,7 +11,7 @@ import warp as wp
 from diffsim.kernels.model import types
 
 
-@lru_cache(maxsize=None)
+@cache
 def spatial(dtype: type) -> SimpleNamespace:
     t = types(dtype)
     T, vec3, vec6, mat3, quat = dtype, t.vec3, t.vec6, t.mat3, t.quat

@@ -47,7 +47,7 @@ class Locomotion(Task):
         drawn = torch.addcmul(self._start, rand - 0.5, self._spread)
         position, angle, axis, joints, angular, linear, rates = drawn.split(self._drawn, dim=-1)
         w, u = torch.cos(0.5 * angle), torch.sin(0.5 * angle) * F.normalize(axis, dim=-1)
-        # The benchmark draws the velocity of the body's point at the world origin; kept, as it widens the distribution.
+        # The benchmark draws the velocity of the body's point at the world origin; so do we, to start as it does.
         velocity = linear + torch.linalg.cross(angular, position)
         angular = rotate(torch.cat((w, -u), dim=-1), angular)  # world to body frame
         return torch.cat((position, w, u, joints), dim=-1), torch.cat((velocity, angular, rates), dim=-1)
