@@ -21,7 +21,8 @@ class DiffEnv(VectorEnv):
 
     Actions are clipped to [-1, 1]. A step that ends an episode returns the first observation of the next one
     (gymnasium's SAME_STEP autoreset); the last one of the old episode is info["final_obs"]. No gradient crosses a
-    reset. Up to `horizon` differentiable steps make a window, which `detach` ends; under torch.no_grad there is no limit.
+    reset. Up to `horizon` differentiable steps make a window, which `detach` ends; under torch.no_grad there is no
+    limit.
 
     Args:
         task: task on the simulator's device and dtype.
@@ -63,7 +64,7 @@ class DiffEnv(VectorEnv):
             scene,
             num_envs,
             task.control_dt,
-            substeps or task.substeps,
+            task.substeps if substeps is None else substeps,
             horizon,
             integrator,
             theta,

@@ -227,6 +227,10 @@ class _Reader:
         label = str(kind).rsplit("mjOBJ_", 1)[-1].lower()
         return f"{label} {mujoco.mj_id2name(self.m, kind, index) or f'number {index}'!r}"
 
+    def _any(self, field: str, index: int) -> bool:
+        """Whether a field that only newer versions of MuJoCo have is set."""
+        return bool(np.any(getattr(self.m, field)[index])) if hasattr(self.m, field) else False
+
     def _reject_unsupported(self) -> None:
         m, obj, joint = self.m, mujoco.mjtObj, mujoco.mjtJoint
         for kind, count in ((obj.mjOBJ_EQUALITY, m.neq), (obj.mjOBJ_TENDON, m.ntendon), (obj.mjOBJ_PAIR, m.npair)):
@@ -234,8 +238,15 @@ class _Reader:
                 raise self._error(f"{self._name(kind, 0)}: not simulated")
         if m.opt.density or m.opt.viscosity or np.any(m.opt.wind):
             raise self._error("option density, viscosity or wind: a fluid is not simulated")
+        for b in range(m.nbody):
+            if m.body_gravcomp[b] or m.body_mocapid[b] >= 0:
+                raise self._error(f"{self._name(obj.mjOBJ_BODY, b)}: gravcomp and mocap are not simulated")
         for j in range(m.njnt):
             name, dof = self._name(obj.mjOBJ_JOINT, j), m.jnt_dofadr[j]
+            if m.jnt_actfrclimited[j]:
+                raise self._error(f"{name}: actuatorfrcrange is not simulated")
+            if self._any("dof_dampingpoly", dof) or self._any("jnt_stiffnesspoly", j):
+                raise self._error(f"{name}: damping and stiffness are linear here, one number each")
             if m.jnt_type[j] == joint.mjJNT_BALL:
                 raise self._error(f"{name}: ball joints are not simulated; use free, hinge or slide")
             if m.dof_frictionloss[dof]:
@@ -317,8 +328,10 @@ class _Reader:
                 or m.actuator_gaintype[a] != mujoco.mjtGain.mjGAIN_FIXED
                 or m.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_NONE
                 or m.actuator_forcelimited[a]
+                or self._any("actuator_damping", a)
+                or self._any("actuator_armature", a)
             ):
-                raise self._error(f"{name}: only motors on a hinge or slide, without a force range, are simulated")
+                raise self._error(f"{name}: only motors with a gear and a ctrlrange, on a hinge or slide")
             low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
             scale = m.actuator_gear[a, 0] * m.actuator_gainprm[a, 0]
             link.append(self.joint_link[joint])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -67,7 +68,7 @@ class Simulator:
         for name, value in (("num_envs", num_envs), ("substeps", substeps), ("horizon", horizon), ("threads", threads)):
             if value is not None and (not isinstance(value, int) or value < 1):
                 raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
-        if not control_dt > 0:
+        if not 0 < control_dt < math.inf:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
         if integrator not in INTEGRATORS:
             raise ValueError(f"unknown integrator {integrator!r}; choose from {', '.join(INTEGRATORS)}")

@@ -287,7 +287,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 gw = gw + wp.transpose(R[0]) * wp.spatial_top(tw)
 
         # A gradient that left the finite numbers, or of a contained step, is zero.
-        finite = True
+        finite = bool(True)
         for i in range(1, NL):
             finite = finite and wp.isfinite(gq[i]) and wp.isfinite(gqd[i]) and wp.isfinite(gtau[i])
         if wp.static(FLOATING):

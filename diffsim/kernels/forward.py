@@ -237,7 +237,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                     store(ck_a, row, VADR + i, e, qdd)
 
         # An environment that left the finite numbers is handed back as it came.
-        finite = True
+        finite = bool(True)
         if wp.static(FLOATING):
             for k in range(3):
                 finite = (
