@@ -1,0 +1,318 @@
+"""How fast the simulator and a whole SHAC iteration are, against MuJoCo's C step on the same model in the same run.
+
+    python benchmarks/speed.py --env ant --num-envs 64
+    python benchmarks/speed.py                                every task, 64 and 256 environments
+
+Prints three markdown tables and writes their rows to benchmarks/results/speed_*.csv, in place of older rows of the same
+setting. Times are medians over states that random actions visit; all competitors take their turn in each state.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any, Literal, NoReturn
+
+import mujoco
+import torch
+import tyro
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import diffsim
+
+ROOT = Path(__file__).resolve().parents[1]
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+Part = Literal["physics", "training", "compile"]
+
+
+@dataclass
+class Args:
+    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
+    """tasks"""
+    num_envs: tuple[int, ...] = (64, 256)
+    """batch sizes of the physics table (training uses the task's own)"""
+    dtype: tuple[Literal["float32", "float64"], ...] = ("float32", "float64")
+    """precisions of the physics table"""
+    device: str = "cpu"
+    """torch device, cpu or cuda"""
+    parts: tuple[Part, ...] = ("physics", "training", "compile")
+    """tables to measure"""
+    repeats: int = 15
+    """states in which a control step is timed"""
+    iterations: int = 30
+    """SHAC iterations of the training table; the first three are not counted"""
+    output: Path = ROOT / "benchmarks" / "results"
+    """directory of the csv files"""
+
+
+def fail(message: str) -> NoReturn:
+    print(f"speed.py: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Table:
+    """Rows of one csv file. The `key` columns say what was measured: a new row replaces the old one of its key."""
+
+    name: str
+    key: tuple[str, ...]
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, **row: Any) -> None:
+        self.rows.append({k: f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in row.items()})
+        print(" ", ", ".join(f"{k} {v}" for k, v in self.rows[-1].items()), flush=True)
+
+    def write(self, directory: Path) -> None:
+        path = directory / f"speed_{self.name}.csv"
+        directory.mkdir(parents=True, exist_ok=True)
+        merged: dict[tuple[str, ...], dict[str, Any]] = {}
+        if path.is_file():
+            with path.open(newline="") as file:
+                merged = {tuple(row[k] for k in self.key): row for row in csv.DictReader(file)}
+        merged |= {tuple(row[k] for k in self.key): row for row in self.rows}
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(self.rows[0]), extrasaction="ignore", restval="")
+            writer.writeheader()
+            writer.writerows(merged.values())
+
+    def markdown(self) -> str:
+        columns = list(self.rows[0])
+        lines = [columns, ["---"] * len(columns), *([row[c] for c in columns] for row in self.rows)]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+# Physics --------------------------------------------------------------------------------------------------------------
+
+State = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+@torch.no_grad()
+def visited_states(name: str, num_envs: int, count: int) -> list[State]:
+    """(qpos, qvel, ctrl) in float64, every 8 control steps of a run under uniform random actions, resets included."""
+    env = diffsim.make(name, num_envs=num_envs, seed=0)
+    generator = torch.Generator().manual_seed(0)
+    env.reset(seed=0)
+    states = []
+    for step in range(8 * count):
+        action = torch.rand(num_envs, env.scene.nu, generator=generator) * 2 - 1
+        if step % 8 == 7:
+            states.append((env.qpos.double(), env.qvel.double(), action.double()))
+        env.step(action)
+    return states
+
+
+def time_diffsim(sim: diffsim.Simulator, state: State) -> dict[str, float]:
+    """Microseconds of one differentiated control step: forward and backward, with torch's part and of the kernels."""
+    synchronize = torch.cuda.synchronize if sim.device.type == "cuda" else lambda: None
+    inputs = [x.to(sim.device, sim.dtype).requires_grad_() for x in state]
+    gradients = [torch.ones_like(x) for x in inputs[:2]]
+    kernels = dict(sim.seconds)
+    synchronize()
+    start = time.perf_counter()
+    outputs = sim.step(*inputs)
+    synchronize()
+    middle = time.perf_counter()
+    torch.autograd.grad(outputs, inputs, gradients)
+    synchronize()
+    wall = {"forward": middle - start, "backward": time.perf_counter() - middle}
+    if sim.device.type == "cpu":
+        kernels = {k: sim.seconds[k] - before for k, before in kernels.items()}
+    else:
+        kernels = wall
+    return {f"step {k}": 1e6 * v for k, v in wall.items()} | {f"kernel {k}": 1e6 * v for k, v in kernels.items()}
+
+
+class MuJoCo:
+    """mj_step of each environment in turn on one core: Euler, the substep's length, MuJoCo's own contact solver."""
+
+    def __init__(self, scene: diffsim.Scene, num_envs: int, substeps: int, control_dt: float) -> None:
+        self.model = mujoco.MjModel.from_xml_path(scene.path)
+        self.model.opt.timestep = control_dt / substeps
+        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        self.substeps = substeps
+        self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
+
+    def time(self, state: State) -> dict[str, float]:
+        low, high = self.model.actuator_ctrlrange.T
+        for data, qpos, qvel, ctrl in zip(self.data, *(x.numpy() for x in state), strict=True):
+            data.qpos, data.qvel, data.ctrl = qpos, qvel, low + (ctrl + 1) / 2 * (high - low)
+            mujoco.mj_forward(self.model, data)  # gives the solver the warm start that a running simulation has
+        start = time.perf_counter()
+        for data in self.data:
+            mujoco.mj_step(self.model, data, self.substeps)
+        return {"mj_step": 1e6 * (time.perf_counter() - start)}
+
+
+def measure_physics(args: Args, table: Table) -> None:
+    threads = [1] if args.device != "cpu" else [1, None]
+    for name in args.env:
+        task = diffsim.TASKS[name]
+        for num_envs in args.num_envs:
+            states = visited_states(name, num_envs, args.repeats + 1)
+            scene = diffsim.load_scene(Path(diffsim.__file__).parent / "assets" / task.asset)
+            reference = MuJoCo(scene, num_envs, task.substeps, task.control_dt)
+            competitors: dict[Any, Callable[[State], dict[str, float]]] = {"mujoco": reference.time}
+            for dtype in args.dtype:
+                for count in threads:
+                    sim = diffsim.Simulator(
+                        scene,
+                        num_envs,
+                        task.control_dt,
+                        task.substeps,
+                        device=args.device,
+                        dtype=DTYPES[dtype],
+                        threads=count,
+                    )
+                    competitors[dtype, count] = lambda state, sim=sim: time_diffsim(sim, state)
+            times: dict[Any, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+            for k, state in enumerate(states):
+                for competitor, measure in competitors.items():
+                    for what, value in measure(state).items():
+                        if k > 0:  # the first state compiles and fills caches
+                            times[competitor][what].append(value)
+            report_physics(args, table, name, num_envs, task.substeps, times)
+
+
+def report_physics(args: Args, table: Table, name: str, num_envs: int, substeps: int, times: Any) -> None:
+    per_substep = num_envs * substeps
+    mj = median(times.pop("mujoco")["mj_step"]) / per_substep
+    for (dtype, count), measured in times.items():
+        t = {what: median(values) for what, values in measured.items()}
+        alone = {what: median(values) for what, values in times[dtype, 1].items()}
+        total, total_alone = (x["kernel forward"] + x["kernel backward"] for x in (t, alone))
+        table.add(
+            **{
+                "task": name,
+                "environments": num_envs,
+                "precision": dtype,
+                "device": args.device if args.device != "cpu" else "cpu, 1 thread" if count else "cpu, all cores",
+                "forward (us/substep)": t["kernel forward"] / per_substep,
+                "backward (us/substep)": t["kernel backward"] / per_substep,
+                "backward/forward": t["kernel backward"] / t["kernel forward"],
+                "control step forward (us)": t["step forward"],
+                "control step backward (us)": t["step backward"],
+                "mj_step, one core (us/substep)": mj,
+                "mj_step/forward": mj * per_substep / t["kernel forward"],
+                "one thread/this": total_alone / total,
+            }
+        )
+
+
+# Training and compilation ---------------------------------------------------------------------------------------------
+
+COMPILE = """
+import sys, time
+import diffsim, torch
+start = time.perf_counter()
+env = diffsim.make(sys.argv[1], num_envs=1, horizon=1, device=sys.argv[2])
+action = torch.zeros(1, env.scene.nu, device=env.device, requires_grad=True)
+torch.autograd.grad(env.step(action)[1].sum(), action)
+print(time.perf_counter() - start)
+"""
+
+
+def measure_compile(args: Args, table: Table) -> None:
+    """Seconds until the first control step and its backward are done, with an empty and with a filled kernel cache."""
+    for name in args.env:
+        with tempfile.TemporaryDirectory() as cache:
+            command = [sys.executable, "-c", COMPILE, name, args.device]
+            environment = os.environ | {"WARP_CACHE_PATH": cache}
+            cold, warm = (
+                float(subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout)
+                for _ in range(2)
+            )
+        table.add(task=name, device=args.device, **{"cold cache (s)": cold, "warm cache (s)": warm})
+
+
+def run_shac(directory: Path, arguments: list[str]) -> tuple[float, float]:
+    """Runs shac.py; returns the seconds from its start to its first iteration's end, and its peak memory in MiB."""
+    command = [sys.executable, str(ROOT / "shac.py"), "--run-dir", str(directory), "--quiet", *arguments]
+    progress = directory / "progress.csv"
+    start, first = time.perf_counter(), float("nan")
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while True:
+        ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+        if first != first and progress.is_file() and len(progress.read_text().splitlines()) > 1:
+            first = time.perf_counter() - start
+        if ended:
+            break
+        time.sleep(0.01)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        fail(f"{' '.join(command)} ended with {process.returncode}")
+    return first, usage.ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
+
+
+def logged(directory: Path, tag: str) -> list[float]:
+    """The values of a tensorboard scalar."""
+    events = EventAccumulator(str(directory), size_guidance={"scalars": 0})
+    events.Reload()
+    return [event.value for event in events.Scalars(tag)]
+
+
+def measure_training(args: Args, table: Table) -> None:
+    devices = [args.device] if args.device != "cpu" else ["cpu, 1 thread", "cpu, all cores"]
+    for name in args.env:
+        for device in devices:
+            options = ["--env", name, "--device", device.partition(",")[0], "--eval-every", "0", "--save-every", "0"]
+            options += ["--iterations", str(args.iterations), *(["--threads", "1"] if "1 thread" in device else [])]
+            with tempfile.TemporaryDirectory() as temporary:
+                run_shac(Path(temporary) / "compile", [*options, "--stop-after", "1"])
+                directory = Path(temporary) / "run"
+                first, memory = run_shac(directory, options)
+                tags = ("time/total", "time/sim_forward", "time/sim_backward", "time/critic")
+                total, forward, backward, critic = (1e3 * median(logged(directory, tag)[3:]) for tag in tags)
+                num_envs = json.loads((directory / "args.json").read_text())["num_envs"]
+            table.add(
+                **{
+                    "task": name,
+                    "environments": num_envs,
+                    "device": device,
+                    "iteration (ms)": total,
+                    "physics forward": forward,
+                    "physics backward": backward,
+                    "critic": critic,
+                    "policy, task, loss": total - forward - backward - critic,
+                    "start to first iteration (s)": first,
+                    "peak memory (MiB)": memory,
+                }
+            )
+
+
+def main(args: Args) -> None:
+    if unknown := [name for name in args.env if name not in diffsim.TASKS]:
+        fail(f"unknown task {unknown[0]!r}: choose from {', '.join(diffsim.TASKS)}")
+    if args.repeats < 1 or args.iterations < 4:
+        fail("--repeats must be at least 1 and --iterations at least 4")
+    torch.set_num_threads(1)
+    measures = {
+        "physics": (measure_physics, ("task", "environments", "precision", "device")),
+        "training": (measure_training, ("task", "environments", "device")),
+        "compile": (measure_compile, ("task", "device")),
+    }
+    tables = []
+    for part in args.parts:
+        measure, key = measures[part]
+        print(f"{part}:", flush=True)
+        tables.append(Table(part, key))
+        measure(args, tables[-1])
+        tables[-1].write(args.output)
+    for table in tables:
+        print(f"\n{table.markdown()}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

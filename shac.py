@@ -1,0 +1,627 @@
+"""SHAC, Short-Horizon Actor-Critic (Xu et al. 2022, https://arxiv.org/abs/2204.07137).
+
+The actor descends the gradient of a short window of simulated steps, taken through the simulator, with a value function
+at the window's end (Eq. 5); the value function is fitted to the TD(lambda) returns of the same window (Eq. 6 and 7).
+
+    python shac.py --env ant --seed 1                                   train; writes runs/ant__shac__1__<time>/
+    python shac.py --resume runs/ant__shac__1__<time>/checkpoint.pt     continue an interrupted run exactly
+    python shac.py --evaluate runs/ant__shac__1__<time>/checkpoint.pt   evaluate its deterministic policy
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import dataclasses
+import json
+import math
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections import deque
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import IO, Annotated, Any, Literal, NamedTuple, NoReturn
+
+import torch
+import tyro
+from torch import Tensor, nn
+from torch.utils.tensorboard import SummaryWriter
+
+import diffsim
+from diffsim import graph, render
+
+
+@dataclass
+class Args:
+    env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
+    """task: cartpole, hopper, half_cheetah, ant or humanoid"""
+    seed: int = 1
+    """seed of the networks, the policy's noise and the environments' resets"""
+    device: str = "cpu"
+    """torch device of simulation and learning, e.g. cpu or cuda:0"""
+    threads: int | None = None
+    """CPU threads of the simulator, which change no result; None: all cores"""
+
+    iterations: int | None = None
+    """learning iterations: the paper's learning episodes M; None: per task"""
+    num_envs: int | None = None
+    """parallel environments N; None: per task"""
+    horizon: int = 32
+    """control steps h of a window (1/60 s each)"""
+    substeps: int | None = None
+    """simulation steps per control step; None: per task"""
+    integrator: Literal["semi_implicit", "implicit"] = "semi_implicit"
+    """time integration of the simulator"""
+
+    general_hyperparameters: bool = False
+    """the paper's one setting for all tasks (Table 5) instead of the per-task ones"""
+    deterministic_policy: bool = False
+    """train a policy without noise (A.4.4)"""
+    actor_hidden: tuple[int, ...] | None = None
+    """units of the actor's hidden layers; None: per task"""
+    critic_hidden: tuple[int, ...] | None = None
+    """units of the critic's hidden layers; None: per task"""
+    actor_lr: float | None = None
+    """initial learning rate of the actor; None: per task"""
+    critic_lr: float | None = None
+    """initial learning rate of the critic; None: per task"""
+    final_lr: float = 1e-5
+    """learning rate that both reach, linearly, after the last iteration"""
+    betas: tuple[float, float] = (0.7, 0.95)
+    """Adam's decay rates of the gradient's first and second moment"""
+    max_grad_norm: float = 1.0
+    """gradients of actor and critic are clipped to this norm"""
+    gamma: float = 0.99
+    """discount factor"""
+    td_lambda: float = 0.95
+    """lambda of the value estimation (Eq. 7)"""
+    target_alpha: float | None = None
+    """target critic <- alpha target critic + (1 - alpha) critic, each iteration; None: per task"""
+    critic_iterations: int = 16
+    """passes over a window's samples to fit the critic"""
+    critic_minibatches: int = 4
+    """minibatches of a pass, contiguous in time"""
+    initial_log_std: float = -1.0
+    """initial log standard deviation of the policy's noise, before tanh"""
+
+    eval_every: int = 100
+    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
+    eval_episodes: int = 64
+    """episodes of an evaluation, one in each of as many fresh environments"""
+    save_every: int = 100
+    """save the checkpoint every this many iterations (0: only at the end)"""
+    stop_after: int | None = None
+    """stop at this iteration as Ctrl-C would: saved, to be resumed; the schedules still run to --iterations"""
+    run_dir: Path | None = None
+    """directory of the run; None: runs/{env}__shac__{seed}__{time}, or that of the checkpoint resumed"""
+    resume: Path | None = None
+    """checkpoint to continue from; its arguments hold where the command line gives no other"""
+    evaluate: Path | None = None
+    """checkpoint to evaluate, without training; e.g. with other --substeps or --eval-episodes"""
+    capture_video: bool = False
+    """write a video of the last evaluation's median episode"""
+    track: bool = False
+    """also log to Weights & Biases (pip install wandb)"""
+    quiet: bool = False
+    """no progress line"""
+
+
+# Tables 1 and 4; hopper and half_cheetah: the authors' released settings. GENERAL: Table 5, with the networks of A.4.3.
+# fmt: off
+COLUMNS = ("actor_hidden", "critic_hidden", "actor_lr", "critic_lr", "target_alpha", "num_envs", "iterations")
+PER_TASK = {
+    "cartpole":     ((64, 64),      (64, 64),   1e-2, 1e-3, 0.2,    64,  500),
+    "hopper":       ((128, 64, 32), (64, 64),   2e-3, 2e-4, 0.2,   256, 2000),
+    "half_cheetah": ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,    64, 2000),
+    "ant":          ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,    64, 2000),
+    "humanoid":     ((256, 128),    (128, 128), 2e-3, 5e-4, 0.995,  64, 2000),
+}
+GENERAL =           ((256, 128),    (128, 128), 2e-3, 5e-4, 0.995,  64)
+
+PROGRESS = {  # scalar of tensorboard: column of progress.csv, beside iteration, control_steps and seconds (of training)
+    "charts/episodic_return": "return", "charts/episodic_length": "length",
+    "eval/return": "eval_return", "eval/length": "eval_length", "eval/speed": "eval_speed",
+    "losses/actor": "actor_loss", "losses/critic": "critic_loss",
+    "grad/norm": "grad_norm", "grad/skipped": "skipped", "sim/nonfinite": "nonfinite",
+}
+# fmt: on
+FIXED = ("env", "num_envs", "actor_hidden", "critic_hidden", "deterministic_policy")  # by a checkpoint
+FORMAT = "shac-1"  # of checkpoints
+EVALUATION_SEED = 1_000_000
+
+
+def fail(message: object) -> NoReturn:
+    print(f"shac.py: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+def mlp(inputs: int, hidden: tuple[int, ...], outputs: int, orthogonal: bool) -> nn.Sequential:
+    """Linear, ELU, LayerNorm per hidden layer and a linear output; torch's default or orthogonal initialisation."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True), nn.LayerNorm(width)]
+        inputs = width
+    layers.append(nn.Linear(inputs, outputs))
+    if orthogonal:
+        for layer in layers:
+            if isinstance(layer, nn.Linear):
+                nn.init.orthogonal_(layer.weight, math.sqrt(2))
+                nn.init.zeros_(layer.bias)
+    return nn.Sequential(*layers)
+
+
+class Actor(nn.Module):
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state; or of its mean alone."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int):
+        super().__init__()
+        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, orthogonal=args.deterministic_policy)
+        log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
+        self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)
+
+    def sample_noise(self, *shape: int) -> Tensor:
+        """(*shape, action_dim) reparameterised noise of a whole window, differentiable in log_std (A.1)."""
+        std = self.log_std.exp()
+        return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
+
+    def forward(self, obs: Tensor, noise: Tensor | float = 0.0) -> Tensor:
+        return torch.tanh(self.mean(obs) + noise)
+
+
+class Normaliser(nn.Module):
+    """Normalises observations by their running mean and variance; constant between updates, thus within a window."""
+
+    def __init__(self, obs_dim: int):
+        super().__init__()
+        self.register_buffer("count", torch.tensor(0.0))
+        self.register_buffer("mean", torch.zeros(obs_dim))
+        self.register_buffer("var", torch.ones(obs_dim))
+        self.register_buffer("std", torch.ones(obs_dim))
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return (obs - self.mean) / self.std
+
+    @torch.no_grad()
+    def update(self, obs: Tensor) -> None:
+        """Adds obs (..., obs_dim) to the statistics (Chan et al.'s parallel variance)."""
+        obs = obs.flatten(0, -2)
+        var, mean = torch.var_mean(obs, dim=0, correction=0)
+        total, delta = self.count + len(obs), mean - self.mean
+        self.var.copy_((self.var * self.count + var * len(obs) + delta**2 * self.count * len(obs) / total) / total)
+        self.mean.add_(delta * len(obs) / total)
+        self.count.copy_(total)
+        self.std.copy_((self.var + 1e-5).sqrt())
+
+
+class ClippedAdam:
+    """Adam on the gradient clipped to a norm. A gradient that is not finite, or is beyond 1e6, is counted and skipped.
+
+    The module's parameters become views of one vector, so a step is a dozen operations for any network; none of them
+    waits for the device.
+    """
+
+    def __init__(self, module: nn.Module, args: Args):
+        self.parameters = [p for p in module.parameters() if p.requires_grad]
+        self.vector = nn.utils.parameters_to_vector(self.parameters).detach()
+        nn.utils.vector_to_parameters(self.vector, self.parameters)
+        self.lr = torch.zeros((), device=self.vector.device)  # a tensor: a captured graph reads its present value
+        self.adam = torch.optim.Adam([self.vector], self.lr, args.betas, fused=True, capturable=self.vector.is_cuda)
+        self.max_norm = args.max_grad_norm
+        self.skipped = torch.zeros_like(self.lr)
+
+    def step(self, loss: Tensor) -> Tensor:
+        """One descent step; returns the gradient's norm before clipping."""
+        gradients = torch.autograd.grad(loss, self.parameters)
+        self.vector.grad = torch.cat([gradient.flatten() for gradient in gradients])
+        norm = torch.linalg.vector_norm(self.vector.grad)
+        bad = (~(norm < 1e6)).to(norm.dtype)
+        # GradScaler's hooks: fused Adam divides by grad_scale and, where found_inf is 1, leaves everything as it was.
+        self.adam.grad_scale = (norm / self.max_norm).clamp(min=1.0)
+        self.adam.found_inf = bad
+        self.adam.step()
+        self.skipped += bad
+        return norm
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"adam": self.adam.state_dict(), "skipped": self.skipped}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.adam.load_state_dict(state["adam"])
+        self.adam.param_groups[0]["lr"] = self.lr
+        self.skipped.copy_(state["skipped"])
+
+
+# The algorithm --------------------------------------------------------------------------------------------------------
+
+
+class Window(NamedTuple):
+    """What happened in one window, time first: (H, N, ...)."""
+
+    obs: Tensor  # s_t, on which the policy acted
+    next_obs: Tensor  # s_{t+1}, before any reset
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    nonfinite: Tensor
+    episode_return: Tensor  # of the episode so far, as is the length
+    episode_length: Tensor
+
+    @property
+    def done(self) -> Tensor:
+        return self.terminated | self.truncated
+
+
+def collect(env: Any, actor: Actor, normalise: Normaliser, noise: Tensor) -> Window:
+    """H steps of all environments from where they stand, with the policy's noise (H, N, action_dim)."""
+    steps = []
+    obs = env.detach()
+    for step_noise in noise.unbind():
+        next_obs, reward, terminated, truncated, info = env.step(actor(normalise(obs), step_noise))
+        episode = info["episode"]["r"], info["episode"]["l"]
+        steps.append((obs, info["final_obs"], reward, terminated, truncated, info["nonfinite"], *episode))
+        obs = next_obs
+    return Window(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
+
+
+def next_values(critic: nn.Module, normalise: Normaliser, window: Window) -> Tensor:
+    """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
+    values = critic(normalise(window.next_obs)).squeeze(-1)
+    return torch.where(window.terminated, torch.zeros_like(values), values)
+
+
+def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
+    """Eq. 5 of (H, N) steps: each environment's window is cut at its dones, and the discount starts anew after them."""
+    horizon = len(reward)
+    t = torch.arange(horizon, device=reward.device).unsqueeze(1)
+    starts, ends = done.roll(1, 0), done.clone()
+    starts[0] = ends[-1] = True
+    age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values  # steps since the start or the last done
+    discount = gamma ** age.to(reward.dtype)
+    return -(discount * reward + discount * gamma * ends * next_value).mean()
+
+
+def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the window's end does."""
+    returns = torch.empty_like(reward)
+    following = next_value[-1]
+    for t in reversed(range(len(reward))):
+        following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))
+        following = returns[t] = reward[t] + gamma * following
+    return returns
+
+
+class Evaluation(NamedTuple):
+    returns: Tensor  # (n,) of one episode each
+    lengths: Tensor  # (n,) control steps
+    speed: float | None  # mean forward speed, m/s; None for a robot without ground
+    qpos: Tensor  # (T, n, nq) before each step; valid up to an episode's length
+
+    def scalars(self) -> dict[str, float]:
+        values = {"eval/return": self.returns.median().item(), "eval/length": self.lengths.float().mean().item()}
+        return values if self.speed is None else values | {"eval/speed": self.speed}
+
+    def __str__(self) -> str:
+        r = self.returns
+        speed = "" if self.speed is None else f", forward speed {self.speed:.2f} m/s"
+        spread = f"mean {r.mean():.1f}, std {r.std(correction=0):.1f}, min {r.min():.1f}"
+        return f"return median {r.median():.1f}, {spread}, length {self.lengths.float().mean():.1f}{speed}"
+
+
+@torch.no_grad()
+def evaluate(env: Any, actor: Actor, normalise: Normaliser) -> Evaluation:
+    """The first episode of each environment under the deterministic policy; always from the same initial states."""
+    obs, _ = env.reset(seed=EVALUATION_SEED)
+    alive = torch.ones(env.num_envs, dtype=torch.bool, device=obs.device)
+    returns, lengths, qpos = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long), []
+    while alive.any():
+        qpos.append(env.qpos)
+        obs, reward, terminated, truncated, _ = env.step(actor(normalise(obs)))
+        returns += torch.where(alive, reward, torch.zeros_like(reward))
+        lengths += alive
+        alive &= ~(terminated | truncated)
+    path = torch.stack(qpos)
+    speed = None
+    if "contact" in env.scene.features:  # the first coordinate of a robot that walks is its x
+        distance = path[..., 0].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, 0]
+        speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
+    return Evaluation(returns, lengths, speed, path)
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def save_checkpoint(path: Path, checkpoint: dict[str, Any]) -> None:
+    """Replaces path in one step: whoever reads it finds the old checkpoint or the new one, whole."""
+    temporary = path.with_suffix(".tmp")
+    torch.save(checkpoint, temporary)
+    os.replace(temporary, path)
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        fail(f"no such checkpoint: {path}")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        if checkpoint["format"] == FORMAT:
+            return checkpoint
+    except Exception:  # torch.load raises whatever broken bytes lead it to
+        pass
+    fail(f"{path} is not a whole checkpoint of shac.py")
+
+
+def check_run_dir(path: Path, resume: Path | None) -> None:
+    """That a run can be written to path; leaves nothing there."""
+    if (path / "checkpoint.pt").exists() and (resume is None or not resume.samefile(path / "checkpoint.pt")):
+        fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
+    existing = next(p for p in (path, *path.absolute().parents) if p.exists())
+    try:
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        fail(f"cannot write to run directory {path}: {error.strerror}")
+
+
+def open_progress(path: Path, iteration: int) -> tuple[IO[str], csv.DictWriter]:
+    """progress.csv and its writer, after the rows that a resumed run has up to iteration."""
+    rows: list[dict[str, str]] = []
+    if iteration > 0 and path.is_file():
+        with path.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if int(row["iteration"]) <= iteration]
+    file = path.open("w", newline="")
+    writer = csv.DictWriter(file, ["iteration", "control_steps", "seconds", *PROGRESS.values()])
+    writer.writeheader()
+    writer.writerows(rows)
+    return file, writer
+
+
+# Runs -----------------------------------------------------------------------------------------------------------------
+
+
+def flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
+    """The arguments, complete and checked, and the checkpoint that they name."""
+    args, checkpoint = tyro.cli(Args, args=argv, description=__doc__), None
+    if args.resume and args.evaluate:
+        fail("--resume and --evaluate exclude each other")
+    if path := args.resume or args.evaluate:
+        checkpoint = load_checkpoint(path)
+        saved = Args(**checkpoint["args"])
+        args = tyro.cli(Args, args=argv, description=__doc__, default=saved)
+        for name in FIXED:
+            if getattr(args, name) != getattr(saved, name):
+                fail(f"{path} has {flag(name)} {getattr(saved, name)}, not {getattr(args, name)}")
+        if args.resume and checkpoint["iteration"] >= min(args.iterations, args.stop_after or args.iterations):
+            fail(f"{path} is at iteration {checkpoint['iteration']} already: give more --iterations or --stop-after")
+    if args.env not in diffsim.TASKS:
+        fail(f"unknown task {args.env!r}: choose from {', '.join(diffsim.TASKS)}")
+    defaults = dict(zip(COLUMNS, PER_TASK.get(args.env, (*GENERAL, 2000)), strict=True))
+    if args.general_hyperparameters:
+        defaults.update(zip(COLUMNS, GENERAL, strict=False))
+    for name, value in defaults.items():
+        if getattr(args, name) is None:
+            setattr(args, name, value)
+    for name in ("iterations", "critic_iterations", "critic_minibatches", "eval_episodes", "stop_after", "threads"):
+        if (value := getattr(args, name)) is not None and value < 1:
+            fail(f"{flag(name)} must be at least 1, not {value}")
+    return args, checkpoint
+
+
+def clock(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def make_env(args: Args, num_envs: int, horizon: int) -> Any:
+    options = dict(substeps=args.substeps, integrator=args.integrator, threads=args.threads)
+    try:
+        return diffsim.make(args.env, num_envs, args.device, args.seed, horizon, **options)
+    except ValueError as error:
+        fail(error)
+
+
+def build(args: Args, env: Any) -> tuple[Actor, Normaliser]:
+    obs_dim, action_dim = env.single_observation_space.shape[0], env.single_action_space.shape[0]
+    return Actor(args, obs_dim, action_dim).to(args.device), Normaliser(obs_dim).to(args.device)
+
+
+def evaluate_only(args: Args, checkpoint: dict[str, Any]) -> None:
+    env = make_env(args, args.eval_episodes, horizon=1)
+    actor, normalise = build(args, env)
+    actor.load_state_dict(checkpoint["actor"])
+    normalise.load_state_dict(checkpoint["normalise"])
+    evaluation = evaluate(env, actor, normalise)
+    print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
+    if args.capture_video:
+        write_video(args.run_dir or args.evaluate.parent, env, evaluation)
+
+
+def write_video(directory: Path, env: Any, evaluation: Evaluation) -> None:
+    """The episode of median return, every other control step."""
+    episode = evaluation.returns.argsort()[(len(evaluation.returns) - 1) // 2]
+    qpos = evaluation.qpos[: evaluation.lengths[episode] : 2, episode].cpu().numpy()
+    try:
+        frames = render.render_frames(env.scene, qpos, width=480, height=360)
+        print(f"video: {render.write_video(directory / 'video.mp4', frames, fps=0.5 / env.control_dt)}")
+    except (ImportError, OSError, RuntimeError) as error:
+        fail(error)
+
+
+def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
+    run_name = f"{args.env}__{Path(__file__).stem}__{args.seed}__{int(time.time())}"
+    run_dir = args.run_dir or (args.resume.parent if args.resume else Path("runs") / run_name)
+    check_run_dir(run_dir, args.resume)
+    if args.track:
+        try:
+            import wandb
+        except ImportError:
+            fail("--track needs Weights & Biases: pip install wandb")
+    torch.manual_seed(args.seed)
+    env, eval_env = make_env(args, args.num_envs, args.horizon), make_env(args, args.eval_episodes, horizon=1)
+    args.substeps = args.substeps or env.task.substeps
+    actor, normalise = build(args, env)
+    critic = mlp(normalise.mean.numel(), args.critic_hidden, 1, orthogonal=True).to(env.device)
+    target = copy.deepcopy(critic).requires_grad_(False)
+    actor_optimizer, critic_optimizer = ClippedAdam(actor, args), ClippedAdam(critic, args)
+    samples = args.horizon * args.num_envs
+    batch_obs = torch.zeros(samples, normalise.mean.numel(), device=env.device)
+    batch_value = torch.zeros(samples, device=env.device)
+
+    # The two halves of an iteration (Algorithm 1). They keep their state in tensors, change it in place and never wait
+    # for the device: on a GPU each becomes one CUDA graph.
+    def update_actor() -> tuple[Tensor, Tensor, Window]:
+        window = collect(env, actor, normalise, actor.sample_noise(args.horizon, args.num_envs))
+        next_value = next_values(target, normalise, window)
+        loss = actor_loss(window.reward, next_value, window.done, args.gamma)
+        norm = actor_optimizer.step(loss)
+        window = Window(*(tensor.detach() for tensor in window))
+        value = td_lambda(window.reward, next_value.detach(), window.done, args.gamma, args.td_lambda)
+        batch_value.copy_(value.flatten())
+        batch_obs.copy_(normalise(window.obs).flatten(0, 1))
+        normalise.update(window.obs)
+        return loss.detach(), norm, window
+
+    def update_critic() -> Tensor:
+        batches = batch_obs.chunk(args.critic_minibatches), batch_value.chunk(args.critic_minibatches)
+        for _ in range(args.critic_iterations):
+            losses = []
+            for obs, value in zip(*batches, strict=True):
+                loss = (critic(obs).squeeze(-1) - value).square().mean()  # Eq. 6
+                critic_optimizer.step(loss)
+                losses.append(loss.detach())
+        for slow, fast in zip(target.parameters(), critic.parameters(), strict=True):
+            slow.lerp_(fast.detach(), 1 - args.target_alpha)
+        return torch.stack(losses).mean()  # of the last pass
+
+    update_actor, update_critic = graph.capture(update_actor, env.device, env), graph.capture(update_critic, env.device)
+
+    parts = dict(env=env, actor=actor, critic=critic, target=target, normalise=normalise)
+    parts |= dict(actor_optimizer=actor_optimizer, critic_optimizer=critic_optimizer)
+    rng = torch.cuda.default_generators[env.device.index or 0] if env.device.type == "cuda" else torch.default_generator
+    start, seconds, nonfinite = 0, 0.0, 0
+    finished: deque[list[float]] = deque(maxlen=100)  # return and length of the last training episodes
+    if checkpoint:
+        for name, part in parts.items():
+            part.load_state_dict(checkpoint[name])
+        rng.set_state(checkpoint["rng"])
+        start, seconds, nonfinite = (checkpoint[name] for name in ("iteration", "seconds", "nonfinite"))
+        finished.extend(checkpoint["finished"])
+
+    def save(iteration: int) -> None:
+        state = {name: part.state_dict() for name, part in parts.items()}
+        state["args"] = dataclasses.asdict(args) | dict(resume=None, run_dir=None, stop_after=None)
+        state |= dict(format=FORMAT, rng=rng.get_state(), finished=list(finished))
+        state |= dict(iteration=iteration, seconds=seconds, nonfinite=nonfinite)
+        save_checkpoint(run_dir / "checkpoint.pt", state)
+
+    run_dir.mkdir(parents=True, exist_ok=True)
+    arguments = dataclasses.asdict(args)
+    (run_dir / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
+    if args.track:
+        wandb.init(project="diffsim", name=run_dir.name, dir=run_dir, config=arguments, sync_tensorboard=True)
+    writer = SummaryWriter(str(run_dir), purge_step=start * samples + 1 if start else None)
+    table = "\n".join(f"|{name}|{value}|" for name, value in arguments.items())
+    writer.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}")
+    progress_file, progress = open_progress(run_dir / "progress.csv", start)
+
+    signals: list[int] = []
+
+    def on_signal(number: int, _frame: Any) -> None:
+        signals.append(number)  # the iteration is finished first; the same signal again has its usual effect
+        signal.signal(number, handlers[number])
+
+    handlers = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    last = min(args.iterations, args.stop_after or args.iterations)
+    terminal, shown, durations = sys.stdout.isatty(), 0.0, deque(maxlen=50)
+    for iteration in range(start + 1, last + 1):
+        for optimizer, lr in ((actor_optimizer, args.actor_lr), (critic_optimizer, args.critic_lr)):
+            optimizer.lr.fill_(lr + (args.final_lr - lr) * (iteration - 1) / args.iterations)
+        simulated, begin = dict(env.sim.seconds), clock(env.device)
+        loss, norm, window = update_actor()
+        middle = clock(env.device)
+        critic_loss = update_critic()
+        end = clock(env.device)
+
+        durations.append(end - begin)
+        seconds += end - begin
+        nonfinite += int(window.nonfinite.sum())
+        nonfinite_gradients = int(env.sim.nonfinite_gradients.sum())
+        skipped = int(actor_optimizer.skipped + critic_optimizer.skipped)
+        finished.extend(torch.stack((window.episode_return, window.episode_length), -1)[window.done].tolist())
+        scalars = {
+            "charts/SPS": samples / (end - begin),
+            "losses/actor": loss.item(),
+            "losses/critic": critic_loss.item(),
+            "grad/norm": norm.item(),
+            "grad/skipped": skipped,
+            "sim/nonfinite": nonfinite,
+            "sim/nonfinite_gradients": nonfinite_gradients,
+            "time/sim_forward": env.sim.seconds["forward"] - simulated["forward"],
+            "time/sim_backward": env.sim.seconds["backward"] - simulated["backward"],
+            "time/critic": end - middle,
+            "time/total": end - begin,
+        }
+        if finished:
+            episodic_return, episodic_length = (sum(column) / len(finished) for column in zip(*finished, strict=True))
+            scalars |= {"charts/episodic_return": episodic_return, "charts/episodic_length": episodic_length}
+        evaluation = None
+        if iteration == args.iterations or (args.eval_every and iteration % args.eval_every == 0):
+            evaluation = evaluate(eval_env, actor, normalise)
+            scalars |= evaluation.scalars()
+        for key, value in scalars.items():
+            writer.add_scalar(key, value, iteration * samples)
+        row = dict(iteration=iteration, control_steps=iteration * samples, seconds=round(seconds, 3))
+        progress.writerow(row | {PROGRESS[key]: value for key, value in scalars.items() if key in PROGRESS})
+        progress_file.flush()
+
+        if evaluation and not args.quiet:
+            print(f"{f'iteration {iteration}: {evaluation}':<79}")
+        if not args.quiet and (iteration == last or time.monotonic() - shown > (0.1 if terminal else 10.0)):
+            shown, rate = time.monotonic(), len(durations) / sum(durations)
+            bar = f"{'#' * (20 * iteration // args.iterations):<20}"
+            left = timedelta(seconds=round((args.iterations - iteration) / rate))
+            mean_return = scalars.get("charts/episodic_return", math.nan)
+            line = f"[{bar}] {iteration}/{args.iterations}, return {mean_return:.1f}, {rate:.2f} it/s, {left} left"
+            print(f"{line:<79}", end="\r" if terminal and iteration < last else "\n", flush=True)
+        if signals or iteration == last or (args.save_every and iteration % args.save_every == 0):
+            save(iteration)
+        if signals:
+            break
+
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    writer.close()
+    progress_file.close()
+    print(f"{args.env}: {iteration} iterations, {iteration * samples:,} control steps, {seconds:.1f} s of training")
+    print(f"skipped {skipped} updates, contained {nonfinite} non-finite states and {nonfinite_gradients} gradients")
+    if evaluation:
+        print(f"deterministic policy, {args.eval_episodes} episodes: {evaluation}")
+    print(f"written to {run_dir}")
+    if iteration < args.iterations:
+        print(f"stopped early: python shac.py --resume {run_dir / 'checkpoint.pt'} goes on")
+    elif args.capture_video:
+        write_video(run_dir, eval_env, evaluation)
+    if signals:
+        sys.exit(128 + signals[0])
+
+
+def main(argv: list[str] | None = None) -> None:
+    args, checkpoint = parse(argv)
+    torch.set_num_threads(1)  # operations this small gain little from more; idle ones would busy the simulator's cores
+    if args.evaluate:
+        evaluate_only(args, checkpoint)
+    else:
+        train(args, checkpoint)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,240 @@
+"""The simulator once more in plain NumPy and double precision: dense, slow, and sharing no recursion with the kernels.
+
+The mass matrix is the sum of J' I J over the links, the bias force comes from Newton's and Euler's equations at zero
+joint acceleration, and the accelerations from `numpy.linalg.solve`. Vectors are in world axes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffsim.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass
+class Link:
+    """Motion of a link's frame: pose, velocity, Jacobians, and the accelerations that remain when qacc is zero."""
+
+    rotation: Array  # (3, 3)
+    position: Array  # (3,)
+    angular_velocity: Array  # (3,)
+    velocity: Array  # (3,) of the frame's origin
+    angular_jacobian: Array  # (3, nv): angular_velocity = angular_jacobian @ qvel
+    jacobian: Array  # (3, nv): velocity = jacobian @ qvel
+    angular_bias: Array  # (3,) d/dt angular_jacobian @ qvel
+    bias: Array  # (3,) d/dt jacobian @ qvel
+
+    def point(self, offset: Array) -> tuple[Array, Array, Array]:
+        """Velocity, Jacobian and bias acceleration of the material point at `offset` (world axes) from the origin."""
+        w = self.angular_velocity
+        return (
+            self.velocity + np.cross(w, offset),
+            self.jacobian + np.cross(self.angular_jacobian, offset, axisa=0, axisc=0),
+            self.bias + np.cross(self.angular_bias, offset) + np.cross(w, np.cross(w, offset)),
+        )
+
+
+def kinematics(scene: Scene, qpos: Array, qvel: Array) -> list[Link]:
+    zero, nothing = np.zeros(3), np.zeros((3, scene.nv))
+    base = Link(np.eye(3), zero, zero, zero, nothing.copy(), nothing.copy(), zero, zero)
+    if scene.floating:
+        base.rotation = quaternion_matrix(qpos[3:7] / np.linalg.norm(qpos[3:7]))
+        base.position = qpos[:3]
+        base.velocity, base.jacobian[:, :3] = qvel[:3], np.eye(3)
+        base.angular_velocity, base.angular_jacobian[:, 3:6] = base.rotation @ qvel[3:6], base.rotation
+    links = [base]
+    for i in range(1, scene.nlink):
+        q, qd, dof = qpos[joint_qpos(scene, i)], qvel[joint_dof(scene, i)], joint_dof(scene, i)
+        parent = links[scene.parent[i]]
+        frame = parent.rotation @ scene.rotation[i]
+        axis = frame @ scene.axis[i]
+        offset = parent.rotation @ scene.position[i]
+        if scene.slide[i]:
+            offset = offset + axis * (q - scene.joint_ref[i])
+        else:
+            frame = frame @ axis_angle_matrix(scene.axis[i], q - scene.joint_ref[i])
+        velocity, jacobian, bias = parent.point(offset)
+        w = parent.angular_velocity
+        link = Link(
+            frame,
+            parent.position + offset,
+            w,
+            velocity,
+            parent.angular_jacobian.copy(),
+            jacobian,
+            parent.angular_bias,
+            bias,
+        )
+        if scene.slide[i]:
+            link.velocity = velocity + axis * qd
+            link.jacobian[:, dof] += axis
+            link.bias = bias + 2 * np.cross(w, axis * qd)
+        else:
+            link.angular_velocity = w + axis * qd
+            link.angular_jacobian[:, dof] += axis
+            link.angular_bias = parent.angular_bias + np.cross(w, axis * qd)
+        links.append(link)
+    return links
+
+
+def mass_and_bias(scene: Scene, links: list[Link]) -> tuple[Array, Array]:
+    """(nv, nv) mass matrix and (nv,) bias force: mass @ qacc + bias = every other generalised force."""
+    mass, bias = np.zeros((scene.nv, scene.nv)), np.zeros(scene.nv)
+    for i, link in enumerate(links):
+        w, jw = link.angular_velocity, link.angular_jacobian
+        _, jc, acceleration = link.point(link.rotation @ scene.com[i])
+        inertia = link.rotation @ scene.inertia[i] @ link.rotation.T
+        mass += scene.mass[i] * jc.T @ jc + jw.T @ inertia @ jw
+        bias += scene.mass[i] * jc.T @ (acceleration - scene.gravity)
+        bias += jw.T @ (inertia @ link.angular_bias + np.cross(w, inertia @ w))
+        if i > 0:
+            mass[joint_dof(scene, i), joint_dof(scene, i)] += scene.armature[i]
+    return mass, bias
+
+
+def joint_forces(
+    scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float = 0.0, theta: float = 0.0
+) -> tuple[Array, Array]:
+    """Motors, springs, dampers and limits (Eq. 4) at zero acceleration, and their (nv,) resistance to it."""
+    force, resistance = np.zeros(scene.nv), np.zeros(scene.nv)
+    for motor, link in enumerate(scene.motor_link):
+        force[joint_dof(scene, link)] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]
+    for i in range(1, scene.nlink):
+        dof, qd = joint_dof(scene, i), qvel[joint_dof(scene, i)]
+        q = qpos[joint_qpos(scene, i)] + theta * h * qd
+        bound = np.clip(q, scene.lower[i], scene.upper[i])
+        beyond = q != bound
+        damping = scene.damping[i] + beyond * scene.d_limit
+        force[dof] += scene.stiffness[i] * (scene.spring_ref[i] - q) - damping * qd
+        if beyond:
+            force[dof] += scene.k_limit * (bound - q)
+        resistance[dof] = h * damping + theta * h**2 * (scene.stiffness[i] + beyond * scene.k_limit)
+    return force, resistance
+
+
+def contact_law(scene: Scene, depth: float, velocity: Array, h: float = 0.0, theta: float = 0.0) -> tuple[Array, Array]:
+    """Eq. 3: force on a sphere of signed depth (negative inside) whose lowest point moves so, and its resistance."""
+    normal = max((scene.k_d * velocity[2] - scene.k_n) * depth, 0.0)
+    if depth >= 0 or normal == 0:
+        return np.zeros(3), np.zeros(3)
+    slip = np.hypot(velocity[0], velocity[1])
+    viscosity = min(scene.k_t * slip, scene.mu * normal) / slip if slip > 0 else scene.k_t
+    force = np.array([-viscosity * velocity[0], -viscosity * velocity[1], normal])
+    return force, h * np.array([viscosity, viscosity, theta * h * scene.k_n - scene.k_d * depth])
+
+
+def lowest_points(scene: Scene, links: list[Link]) -> list[tuple[Link, Array, float]]:
+    """The link, the lowest point (from the link's origin) and its signed depth, of each contact sphere."""
+    points = []
+    for i, centre, radius in zip(scene.contact_link, scene.contact_position, scene.contact_radius, strict=True):
+        lowest = links[i].rotation @ centre - np.array([0.0, 0.0, radius])
+        points.append((links[i], lowest, links[i].position[2] + lowest[2] - scene.ground_height))
+    return points
+
+
+def contacts(scene: Scene, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+    """Signed depths (nc,) and velocities (nc, 3) of the lowest points of all contact spheres."""
+    points = lowest_points(scene, kinematics(scene, qpos, qvel))
+    depths = np.array([depth for _, _, depth in points])
+    return depths, np.array([link.point(lowest)[0] for link, lowest, _ in points]).reshape(-1, 3)
+
+
+def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float = 0.0, theta: float = 0.0) -> Array:
+    """qacc of mass @ qacc = forces - bias. The implicit step has forces that are linear in it: f - resistance * a.
+
+    h is the substep of the implicit integrator, 0 for the explicit one; theta how far ahead stiffness is evaluated.
+    """
+    links = kinematics(scene, qpos, qvel)
+    mass, bias = mass_and_bias(scene, links)
+    force, resistance = joint_forces(scene, qpos, qvel, ctrl, h, theta)
+    mass, force = mass + np.diag(resistance), force - bias
+    for link, lowest, depth in lowest_points(scene, links):
+        velocity, jacobian, drift = link.point(lowest)
+        push, resistance = contact_law(scene, depth + theta * h * velocity[2], velocity, h, theta)
+        # The law resists the change of the velocity field at a fixed place, so w x v of the moving point is not in it.
+        drift = drift - np.cross(link.angular_velocity, velocity)
+        mass = mass + jacobian.T @ np.diag(resistance) @ jacobian
+        force = force + jacobian.T @ (push - resistance * drift)
+    return np.linalg.solve(mass, force)
+
+
+def integrate(scene: Scene, qpos: Array, qvel: Array, h: float) -> Array:
+    """qpos after moving with qvel for h seconds, the orientation by the exact exponential."""
+    if not scene.floating:
+        return qpos + h * qvel
+    rotation = h * qvel[3:6]
+    angle = np.linalg.norm(rotation)
+    turn = np.array([np.cos(angle / 2), *(np.sinc(angle / (2 * np.pi)) / 2 * rotation)])
+    orientation = quaternion_product(qpos[3:7] / np.linalg.norm(qpos[3:7]), turn)
+    return np.concatenate([qpos[:3] + h * qvel[:3], orientation, qpos[7:] + h * qvel[6:]])
+
+
+def step(
+    scene: Scene,
+    qpos: Array,
+    qvel: Array,
+    ctrl: Array,
+    control_dt: float,
+    substeps: int,
+    integrator: str = "semi_implicit",
+    theta: float = 0.0,
+) -> tuple[Array, Array]:
+    """One control step of one environment."""
+    h = control_dt / substeps
+    for _ in range(substeps):
+        implicit = h if integrator == "implicit" else 0.0
+        qvel = qvel + h * acceleration(scene, qpos, qvel, ctrl, implicit, theta)
+        qpos = integrate(scene, qpos, qvel, h)
+    return qpos, qvel
+
+
+def momentum(scene: Scene, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+    """Linear momentum, and angular momentum about the centre of mass."""
+    links = kinematics(scene, qpos, qvel)
+    centres = np.array([link.position + link.rotation @ c for link, c in zip(links, scene.com, strict=True)])
+    velocities = np.array([link.point(link.rotation @ c)[0] for link, c in zip(links, scene.com, strict=True)])
+    linear = scene.mass[:, None] * velocities
+    angular = np.cross(centres - scene.mass @ centres / scene.mass.sum(), linear).sum(0)
+    for link, inertia in zip(links, scene.inertia, strict=True):
+        angular = angular + link.rotation @ inertia @ link.rotation.T @ link.angular_velocity
+    return linear.sum(0), angular
+
+
+def energy(scene: Scene, qpos: Array, qvel: Array) -> float:
+    """Kinetic energy and the potential of gravity and springs."""
+    links = kinematics(scene, qpos, qvel)
+    centres = np.array([link.position + link.rotation @ c for link, c in zip(links, scene.com, strict=True)])
+    stretch = qpos[-scene.nlink + 1 :] - scene.spring_ref[1:] if scene.nlink > 1 else np.zeros(0)
+    potential = -scene.mass @ centres @ scene.gravity + stretch**2 @ scene.stiffness[1:] / 2
+    return float(qvel @ mass_and_bias(scene, links)[0] @ qvel / 2 + potential)
+
+
+def joint_dof(scene: Scene, link: int) -> int:
+    return link - 1 + 6 * scene.floating
+
+
+def joint_qpos(scene: Scene, link: int) -> int:
+    return link - 1 + 7 * scene.floating
+
+
+def quaternion_matrix(quaternion: Array) -> Array:
+    w, v = quaternion[0], quaternion[1:]
+    return (w * w - v @ v) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * skew(v)
+
+
+def axis_angle_matrix(axis: Array, angle: float) -> Array:
+    return np.eye(3) + np.sin(angle) * skew(axis) + (1 - np.cos(angle)) * skew(axis) @ skew(axis)
+
+
+def quaternion_product(a: Array, b: Array) -> Array:
+    w = a[0] * b[0] - a[1:] @ b[1:]
+    return np.array([w, *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
+
+
+def skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

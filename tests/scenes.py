@@ -1,0 +1,242 @@
+"""The robots of the tests, and states in which the ground and the joint limits act on them."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import reference
+import torch
+from numpy.typing import NDArray
+
+import diffsim
+from diffsim.scene import Scene, load_scene
+from diffsim.simulator import Simulator
+from diffsim.tasks import TASKS
+
+Array = NDArray[np.float64]
+
+# A free sphere of 2 kg; it falls, rolls, slides and rests.
+BALL = """
+<mujoco>
+  <custom>
+    <numeric name="k_n" data="2e4"/> <numeric name="k_d" data="2e4"/> <numeric name="k_t" data="50"/>
+    <numeric name="mu" data="0.5"/>
+  </custom>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body pos="0 0 1"> <freejoint/> <geom type="sphere" size="0.1" mass="2"/> </body>
+  </worldbody>
+</mujoco>"""
+
+# A free box of 1 kg that slides on its lower corners.
+BLOCK = """
+<mujoco>
+  <custom>
+    <numeric name="k_n" data="1e4"/> <numeric name="k_d" data="1e4"/> <numeric name="k_t" data="200"/>
+    <numeric name="mu" data="0.5"/>
+  </custom>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body> <freejoint/> <geom type="box" size="0.2 0.2 0.02" mass="1"/> </body>
+  </worldbody>
+</mujoco>"""
+
+# A physical pendulum about the y axis, hanging at angle 0.
+PENDULUM = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint axis="0 1 0"/>
+      <inertial pos="0 0 -0.8" mass="1.5" diaginertia="0.1 0.2 0.15"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+# One limited, driven hinge about the vertical, so that only its own laws act.
+HINGE = """
+<mujoco>
+  <compiler angle="radian"/>
+  <custom> <numeric name="k_limit" data="300"/> <numeric name="d_limit" data="2"/> </custom>
+  <worldbody>
+    <body>
+      <joint name="hinge" axis="0 0 1" range="-0.5 0.5" armature="0.1"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="0.4 0.4 0.4"/>
+    </body>
+  </worldbody>
+  <actuator> <motor joint="hinge" gear="3" ctrlrange="-1 1" ctrllimited="true"/> </actuator>
+</mujoco>"""
+
+
+def parse(mjcf: str) -> Scene:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.xml"
+        path.write_text(mjcf)
+        return load_scene(path)
+
+
+@cache
+def task_scene(name: str) -> Scene:
+    return load_scene(Path(diffsim.__file__).parent / "assets" / TASKS[name].asset)
+
+
+@cache
+def tree_scene(base: str, seed: int) -> Scene:
+    return parse(random_tree(base, seed))
+
+
+def random_tree(base: str, seed: int) -> str:
+    """MJCF of a random tree: seven hinges and slides, up to three a body, welded bodies, everything else random.
+
+    `base` is "floating", "fixed" (the first joint is a hinge) or "planar" (two slides without mass lead to the rest).
+    All seeds of a base have the same shape, so one compiled kernel serves them. The ground is far below.
+    """
+    rng = np.random.default_rng(seed)
+    joints = 0
+
+    def numbers(count: int) -> str:
+        return " ".join(map(str, rng.normal(size=count)))
+
+    def joint(kind: str) -> str:
+        nonlocal joints
+        joints += 1
+        low, high = -rng.uniform(0.2, 1.5), rng.uniform(0.2, 1.5)
+        spring = f'stiffness="{rng.uniform(0, 20)}" springref="{rng.normal()}" damping="{rng.uniform(0, 2)}"'
+        limit = f'limited="true" range="{low} {high}"' if rng.random() < 0.7 else ""
+        place = f'pos="{numbers(3)}" axis="{numbers(3)}" ref="{0.5 * rng.normal()}" armature="{rng.uniform(0, 0.5)}"'
+        return f'<joint name="joint{joints}" type="{kind}" {place} {spring} {limit}/>'
+
+    def inertial() -> str:
+        spread = rng.uniform(0.05, 0.5, 3)
+        moments = " ".join(map(str, spread.sum() - spread))  # no moment exceeds the sum of the two others
+        return (
+            f'<inertial pos="{numbers(3)}" quat="{numbers(4)}" mass="{rng.uniform(0.5, 3)}" diaginertia="{moments}"/>'
+        )
+
+    def geom() -> str:
+        place = f'pos="{numbers(3)}" quat="{numbers(4)}"'
+        kind = rng.choice(["sphere", "capsule", "box"])
+        return f'<geom type="{kind}" size="{" ".join(map(str, rng.uniform(0.05, 0.3, 3)))}" {place}/>'
+
+    def body(joint_tags: str) -> str:
+        return f'<body pos="{numbers(3)}" quat="{numbers(4)}">{joint_tags}{inertial()}{geom()}'
+
+    first = {
+        "floating": "<freejoint/>",
+        "fixed": joint("hinge") if base == "fixed" else "",
+        "planar": joint("slide") + joint("slide") + joint("hinge") if base == "planar" else "",
+    }[base]
+    text, depth = body(first), 1
+    while joints < 7:
+        for _ in range(rng.integers(0, depth)):  # climb back to an ancestor, never beyond the first body
+            text, depth = text + "</body>", depth - 1
+        count = min(int(rng.integers(0, 4)), 7 - joints)  # 0: a welded body
+        text, depth = text + body("".join(joint(rng.choice(["hinge", "slide"])) for _ in range(count))), depth + 1
+    text += "</body>" * depth
+    motors = "".join(
+        f'<motor joint="joint{j}" gear="{10 * rng.normal()}" ctrllimited="true" ctrlrange="{-rng.random()} 1.5"/>'
+        for j in rng.choice(np.arange(1, 8), 4, replace=False)
+    )
+    return f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="{rng.normal()} {rng.normal()} -9.81"/>
+  <custom>
+    <numeric name="k_n" data="2e3"/> <numeric name="k_d" data="2e2"/> <numeric name="k_t" data="200"/>
+    <numeric name="mu" data="0.7"/> <numeric name="k_limit" data="500"/> <numeric name="d_limit" data="3"/>
+  </custom>
+  <worldbody> <geom type="plane" size="1 1 1" pos="0 0 -100"/> {text} </worldbody>
+  <actuator> {motors} </actuator>
+</mujoco>"""
+
+
+def free_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Random (qpos, qvel, ctrl) within the joint limits; the ground is not looked at."""
+    qpos = np.zeros((count, scene.nq))
+    if scene.floating:
+        qpos[:, :3] = rng.normal(size=(count, 3))
+        qpos[:, 3:7] = unit(rng.normal(size=(count, 4)))
+    low, high = np.maximum(scene.lower[1:], -2.0), np.minimum(scene.upper[1:], 2.0)
+    qpos[:, scene.nq - scene.nlink + 1 :] = rng.uniform(low, high, (count, scene.nlink - 1))
+    return qpos, rng.normal(size=(count, scene.nv)), rng.uniform(-1, 1, (count, scene.nu))
+
+
+def acting_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Random (qpos, qvel, ctrl) of a task's robot, pressed into the ground and with some joints beyond their limits.
+
+    Every other state is nearly at rest, so that its contacts stick; in the rest many slide.
+    """
+    qpos, qvel, ctrl = free_states(scene, count, rng)
+    if scene.floating:
+        qpos[:, 3:7] = unit(scene.qpos0[3:7] + 0.2 * rng.normal(size=(count, 4)))
+    pass_limits(scene, qpos, rng)
+    if scene.ncontact:
+        for e in range(count):
+            lowest = reference.contacts(scene, qpos[e], qvel[e])[0].min()
+            qpos[e, 2 if scene.floating else 1] -= lowest + rng.uniform(0.005, 0.03)
+    qvel[::2] *= 0.02
+    return qpos, qvel, ctrl
+
+
+def check_that_ground_and_limits_act(scene: Scene, qpos: Array, qvel: Array) -> None:
+    """Every state touches the ground, half of them pass a limit; some contacts stick and some slide."""
+    joints = qpos[:, scene.nq - scene.nlink + 1 :]
+    assert ((joints < scene.lower[1:]) | (joints > scene.upper[1:])).any(-1).mean() >= 0.5
+    if scene.ncontact:
+        points = [reference.contacts(scene, *state) for state in zip(qpos, qvel, strict=True)]
+        depths, velocities = np.array([p[0] for p in points]), np.array([p[1] for p in points])
+        assert (depths < 0).any(-1).all()
+        normal = np.maximum((scene.k_d * velocities[..., 2] - scene.k_n) * depths, 0)
+        slides = scene.k_t * np.linalg.norm(velocities[..., :2], axis=-1) > scene.mu * normal
+        assert slides[depths < 0].any() and not slides[depths < 0].all()
+
+
+def pass_limits(scene: Scene, qpos: Array, rng: np.random.Generator) -> None:
+    """Draw the limited joints anew: a third within their range, a third up to 5 % beyond each end of it."""
+    for link in np.flatnonzero(np.isfinite(scene.lower)):
+        beyond = 0.05 * rng.random(len(qpos))
+        part = np.choose(rng.integers(0, 3, len(qpos)), [-beyond, rng.random(len(qpos)), 1 + beyond])
+        qpos[:, reference.joint_qpos(scene, link)] = scene.lower[link] + part * (scene.upper[link] - scene.lower[link])
+
+
+def raise_ground(scene: Scene, qpos: Array) -> Scene:
+    """The scene with its ground so high that a third of the contact spheres of these states are in it."""
+    rest = np.zeros(scene.nv)
+    depths = np.sort(np.concatenate([reference.contacts(scene, q, rest)[0] for q in qpos]))
+    third = len(depths) // 3
+    return dataclasses.replace(scene, ground_height=scene.ground_height + depths[third : third + 2].mean())
+
+
+def without_ground(scene: Scene) -> Scene:
+    """The same scene, hence the same kernels, with the ground too deep to be reached."""
+    return dataclasses.replace(scene, ground_height=-1e3)
+
+
+def unit(quaternion: Array) -> Array:
+    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+
+
+def run(
+    scene: Scene,
+    qpos: Array,
+    qvel: Array,
+    ctrl: Array,
+    steps: int = 1,
+    dtype: torch.dtype = torch.float64,
+    **simulator: object,
+) -> tuple[Array, Array]:
+    """qpos and qvel after some control steps of constant ctrl, without gradients."""
+    sim = Simulator(scene, len(qpos), dtype=dtype, **simulator)
+    q, v, u = (torch.as_tensor(x, dtype=dtype) for x in (qpos, qvel, ctrl))
+    with torch.no_grad():
+        for _ in range(steps):
+            q, v = sim.step(q, v, u)
+    return q.double().numpy(), v.double().numpy()
+
+
+def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, **simulator: object) -> Array:
+    """qacc: the change of velocity over one substep of one second."""
+    return run(scene, qpos, qvel, ctrl, control_dt=1.0, substeps=1, **simulator)[1] - qvel

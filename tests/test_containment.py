@@ -1,0 +1,223 @@
+"""What goes wrong in one environment stays there, and what the caller does wrong is said in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import PENDULUM, acting_states, parse, task_scene
+
+import diffsim
+from diffsim.simulator import Simulator
+
+BAD, GOOD = 2, [0, 1, 3, 4]
+
+
+def leaves(*arrays, dtype=torch.float32):
+    return [torch.tensor(x, dtype=dtype, requires_grad=True) for x in arrays]
+
+
+def step_and_gradients(sim, states):
+    inputs = leaves(*states)
+    outputs = sim.step(*inputs)
+    gradients = torch.autograd.grad([output.sum() for output in outputs], inputs)
+    return [x.detach() for x in outputs], list(gradients)
+
+
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("where, value", [(0, np.nan), (1, 1e30), (1, -np.inf), (2, np.nan)])
+def test_simulator_contains_what_is_not_finite(name, threads, where, value, rng):
+    scene = task_scene(name)
+    states = acting_states(scene, 5, rng)
+    sim = Simulator(scene, 5, threads=threads)
+    outputs, gradients = step_and_gradients(sim, states)
+    assert not sim.nonfinite.any()
+    states[where][BAD, -1] = value
+    bad_outputs, bad_gradients = step_and_gradients(sim, states)
+    np.testing.assert_array_equal(sim.nonfinite, [False, False, True, False, False])
+    for output, expected, start in zip(bad_outputs, outputs, states[:2], strict=True):
+        torch.testing.assert_close(output[GOOD], expected[GOOD], rtol=0, atol=0)
+        np.testing.assert_array_equal(output[BAD], start[BAD].astype(np.float32))
+    for gradient, expected in zip(bad_gradients, gradients, strict=True):
+        torch.testing.assert_close(gradient[GOOD], expected[GOOD], rtol=0, atol=0)
+        assert (gradient[BAD] == 0).all() and (expected[BAD] != 0).any()
+    assert sim.nonfinite_gradients.sum() == 0
+    assert not step_and_gradients(sim, states := acting_states(scene, 5, rng))[0][0].isnan().any()
+    assert not sim.nonfinite.any()
+
+
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+def test_simulator_contains_a_gradient_that_is_not_finite(name, rng):
+    scene, sim = task_scene(name), Simulator(task_scene(name), 5)
+    inputs = leaves(*acting_states(scene, 5, rng))
+    outputs = sim.step(*inputs)
+    weights = [torch.ones_like(output) for output in outputs]
+    expected = torch.autograd.grad(outputs, inputs, weights, retain_graph=True)
+    weights[1][BAD, 0] = torch.nan
+    gradients = torch.autograd.grad(outputs, inputs, weights)
+    for gradient, wanted in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(gradient[GOOD], wanted[GOOD], rtol=0, atol=0)
+        assert (gradient[BAD] == 0).all()
+    assert sim.nonfinite_gradients.tolist() == [0, 0, 1, 0, 0]
+
+
+def rollout(name, threads, velocity=None, steps=4):
+    """Observations, rewards and gradients of a few steps; one environment starts with the given velocity."""
+    env = diffsim.make(name, num_envs=5, seed=3, horizon=steps, threads=threads)
+    if velocity is not None:
+        qvel = env.qvel.clone()
+        qvel[BAD, -1] = velocity
+        env.set_state(env.qpos, qvel)
+    generator = torch.Generator().manual_seed(0)
+    actions = [torch.randn(5, env.scene.nu, generator=generator).tanh().requires_grad_() for _ in range(steps)]
+    history = [env.step(action) for action in actions]
+    total = sum(obs.sum() + reward.sum() + info["final_obs"].sum() for obs, reward, _, _, info in history)
+    return history, torch.stack(torch.autograd.grad(total, actions)), env
+
+
+@pytest.mark.parametrize("name", ["cartpole", "hopper", "ant"])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_environment_that_blows_up_is_reset_and_counted(name, threads):
+    history, gradients, _ = rollout(name, threads)
+    bad_history, bad_gradients, env = rollout(name, threads, velocity=1e30)
+    for step, (record, bad_record) in enumerate(zip(history, bad_history, strict=True)):
+        assert bad_record[4]["nonfinite"].tolist() == [False, False, step == 0, False, False]
+        assert not record[4]["nonfinite"].any()
+        for x, y in zip(record[:4], bad_record[:4], strict=True):
+            torch.testing.assert_close(y[GOOD], x[GOOD], rtol=0, atol=0)
+        torch.testing.assert_close(bad_record[4]["final_obs"][GOOD], record[4]["final_obs"][GOOD], rtol=0, atol=0)
+        assert bad_record[0].isfinite().all()
+    obs, reward, terminated, truncated, info = bad_history[0]
+    assert reward[BAD] == 0 and terminated[BAD] and not truncated[BAD]
+    assert info["_final_obs"][BAD] and info["_episode"][BAD] and info["episode"]["l"][BAD] == 1
+    assert obs[BAD].abs().max() < 100  # a start state
+    assert env.episode_step[BAD] == 3
+
+    torch.testing.assert_close(bad_gradients[:, GOOD], gradients[:, GOOD], rtol=0, atol=0)
+    assert (bad_gradients[1:, BAD] != 0).any() and (gradients[0, BAD] != 0).any()
+    assert bad_gradients.isfinite().all()
+    # The old episode's last action shows in its last observation, where the task has it there, and nowhere else.
+    shown = 1.0 if name == "ant" else 0.0
+    torch.testing.assert_close(bad_gradients[0, BAD], torch.full_like(gradients[0, BAD], shown), rtol=0, atol=0)
+
+
+def test_blow_up_ends_the_episode_without_early_termination_too():
+    env = diffsim.make("hopper", num_envs=2, early_termination=False, seed=0)
+    qvel = env.qvel.clone()
+    qvel[1] = 1e30
+    env.set_state(env.qpos, qvel)
+    with torch.no_grad():
+        _, _, terminated, _, info = env.step(torch.zeros(2, 3))
+    assert terminated.tolist() == info["nonfinite"].tolist() == [False, True]
+
+
+# The caller's mistakes
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"name": "walker"}, "walker.*cartpole, hopper, half_cheetah, ant, humanoid"),
+        ({"num_envs": 0}, "num_envs.*0.*at least 1"),
+        ({"num_envs": 2.5}, "num_envs"),
+        ({"horizon": 0}, "horizon.*0"),
+        ({"substeps": 0}, "substeps.*0"),
+        ({"threads": 0}, "threads.*0"),
+        ({"integrator": "rk4"}, "rk4.*semi_implicit, implicit"),
+        ({"theta": 1.5, "integrator": "implicit"}, "theta.*1.5"),
+        ({"dtype": torch.float16}, "float16.*float32.*float64"),
+        ({"device": "tpu"}, "tpu.*cpu"),
+    ],
+)
+def test_make_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message) as error:
+        diffsim.make(**({"name": "cartpole", "num_envs": 2} | arguments))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_cuda_where_there_is_none():
+    with pytest.raises(ValueError, match="cuda.*cpu"):
+        diffsim.make("cartpole", device="cuda")
+
+
+def test_control_time_must_be_positive():
+    for seconds in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="control_dt"):
+            Simulator(parse(PENDULUM), 1, control_dt=seconds)
+
+
+@pytest.mark.parametrize(
+    "action, message",
+    [
+        (torch.zeros(2, 4), r"action.*\(2, 4\).*\(2, 3\)"),
+        (torch.zeros(3), r"action.*\(3,\).*\(2, 3\)"),
+        (torch.zeros(1, 3), r"action.*\(1, 3\).*\(2, 3\)"),
+        (torch.zeros(2, 3, dtype=torch.float64), "action.*float64.*float32"),
+        (torch.zeros(2, 3, dtype=torch.int64), "action.*int64.*float32"),
+        (torch.zeros(2, 3, device="meta"), "action.*meta.*cpu"),
+        (np.zeros((2, 3), np.float32), "action.*ndarray.*Tensor"),
+        (torch.tensor([[0.0, 0.0, 0.0], [0.0, torch.nan, 0.0]]), "action.*NaN.*1"),
+    ],
+)
+def test_step_refuses(action, message):
+    env = diffsim.make("hopper", num_envs=2, seed=0)
+    qpos, obs = env.qpos.clone(), env.detach()
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    torch.testing.assert_close(env.qpos, qpos, rtol=0, atol=0)
+    assert (env.episode_step == 0).all() and torch.equal(env.detach(), obs)
+
+
+def test_simulator_refuses_a_wrong_state():
+    sim = Simulator(task_scene("hopper"), 2)
+    good = [torch.zeros(2, 6), torch.zeros(2, 6), torch.zeros(2, 3)]
+    for k, name in enumerate(("qpos", "qvel", "ctrl")):
+        for wrong in (torch.zeros(2, 7), good[k].double()):
+            with pytest.raises(ValueError, match=name):
+                sim.step(*[wrong if i == k else x for i, x in enumerate(good)])
+
+
+def test_set_state_refuses():
+    env = diffsim.make("hopper", num_envs=2, seed=0)
+    with pytest.raises(ValueError, match="qpos"):
+        env.set_state(env.qpos[:1], env.qvel)
+    with pytest.raises(ValueError, match="qvel.*finite"):
+        env.set_state(env.qpos, env.qvel * torch.inf)
+
+
+def test_horizon_is_a_limit_of_differentiable_steps_only():
+    env = diffsim.make("cartpole", num_envs=2, horizon=2, seed=0)
+    action = torch.zeros(2, 1, requires_grad=True)
+    with torch.no_grad():
+        for _ in range(5):
+            env.step(action)
+    for _ in range(2):
+        env.detach()
+        env.step(action)
+        env.step(action)
+        with pytest.raises(RuntimeError, match=r"horizon of 2 .*detach\(\)"):
+            env.step(action)
+
+
+def test_overwritten_checkpoint_is_noticed(rng):
+    scene = task_scene("hopper")
+    sim = Simulator(scene, 2, horizon=2)
+    states = leaves(*acting_states(scene, 2, rng))
+    first, second, third = (sim.step(*states)[0].sum() for _ in range(3))
+    expected = torch.autograd.grad(second, states)
+    torch.testing.assert_close(torch.autograd.grad(third, states), expected, rtol=0, atol=0)
+    with pytest.raises(RuntimeError, match="overwritten.*2.*horizon"):
+        torch.autograd.grad(first, states)
+
+
+def test_steps_without_gradient_leave_checkpoints_alone(rng):
+    scene = task_scene("hopper")
+    sim = Simulator(scene, 2)
+    states = leaves(*acting_states(scene, 2, rng))
+    total = sim.step(*states)[0].sum()
+    expected = torch.autograd.grad(total, states, retain_graph=True)
+    with torch.no_grad():
+        sim.step(*(x + 0.1 for x in states))
+    torch.testing.assert_close(torch.autograd.grad(total, states), expected, rtol=0, atol=0)

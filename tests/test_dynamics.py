@@ -1,0 +1,313 @@
+"""Values: accelerations against MuJoCo, whole control steps against plain NumPy, and motions known in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+import reference
+import torch
+from scenes import (
+    BALL,
+    BLOCK,
+    PENDULUM,
+    acceleration,
+    acting_states,
+    check_that_ground_and_limits_act,
+    free_states,
+    parse,
+    pass_limits,
+    raise_ground,
+    run,
+    task_scene,
+    tree_scene,
+    unit,
+    without_ground,
+)
+
+from diffsim.simulator import Simulator
+from diffsim.tasks import TASKS
+
+TREES = [(base, seed) for base in ("floating", "fixed", "planar") for seed in range(6)]
+INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
+
+
+def relative_error(value, expected):
+    """Largest error of any row, relative to the row's largest entry."""
+    return (np.abs(value - expected).max(-1) / np.abs(expected).max(-1)).max()
+
+
+# Against MuJoCo
+
+
+def mujoco_acceleration(scene, qpos, qvel, ctrl):
+    model = scene.mj_model
+    flags = model.opt.disableflags
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    data, qacc = mujoco.MjData(model), np.empty_like(qvel)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    for e in range(len(qpos)):
+        data.qpos, data.qvel, data.ctrl = qpos[e], qvel[e], low + (ctrl[e] + 1) / 2 * (high - low)
+        mujoco.mj_forward(model, data)
+        qacc[e] = data.qacc
+    model.opt.disableflags = flags
+    return qacc
+
+
+def check_against_mujoco(scene, dtype, rng):
+    states = [torch.as_tensor(x).to(dtype).double().numpy() for x in free_states(scene, 64, rng)]
+    qacc = acceleration(without_ground(scene), *states, dtype=dtype)
+    tolerance = {torch.float64: 1e-10, torch.float32: 1e-4}[dtype]
+    assert relative_error(qacc, mujoco_acceleration(scene, *states)) < tolerance
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", TASKS)
+def test_task_accelerations_are_mujocos(name, dtype, rng):
+    check_against_mujoco(task_scene(name), dtype, rng)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("base, seed", TREES)
+def test_tree_accelerations_are_mujocos(base, seed, dtype, rng):
+    check_against_mujoco(tree_scene(base, seed), dtype, rng)
+
+
+# Against the plain NumPy reference
+
+
+def check_against_reference(scene, qpos, qvel, ctrl, substeps, **integrator):
+    q, v = run(scene, qpos, qvel, ctrl, substeps=substeps, **integrator)
+    expected = [
+        reference.step(scene, *state, 1 / 60, substeps, **integrator) for state in zip(qpos, qvel, ctrl, strict=True)
+    ]
+    assert relative_error(q, np.array([e[0] for e in expected])) < 1e-10
+    assert relative_error(v, np.array([e[1] for e in expected])) < 1e-10
+
+
+@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
+@pytest.mark.parametrize("name", TASKS)
+def test_task_steps_are_the_references(name, integrator, theta, rng):
+    scene = task_scene(name)
+    states = acting_states(scene, 4, rng)
+    check_that_ground_and_limits_act(scene, *states[:2])
+    check_against_reference(scene, *states, TASKS[name].substeps, integrator=integrator, theta=theta)
+
+
+@pytest.mark.parametrize("base, seed", TREES)
+def test_tree_steps_are_the_references(base, seed, rng):
+    scene = tree_scene(base, seed)
+    qpos, qvel, ctrl = free_states(scene, 4, rng)
+    pass_limits(scene, qpos, rng)
+    scene = raise_ground(scene, qpos)
+    check_against_reference(scene, qpos, qvel, ctrl, substeps=16)
+
+
+# Laws of motion
+
+
+def halving_orders(errors):
+    """Observed orders of convergence, for errors at steps that halve from one to the next."""
+    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+
+
+def test_free_flight_keeps_momentum_and_energy_to_first_order(rng):
+    """A tree that tumbles for a quarter of a second; gravity adds m g t, motors cannot change momentum."""
+    scene = tree_scene("floating", 0).without("contact", "limit", "damping")
+    qpos, qvel, ctrl = free_states(scene, 1, rng)
+    t, substeps = 0.25, [256, 512, 1024]
+
+    def errors(conserved, ctrl, gained=0.0):
+        before = conserved(scene, qpos[0], qvel[0])
+        ends = [run(scene, qpos, qvel, ctrl, control_dt=t, substeps=n) for n in substeps]
+        return [
+            np.linalg.norm(conserved(scene, q[0], v[0]) - before - gained) / np.linalg.norm(before) for q, v in ends
+        ]
+
+    weight = scene.mass.sum() * scene.gravity
+    idle = -scene.motor_bias[None] / scene.gear
+    for drift in (
+        errors(lambda *state: reference.momentum(*state)[0], ctrl, gained=weight * t),
+        errors(lambda *state: reference.momentum(*state)[1], ctrl),
+        errors(reference.energy, idle),
+    ):
+        np.testing.assert_allclose(halving_orders(drift), 1.0, atol=0.1)
+        assert drift[-1] < 1e-2
+
+
+@pytest.mark.parametrize("name", ["ant", "hopper"])
+def test_motion_is_the_same_far_from_the_origin(name, rng):
+    """Horizontally, 10 km away: the position is rounded to float32's spacing there, nothing else notices."""
+    scene, steps, substeps = task_scene(name), 4, 16
+    qpos, qvel, ctrl = acting_states(scene, 8, rng)
+    horizontal = [0, 1] if scene.floating else [0]
+    weights = [torch.tensor(rng.normal(size=x.shape), dtype=torch.float32) for x in (qpos, qvel)]
+
+    def motion(place):
+        qpos[:, horizontal] = place
+        inputs = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (qpos, qvel, ctrl)]
+        sim = Simulator(scene, 8, substeps=substeps, horizon=steps)
+        q, v, u = inputs
+        for _ in range(steps):
+            q, v = sim.step(q, v, u)
+        return q.detach().numpy(), v.detach().numpy(), torch.autograd.grad([q, v], inputs, weights)
+
+    near_q, near_v, near_gradients = motion(0.0)
+    far_q, far_v, far_gradients = motion(1e4)
+    np.testing.assert_array_equal(far_v, near_v)
+    np.testing.assert_array_equal(np.delete(far_q, horizontal, 1), np.delete(near_q, horizontal, 1))
+    for far, near in zip(far_gradients, near_gradients, strict=True):
+        np.testing.assert_array_equal(far, near)
+    rounding = np.spacing(np.float32(1e4)) / 2 * substeps * steps
+    np.testing.assert_allclose(far_q[:, horizontal] - 1e4, near_q[:, horizontal], rtol=0, atol=rounding)
+
+
+# Closed forms
+
+
+def closed_loop(scene, qpos, qvel, steps, substeps):
+    """Final (qpos, qvel), their inputs as leaves, after steps of 1/60 s without control."""
+    sim = Simulator(scene, 1, substeps=substeps, horizon=steps, dtype=torch.float64)
+    start = [torch.tensor([x], dtype=torch.float64, requires_grad=True) for x in (qpos, qvel)]
+    q, v = start
+    ctrl = torch.zeros(1, scene.nu, dtype=torch.float64)
+    for _ in range(steps):
+        q, v = sim.step(q, v, ctrl)
+    return q[0], v[0], start
+
+
+def test_projectile():
+    """Semi-implicit Euler falls g h t / 2 too far; all else of the parabola, and a free sphere's spin, is exact."""
+    scene, t, substeps = parse(BALL), 2.0, 16
+    position, velocity, spin = np.array([1.0, -2.0, 50.0]), np.array([3.0, 4.0, 10.0]), np.array([0.5, -2.0, 7.0])
+    qpos, qvel = [*position, 1.0, 0.0, 0.0, 0.0], [*velocity, *spin]
+    q, v, (q0, v0) = closed_loop(scene, qpos, qvel, 120, substeps)
+    h = 1 / 60 / substeps
+    expected = position + velocity * t + scene.gravity * (t * t + h * t) / 2
+    np.testing.assert_allclose(q[:3].detach(), expected, rtol=1e-12)
+    np.testing.assert_allclose(v.detach(), [*(velocity + scene.gravity * t), *spin], rtol=1e-12)
+    angle = np.linalg.norm(spin) * t
+    turned = [np.cos(angle / 2), *(np.sin(angle / 2) * spin / np.linalg.norm(spin))]
+    np.testing.assert_allclose(abs(q[3:7].detach().numpy() @ turned), 1.0, rtol=1e-12)
+
+    (dz_dq,) = torch.autograd.grad(q[2], q0, retain_graph=True)
+    (dz_dv,) = torch.autograd.grad(q[2], v0, retain_graph=True)
+    np.testing.assert_allclose(dz_dq[0], np.eye(7)[2], atol=1e-12)
+    np.testing.assert_allclose(dz_dv[0], t * np.eye(6)[2], atol=1e-12)
+    # The quaternion's scalar part is cos(t |spin| / 2).
+    (dw_dv,) = torch.autograd.grad(q[3], v0)
+    turning = -t / 2 * np.sin(angle / 2) * spin / np.linalg.norm(spin)
+    np.testing.assert_allclose(dw_dv[0, 3:], turning, atol=1e-12)
+
+
+def elliptic_pendulum(angle, rate, omega, t):
+    """Angle at time t of a pendulum of small-amplitude frequency omega that swings (does not turn over).
+
+    sin(angle / 2) = k sn(u, k), u = u0 + omega t; sn from the descending Landen transformation (A&S 16.12).
+    """
+    k = np.hypot(np.sin(angle / 2), rate / (2 * omega))
+    phase = np.arcsin(np.sin(angle / 2) / k)
+    if rate < 0:
+        phase = np.pi - phase
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    u0 = phase / 2 * weights @ (1 - (k * np.sin(phase / 2 * (nodes + 1))) ** 2) ** -0.5
+
+    def sn(u, k):
+        if k < 1e-9:
+            return np.sin(u)
+        root = np.sqrt(1 - k * k)
+        smaller = (1 - root) / (1 + root)
+        s = sn(u / (1 + smaller), smaller)
+        return (1 + smaller) * s / (1 + smaller * s * s)
+
+    return 2 * np.arcsin(k * sn(u0 + omega * t, k))
+
+
+def test_pendulum():
+    """A wide swing over 2 s, values and gradients: first order, and the closed form when h is extrapolated to 0."""
+    scene, start, t = parse(PENDULUM), (0.9, 1.5), 2.0
+    mass, length = scene.mass[1], -scene.com[1][2]
+    omega = np.sqrt(mass * 9.81 * length / (mass * length**2 + scene.inertia[1][1, 1]))
+    eps = 1e-5
+
+    def expected(angle, rate):
+        return elliptic_pendulum(angle, rate, omega, t)
+
+    exact = np.array(
+        [
+            expected(*start),
+            (expected(start[0] + eps, start[1]) - expected(start[0] - eps, start[1])) / (2 * eps),
+            (expected(start[0], start[1] + eps) - expected(start[0], start[1] - eps)) / (2 * eps),
+        ]
+    )
+
+    def simulated(substeps):
+        q, _, leaves = closed_loop(scene, [start[0]], [start[1]], 120, substeps)
+        return np.array([q.item(), *(g.item() for g in torch.autograd.grad(q[0], leaves))])
+
+    coarse, middle, fine = (simulated(n) for n in (16, 32, 64))
+    orders = halving_orders([np.abs(x - exact) for x in (coarse, middle, fine)])
+    np.testing.assert_allclose(orders, 1.0, atol=0.1)
+    np.testing.assert_allclose(2 * fine - middle, exact, atol=1e-5)
+
+
+def test_ball_rests_at_the_depth_that_carries_it():
+    scene = parse(BALL)
+    weight = scene.mass[0] * 9.81
+    qpos, qvel = np.array([[0.0, 0.0, 0.1005, 1.0, 0.0, 0.0, 0.0]]), np.zeros((1, 6))
+    q, v = run(scene, qpos, qvel, np.zeros((1, 0)), steps=240)
+    np.testing.assert_allclose(0.1 - q[0, 2], weight / scene.k_n, rtol=1e-6)
+    np.testing.assert_allclose(v, 0, atol=1e-8)
+
+
+def test_block_slides_to_rest_by_coulomb_friction():
+    scene, speed = parse(BLOCK), 1.0
+    depth = scene.mass[0] * 9.81 / (4 * scene.k_n)
+    qpos, qvel = np.array([[0.0, 0.0, 0.02 - depth, 1.0, 0.0, 0.0, 0.0]]), np.zeros((1, 6))
+    qvel[0, :2] = 0.6 * speed, -0.8 * speed
+    q, v = run(scene, qpos, qvel, np.zeros((1, 0)), steps=60, substeps=64)
+    path = speed**2 / (2 * scene.mu * 9.81)
+    np.testing.assert_allclose(q[0, :2], [0.6 * path, -0.8 * path], rtol=0.01)
+    np.testing.assert_allclose(v, 0, atol=1e-6)
+
+
+# Contact law
+
+
+def test_ground_pushes_and_friction_stays_in_its_cone(rng):
+    """The force on a ball, read from its acceleration, in random contacts: fast and slow, touching and leaving."""
+    scene, n = parse(BALL), 2000
+    qpos, qvel = np.tile([0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0], (n, 1)), rng.normal(size=(n, 6))
+    qpos[:, 2] -= rng.uniform(-0.005, 0.02, n)
+    qpos[:, 3:7] = unit(rng.normal(size=(n, 4)))
+    qvel *= 10 ** rng.uniform(-3, 1, (n, 1))
+    qacc = acceleration(scene, qpos, qvel, np.zeros((n, 0)))
+    force = scene.mass[0] * (qacc[:, :3] - scene.gravity)
+    slip = np.array([reference.contacts(scene, *state)[1][0] for state in zip(qpos, qvel, strict=True)])
+    depth = np.minimum(qpos[:, 2] - 0.1, 0)
+    normal, friction = force[:, 2], np.linalg.norm(force[:, :2], axis=-1)
+    speed = np.linalg.norm(slip[:, :2], axis=-1)
+
+    np.testing.assert_allclose(normal, np.maximum((scene.k_d * qvel[:, 2] - scene.k_n) * depth, 0), atol=1e-9)
+    np.testing.assert_allclose(friction, np.minimum(scene.k_t * speed, scene.mu * normal), atol=1e-9)
+    np.testing.assert_allclose(force[:, :2] * speed[:, None], -slip[:, :2] * friction[:, None], atol=1e-9)
+    leaving = (depth < 0) & (scene.k_d * qvel[:, 2] > scene.k_n)
+    sliding = (normal > 0) & (scene.k_t * speed > scene.mu * normal)
+    sticking = (normal > 0) & ~sliding
+    assert min(leaving.sum(), sliding.sum(), sticking.sum(), (depth == 0).sum()) > 20
+    # The friction acts at the lowest point: its moment turns the ball.
+    torque = np.cross([0.0, 0.0, -0.1], force * [1, 1, 0])
+    turns = np.array([reference.quaternion_matrix(q) @ a for q, a in zip(qpos[:, 3:7], qacc[:, 3:], strict=True)])
+    np.testing.assert_allclose(turns * scene.inertia[0][0, 0], torque, atol=1e-9)
+
+
+def test_ground_at_another_height_is_the_same_ground(rng):
+    scene = parse(BALL)
+    qpos, qvel = np.array([[0.3, 0.2, 0.09, 1.0, 0.0, 0.0, 0.0]]), rng.normal(size=(1, 6))
+    low_q, low_v = run(scene, qpos, qvel, np.zeros((1, 0)))
+    raised = dataclasses.replace(scene, ground_height=2.5)
+    high_q, high_v = run(raised, qpos + np.eye(7)[2] * 2.5, qvel, np.zeros((1, 0)))
+    np.testing.assert_allclose(high_q - np.eye(7)[2] * 2.5, low_q, atol=1e-12)
+    np.testing.assert_allclose(high_v, low_v, atol=1e-9)

@@ -1,0 +1,296 @@
+"""DiffEnv as gymnasium knows it, and what a learner may rely on."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import diffsim
+from diffsim.tasks import TASKS
+
+IDS = {name: f"diffsim/{name.title().replace('_', '')}-v0" for name in TASKS}
+
+
+def random_actions(env, steps, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(steps, env.num_envs, env.scene.nu, generator=generator, dtype=env.dtype) - 1
+
+
+def assert_same(a, b):
+    torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+def records(env, actions):
+    """Everything that the steps return, stacked over time."""
+    steps = [env.step(action) for action in actions]
+    columns = {name: torch.stack([s[k] for s in steps]) for k, name in enumerate(("obs", "reward", "end", "timeout"))}
+    for key in ("final_obs", "_final_obs", "nonfinite"):
+        columns[key] = torch.stack([s[4][key] for s in steps])
+    for key in "rlt":
+        columns[key] = torch.stack([s[4]["episode"][key] for s in steps])
+    return {name: column.detach() for name, column in columns.items()}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_spaces(name):
+    env = diffsim.make(name, num_envs=3, seed=0)
+    sizes = {"cartpole": (5, 1), "hopper": (11, 3), "half_cheetah": (17, 6), "ant": (37, 8), "humanoid": (76, 21)}[name]
+    assert env.single_observation_space.shape == sizes[:1] and env.single_action_space.shape == sizes[1:]
+    assert env.observation_space.shape == (3, sizes[0]) and env.action_space.shape == (3, sizes[1])
+    assert (env.single_action_space.low == -1).all() and (env.single_action_space.high == 1).all()
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP and isinstance(env, gymnasium.vector.VectorEnv)
+    obs, info = env.reset(seed=1)
+    assert info == {} and obs.shape == (3, sizes[0]) and obs.dtype == torch.float32 and obs.isfinite().all()
+    assert obs.numpy() in env.observation_space
+    assert env.episode_length == TASKS[name].episode_length and env.control_dt == 1 / 60
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space")
+@pytest.mark.parametrize("name", TASKS)
+def test_gymnasium_makes_both_kinds(name):
+    single = gymnasium.make(IDS[name])
+    check_env(single.unwrapped, skip_render_check=True)
+    obs, _ = single.reset(seed=5)
+    vector = gymnasium.make_vec(IDS[name], num_envs=3)
+    assert isinstance(vector.unwrapped, diffsim.DiffEnv) and vector.num_envs == 3
+    np.testing.assert_array_equal(obs, diffsim.make(name, num_envs=1).reset(seed=5)[0][0])
+    single.close()
+    vector.close()
+
+
+def test_single_environment_ends_as_the_vector_does():
+    single, action = gymnasium.make(IDS["hopper"]), np.ones(3, np.float32)
+    vector = diffsim.make("hopper", num_envs=1, seed=7)
+    single.reset(seed=7)
+    vector.reset(seed=7)
+    for _ in range(1000):
+        obs, reward, terminated, truncated, _ = single.step(action)
+        with torch.no_grad():
+            _, rewards, end, timeout, info = vector.step(torch.ones(1, 3))
+        np.testing.assert_array_equal(obs, info["final_obs"][0])
+        assert (reward, terminated, truncated) == (rewards.item(), end.item(), timeout.item())
+        if terminated or truncated:
+            break
+    assert terminated and isinstance(reward, float) and obs.dtype == np.float32
+
+
+def test_episodes_end_restart_and_are_counted():
+    """SAME_STEP autoreset and the statistics, against a loop that does them by hand."""
+    env = diffsim.make("hopper", num_envs=6, seed=2)
+    obs, _ = env.reset(seed=2)
+    returns, lengths, ends = np.zeros(6), np.zeros(6, int), 0
+    for action in random_actions(env, 150):
+        before = env.qpos.clone()
+        with torch.no_grad():
+            obs, reward, terminated, truncated, info = env.step(action)
+        returns, lengths = returns + reward.numpy(), lengths + 1
+        done = (terminated | truncated).numpy()
+        np.testing.assert_array_equal(terminated, info["final_obs"][:, 0] < -0.45)
+        assert not truncated.any()
+        np.testing.assert_array_equal(info["_final_obs"], done)
+        np.testing.assert_array_equal(info["_episode"], done)
+        np.testing.assert_allclose(info["episode"]["r"][done], returns[done], rtol=1e-5)
+        np.testing.assert_array_equal(info["episode"]["l"][done], lengths[done])
+        np.testing.assert_allclose(info["episode"]["t"][done], lengths[done] / 60, rtol=1e-6)
+        assert_same(obs[~done], info["final_obs"][~done])
+        # A new episode starts upright and near the origin; the old one went on from where it was.
+        assert (obs[done, 0].abs() <= 0.05).all() and (env.qpos[done].abs() <= 0.05).all()
+        assert (env.qpos[~done] - before[~done]).abs().max() < 1
+        assert_same(obs[:, :5], env.qpos[:, 1:])
+        assert_same(obs[:, 5:], env.qvel)
+        np.testing.assert_array_equal(env.episode_step, np.where(done, 0, lengths))
+        returns[done], lengths[done], ends = 0, 0, ends + done.sum()
+    assert ends >= 6
+
+
+def test_time_limit_truncates():
+    env = diffsim.make("cartpole", num_envs=2, seed=0)
+    with torch.no_grad():
+        for step in range(1, 242):
+            _, _, terminated, truncated, info = env.step(torch.zeros(2, 1))
+            assert not terminated.any()
+            assert truncated.tolist() == info["_episode"].tolist() == [step == 240] * 2
+            if step == 240:
+                assert info["episode"]["l"].tolist() == [240, 240]
+                np.testing.assert_allclose(info["episode"]["t"], 4.0)
+    assert env.episode_step.tolist() == [1, 1]
+
+
+def test_early_termination_can_be_off():
+    env = diffsim.make("hopper", num_envs=2, early_termination=False, seed=0)
+    env.set_state(torch.full((2, 6), -0.6), torch.zeros(2, 6))
+    with torch.no_grad():
+        obs, _, terminated, _, info = env.step(torch.zeros(2, 3))
+    assert (info["final_obs"][:, 0] < -0.45).all() and not terminated.any()
+    assert_same(obs, info["final_obs"])
+
+
+def test_actions_are_clipped():
+    rewards = []
+    for scale in (1.0, 5.0):
+        env = diffsim.make("hopper", num_envs=2, seed=0)
+        with torch.no_grad():
+            rewards.append(env.step(scale * torch.tensor([[1.0, -1.0, 1.0]]).repeat(2, 1))[1])
+    assert_same(*rewards)
+
+
+def test_start_states():
+    env = diffsim.make("ant", num_envs=4, seed=0, stochastic_init=False)
+    assert_same(env.qpos, env.qpos[:1].expand(4, -1))
+    np.testing.assert_allclose(env.qpos[0], [0, 0, 0.75, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1], atol=1e-7)
+    assert (env.qvel == 0).all()
+    env = diffsim.make("ant", num_envs=64, seed=0)
+    assert env.qpos.std(0).min() > 1e-4 and env.qvel.std(0).min() > 1e-2
+    np.testing.assert_allclose(env.qpos[:, 3:7].norm(dim=1), 1, rtol=1e-6)
+
+
+def test_seed_decides_everything():
+    def run(seed, reset_seed=None):
+        env = diffsim.make("hopper", num_envs=3, seed=seed)
+        if reset_seed is not None:
+            env.reset(seed=reset_seed)
+        with torch.no_grad():
+            return records(env, random_actions(env, 100))
+
+    first = run(4)
+    assert first["_final_obs"].any()
+    for again in (run(4), run(9, reset_seed=4)):
+        # reset draws once more than construction does, so only the seed given last counts.
+        assert all(torch.equal(x, again[key]) for key, x in first.items())
+    assert not torch.equal(first["obs"], run(5)["obs"])
+    assert not torch.equal(diffsim.make("hopper", num_envs=1).qpos, diffsim.make("hopper", num_envs=1).qpos)
+
+
+def test_reset_with_a_seed_equals_a_fresh_environment():
+    env = diffsim.make("ant", num_envs=3, seed=11)
+    fresh = env.reset(seed=12)[0].clone()
+    assert not torch.equal(fresh, env.reset()[0])
+    assert_same(env.reset(seed=12)[0], fresh)
+    assert (env.episode_step == 0).all()
+
+
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+def test_threads_do_not_change_a_bit(name):
+    def run(threads):
+        env = diffsim.make(name, num_envs=7, seed=1, horizon=8, threads=threads)
+        actions = random_actions(env, 8).requires_grad_()
+        steps = [env.step(action) for action in actions]
+        total = sum(obs.square().sum() + reward.sum() for obs, reward, *_ in steps)
+        return torch.stack([s[0] for s in steps]).detach(), torch.autograd.grad(total, actions)[0]
+
+    for threads in (2, 3, 16):
+        for value, expected in zip(run(threads), run(1), strict=True):
+            assert_same(value, expected)
+
+
+def test_no_grad_takes_the_same_steps():
+    for name in ("hopper", "ant"):
+        envs = [diffsim.make(name, num_envs=3, seed=1, horizon=16) for _ in range(2)]
+        actions = random_actions(envs[0], 16)
+        with torch.no_grad():
+            plain = records(envs[0], actions)
+        recorded = records(envs[1], actions.clone().requires_grad_())
+        for key, value in plain.items():
+            assert_same(value, recorded[key])
+        assert not envs[0].qpos.requires_grad and envs[1].qpos.requires_grad
+
+
+def test_detach_cuts_the_graph():
+    env = diffsim.make("hopper", num_envs=2, seed=0, horizon=2)
+    first = torch.zeros(2, 3, requires_grad=True)
+    obs, _, _, _, _ = env.step(first)
+    cut = env.detach()
+    assert_same(cut, obs.detach())
+    assert not cut.requires_grad and not env.qpos.requires_grad
+    second = torch.zeros(2, 3, requires_grad=True)
+    obs, _, _, _, _ = env.step(second)
+    assert torch.autograd.grad(obs.sum(), [first, second], allow_unused=True)[0] is None
+
+
+def test_no_gradient_crosses_a_reset():
+    env = diffsim.make("hopper", num_envs=2, seed=0, horizon=2)
+    qpos = env.qpos.clone()
+    qpos[1, 1:3] = torch.tensor([-0.6, 1.5])  # has fallen on its face
+    env.set_state(qpos, env.qvel)
+    action = torch.zeros(2, 3, requires_grad=True)
+    obs, _, terminated, _, info = env.step(action)
+    later, reward, _, _, _ = env.step(torch.zeros(2, 3))
+    assert terminated.tolist() == [False, True]
+    (through,) = torch.autograd.grad(obs.sum() + later.sum() + reward.sum(), action, retain_graph=True)
+    (final,) = torch.autograd.grad(info["final_obs"].sum(), action)
+    assert (through[0] != 0).all() and (through[1] == 0).all()
+    assert (final != 0).all()
+
+
+def test_set_state():
+    env = diffsim.make("ant", num_envs=2, seed=0)
+    qpos, qvel = env.qpos + 0.1, env.qvel - 0.1
+    with torch.no_grad():
+        env.step(torch.ones(2, 8))
+    obs = env.set_state(qpos, qvel)
+    assert_same(env.qpos, qpos)
+    assert_same(env.qvel, qvel)
+    assert_same(obs, env.task.observe(qpos, qvel, torch.zeros(2, 8)))
+    assert env.episode_step.tolist() == [1, 1]
+    with torch.no_grad():
+        stepped = env.step(torch.ones(2, 8))[4]["final_obs"]
+        expected = env.task.observe(*env.sim.step(qpos, qvel, torch.ones(2, 8)), torch.ones(2, 8))
+    assert_same(stepped, expected)
+
+
+def test_gradients_flow_into_set_states():
+    env = diffsim.make("hopper", num_envs=2, seed=0)
+    qpos, qvel = (x.clone().requires_grad_() for x in (env.qpos, env.qvel))
+    env.set_state(qpos, qvel)
+    _, reward, *_ = env.step(torch.zeros(2, 3))
+    assert all((g != 0).any() for g in torch.autograd.grad(reward.sum(), [qpos, qvel]))
+
+
+def test_state_dict_continues_exactly():
+    env = diffsim.make("hopper", num_envs=3, seed=1, horizon=40)
+    actions = random_actions(env, 120)
+    with torch.no_grad():
+        records(env, actions[:40])
+        env.detach()
+        saved = env.state_dict()
+        env.load_state_dict(saved)
+        env.detach()
+        expected = records(env, actions[40:80])
+        env.detach()
+        later = records(env, actions[80:])
+        other = diffsim.make("hopper", num_envs=3, seed=99, horizon=40)
+        other.load_state_dict(saved)
+        other.detach()
+        again = records(other, actions[40:80])
+        other.detach()
+        again_later = records(other, actions[80:])
+    assert expected["_final_obs"].any()
+    for one, two in ((expected, again), (later, again_later)):
+        for key, value in one.items():
+            assert_same(value, two[key])
+
+
+def test_float64():
+    env = diffsim.make("cartpole", num_envs=2, seed=0, dtype=torch.float64)
+    assert env.single_observation_space.dtype == np.float64
+    with torch.no_grad():
+        obs, reward, *_ = env.step(torch.zeros(2, 1, dtype=torch.float64))
+    assert obs.dtype == reward.dtype == torch.float64
+
+
+def test_finer_substeps_converge():
+    """The environment's substeps and integrator arguments reach the simulator: first order in the substep."""
+    ends = []
+    for substeps in (8, 16, 32):
+        env = diffsim.make("cartpole", 2, seed=0, dtype=torch.float64, substeps=substeps, stochastic_init=False)
+        with torch.no_grad():
+            for _ in range(30):
+                env.step(torch.full((2, 1), 0.3, dtype=torch.float64))
+        ends.append(env.qpos.clone())
+    np.testing.assert_allclose((ends[0] - ends[1]).norm() / (ends[1] - ends[2]).norm(), 2.0, rtol=0.1)
+    env = diffsim.make("cartpole", 2, integrator="implicit", theta=0.5)
+    assert (env.sim.integrator, env.sim.theta, env.sim.substeps) == ("implicit", 0.5, TASKS["cartpole"].substeps)

@@ -1,0 +1,181 @@
+"""Gradients of whole control steps, against central differences of the forward step and in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import (
+    BALL,
+    HINGE,
+    acting_states,
+    check_that_ground_and_limits_act,
+    free_states,
+    parse,
+    pass_limits,
+    raise_ground,
+    run,
+    task_scene,
+    tree_scene,
+)
+
+import diffsim
+from diffsim.simulator import Simulator
+from diffsim.tasks import TASKS
+
+INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
+
+
+def weights(scene, rng):
+    return rng.normal(size=scene.nq), rng.normal(size=scene.nv)
+
+
+def measure(qpos, qvel, weights):
+    """A random function of the state, one number per environment; of NumPy arrays and torch tensors alike."""
+    sin = torch.sin if isinstance(qpos, torch.Tensor) else np.sin
+    w_q, w_v = (torch.as_tensor(w).to(qpos) for w in weights) if isinstance(qpos, torch.Tensor) else weights
+    return (sin(qpos + w_v.sum()) * w_q).sum(-1) + (sin(qvel + w_q.sum()) * w_v).sum(-1)
+
+
+def gradients(scene, states, weights, dtype=torch.float64, **simulator):
+    """Of the measure after one control step with respect to qpos, qvel and ctrl."""
+    leaves = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in states]
+    q, v = Simulator(scene, len(states[0]), dtype=dtype, **simulator).step(*leaves)
+    measure(q, v, weights).sum().backward()
+    return [leaf.grad.double().numpy() for leaf in leaves]
+
+
+def differences(scene, states, weights, steps=(1e-7, 1e-6, 1e-5), **simulator):
+    """The same by central differences of fourth order, all in one batch; small steps, as contacts make corners."""
+    rows, sizes = len(states[0]), [x.shape[1] for x in states]
+    eps, splits = np.repeat(steps, sizes), np.cumsum(sizes)[:-1]
+    offsets = np.array([-2.0, -1.0, 1.0, 2.0])[:, None, None, None] * np.diag(eps)[:, None, :]
+    batch = (np.concatenate(states, 1) + offsets).reshape(-1, sum(sizes))
+    values = measure(*run(scene, *np.split(batch, splits, axis=1), **simulator), weights)
+    far_low, low, high, far_high = values.reshape(4, sum(sizes), rows)
+    slopes = (8 * (high - low) - (far_high - far_low)) / 12
+    return np.split(slopes.T / eps, splits, axis=1)
+
+
+def check_gradients(scene, states, rng, **simulator):
+    w = weights(scene, rng)
+    values, expected = gradients(scene, states, w, **simulator), differences(scene, states, w, **simulator)
+    for name, value, slope in zip(("qpos", "qvel", "ctrl"), values, expected, strict=True):
+        if slope.size:
+            error = np.linalg.norm(value - slope, axis=-1) / np.linalg.norm(slope, axis=-1)
+            assert error.max() < 1e-6, f"gradient with respect to {name}"
+
+
+@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
+@pytest.mark.parametrize("name", TASKS)
+def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
+    scene = task_scene(name)
+    states = acting_states(scene, 8, rng)
+    check_that_ground_and_limits_act(scene, *states[:2])
+    check_gradients(scene, states, rng, substeps=TASKS[name].substeps, integrator=integrator, theta=theta)
+
+
+@pytest.mark.parametrize("base, seed", [(base, seed) for base in ("floating", "fixed", "planar") for seed in range(4)])
+def test_tree_gradient_is_that_of_differences(base, seed, rng):
+    scene = tree_scene(base, seed)
+    qpos, qvel, ctrl = free_states(scene, 4, rng)
+    pass_limits(scene, qpos, rng)
+    check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, substeps=16)
+
+
+def test_quaternion_of_any_length(rng):
+    """The step normalises it, so it only sees its direction, and the gradient knows."""
+    scene = parse(BALL)
+    qpos, qvel, ctrl = acting_states(scene, 4, rng)
+    longer = qpos.copy()
+    longer[:, 3:7] *= [[0.5], [0.9], [2.0], [3.0]]
+    for value, expected in zip(run(scene, longer, qvel, ctrl), run(scene, qpos, qvel, ctrl), strict=True):
+        np.testing.assert_allclose(value, expected, atol=1e-12)
+    check_gradients(scene, (longer, qvel, ctrl), rng)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_float32_gradient_is_that_of_float64(name, rng):
+    scene, simulator = task_scene(name), {"substeps": TASKS[name].substeps}
+    states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 16, rng)]
+    w = weights(scene, rng)
+    single, double = (gradients(scene, states, w, dtype, **simulator) for dtype in (torch.float32, torch.float64))
+    errors = [np.linalg.norm(a - b, axis=-1) / np.linalg.norm(b, axis=-1) for a, b in zip(single, double, strict=True)]
+    assert np.median(errors) < 1e-4 and np.max(errors) < 1e-2
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
+def test_gradient_where_the_laws_have_corners(integrator):
+    """At zero slip, at depth exactly 0 and at a limit exactly met the gradient is finite: that of one side."""
+    ball, step = parse(BALL), {"substeps": 1, "integrator": integrator, "theta": 0.5 * (integrator == "implicit")}
+    w = [np.arange(1.0, 8.0), np.arange(1.0, 7.0)]
+
+    def ball_gradients(depth, velocity):
+        qpos = np.array([[0.0, 0.0, ball.contact_radius[0] - depth, 1.0, 0.0, 0.0, 0.0]])
+        return gradients(ball, [qpos, np.array([[*velocity, 0.0, 0.0, 0.0]]), np.zeros((1, 0))], w, **step)
+
+    def close(value, expected):
+        return all(np.allclose(a, b, rtol=1e-4, atol=1e-4) for a, b in zip(value, expected, strict=True))
+
+    assert close(ball_gradients(1e-3, [0, 0, 0]), ball_gradients(1e-3, [1e-9, 1e-9, 0]))  # sticking, v_t -> 0
+    assert close(ball_gradients(0.0, [0, 0, -1.0]), ball_gradients(-1e-9, [0, 0, -1.0])) or close(
+        ball_gradients(0.0, [0, 0, -1.0]), ball_gradients(1e-9, [0, 0, -1.0])
+    )
+
+    hinge = parse(HINGE)
+    w = [np.array([1.0]), np.array([2.0])]
+
+    def hinge_gradients(angle):
+        return gradients(hinge, [np.array([[angle]]), np.array([[0.3]]), np.array([[0.1]])], w, **step)
+
+    for bound, inward in ((hinge.lower[1], 1), (hinge.upper[1], -1)):
+        met = hinge_gradients(bound)
+        assert close(met, hinge_gradients(bound + 1e-9 * inward)) or close(met, hinge_gradients(bound - 1e-9 * inward))
+
+
+def test_limit_force_in_closed_form():
+    """One substep of a hinge beyond its bound, and its derivatives, by hand."""
+    scene, h = parse(HINGE), 1 / 60
+    inertia = scene.inertia[1][2, 2] + scene.armature[1]
+    q, v, u = 0.53, -0.4, 0.7
+    leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in (q, v, u)]
+    _, after = Simulator(scene, 1, substeps=1, dtype=torch.float64).step(*leaves)
+    torque = 3 * u + 300 * (0.5 - q) - 2 * v
+    np.testing.assert_allclose(after.item(), v + h * torque / inertia, rtol=1e-12)
+    slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
+    np.testing.assert_allclose(slopes, [-300 * h / inertia, 1 - 2 * h / inertia, 3 * h / inertia], rtol=1e-12)
+
+
+def test_gradients_add_up_over_control_steps(rng):
+    """Three steps at once, of a third of the length each, have the gradient of one."""
+    scene = task_scene("hopper")
+    states = acting_states(scene, 4, rng)
+    w = weights(scene, rng)
+    once = gradients(scene, states, w, control_dt=1 / 60, substeps=12)
+    sim = Simulator(scene, 4, control_dt=1 / 180, substeps=4, horizon=3, dtype=torch.float64)
+    leaves = [torch.tensor(x, requires_grad=True) for x in states]
+    q, v, u = leaves
+    for _ in range(3):
+        q, v = sim.step(q, v, u)
+    measure(q, v, w).sum().backward()
+    for leaf, expected in zip(leaves, once, strict=True):
+        np.testing.assert_allclose(leaf.grad, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_gradcheck_through_policy_reward_and_three_control_steps(name, rng):
+    scene, task = task_scene(name), TASKS[name]
+    qpos, qvel, _ = (torch.tensor(x) for x in acting_states(scene, 2, rng))
+    features = torch.tensor(rng.normal(size=(task.obs_dim, 3))) / task.obs_dim
+
+    def total_reward(policy):
+        # gradcheck holds on to its first graph while it makes others, so each has an environment of its own.
+        env = diffsim.make(name, num_envs=2, horizon=3, dtype=torch.float64, early_termination=False)
+        obs, total = env.set_state(qpos, qvel), 0.0
+        for _ in range(3):
+            obs, reward, _, _, _ = env.step(torch.tanh((obs @ features) @ policy))
+            total = total + reward.sum()
+        return total
+
+    policy = torch.tensor(0.5 * rng.normal(size=(3, scene.nu)), requires_grad=True)
+    assert torch.autograd.gradcheck(total_reward, policy, eps=1e-6, atol=1e-6, rtol=1e-6)
