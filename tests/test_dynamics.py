@@ -91,7 +91,7 @@ def check_against_reference(scene, qpos, qvel, ctrl, substeps, **integrator):
 @pytest.mark.parametrize("name", TASKS)
 def test_task_steps_are_the_references(name, integrator, theta, rng):
     scene = task_scene(name)
-    states = acting_states(scene, 4, rng)
+    states = acting_states(scene, 3, rng)
     check_that_ground_and_limits_act(scene, *states[:2])
     check_against_reference(scene, *states, TASKS[name].substeps, integrator=integrator, theta=theta)
 
