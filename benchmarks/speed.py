@@ -125,7 +125,7 @@ def visited_states(name: str, num_envs: int, count: int) -> list[State]:
 def time_diffsim(sim: diffsim.Simulator, state: State) -> dict[str, float]:
     """Microseconds of one differentiated control step: forward and backward, with torch's part and of the kernels."""
     synchronize = torch.cuda.synchronize if sim.device.type == "cuda" else lambda: None
-    inputs = [x.to(sim.device, sim.dtype).requires_grad_() for x in state]
+    inputs = [x.to(sim.device, sim.dtype, copy=True).requires_grad_() for x in state]
     gradients = [torch.ones_like(x) for x in inputs[:2]]
     kernels = dict(sim.seconds)
     synchronize()

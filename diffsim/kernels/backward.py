@@ -21,10 +21,9 @@ from functools import cache
 import warp as wp
 
 from diffsim.kernels.contact import contact_law
-from diffsim.kernels.forward import MODULE_OPTIONS
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import Shape, types
+from diffsim.kernels.model import Shape, module_options, types
 from diffsim.kernels.spatial import spatial
 
 
@@ -126,7 +125,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                     adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
         return adj_a, adj_v, adj_w, adj_p
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    @wp.kernel(module="unique", module_options=module_options(shape))
     def backward(
         # model
         m: Model,

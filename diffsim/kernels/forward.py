@@ -12,10 +12,8 @@ import warp as wp
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import Shape, types
+from diffsim.kernels.model import Shape, module_options, types
 from diffsim.kernels.spatial import spatial
-
-MODULE_OPTIONS = {"enable_backward": False, "max_unroll": 6}
 
 
 @cache
@@ -92,7 +90,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
             a[r] = y * L[r, r]
         return L, a
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    @wp.kernel(module="unique", module_options=module_options(shape))
     def forward(
         # model
         m: Model,

@@ -50,6 +50,11 @@ def shape_of(scene: Scene, dtype: type, implicit: bool, env_last: bool) -> Shape
     return Shape(scene.nlink, scene.nu, scene.carrier, scene.features, dtype, implicit, env_last)
 
 
+def module_options(shape: Shape) -> dict[str, Any]:
+    # On the CPU unrolling buys no speed and costs a second of compilation; a GPU keeps small matrices in registers.
+    return {"enable_backward": False, "max_unroll": 6 if shape.env_last else 1}
+
+
 @cache
 def types(dtype: type) -> SimpleNamespace:
     """Warp's vector types of one precision, and the struct of a scene's numbers."""
