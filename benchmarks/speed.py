@@ -29,6 +29,7 @@ import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import diffsim
+from diffsim.simulator import available_cores
 
 ROOT = Path(__file__).resolve().parents[1]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -165,7 +166,7 @@ class MuJoCo:
 
 
 def measure_physics(args: Args, table: Table) -> None:
-    threads = [1] if args.device != "cpu" else [1, None]
+    threads = [1] if args.device != "cpu" else [1, available_cores()]
     for name in args.env:
         task = diffsim.TASKS[name]
         for num_envs in args.num_envs:
@@ -211,7 +212,7 @@ def report_physics(args: Args, table: Table, name: str, num_envs: int, substeps:
                 "task": name,
                 "environments": num_envs,
                 "precision": dtype,
-                "device": args.device if args.device != "cpu" else "cpu, 1 thread" if count else "cpu, all cores",
+                "device": args.device if args.device != "cpu" else "cpu, 1 thread" if count == 1 else "cpu, all cores",
                 "forward (us/substep)": t["kernel forward"] / per_substep,
                 "backward (us/substep)": t["kernel backward"] / per_substep,
                 "backward/forward": t["kernel backward"] / t["kernel forward"],
@@ -281,7 +282,12 @@ def measure_training(args: Args, table: Table) -> None:
     for name in args.env:
         for device in devices:
             options = ["--env", name, "--device", device.partition(",")[0], "--eval-every", "0", "--save-every", "0"]
-            options += ["--iterations", str(args.iterations), *(["--threads", "1"] if "1 thread" in device else [])]
+            options += [
+                "--iterations",
+                str(args.iterations),
+                "--threads",
+                "1" if "1 thread" in device else str(available_cores()),
+            ]
             with tempfile.TemporaryDirectory() as temporary:
                 run_shac(Path(temporary) / "compile", [*options, "--stop-after", "1"])
                 directory = Path(temporary) / "run"

@@ -19,8 +19,8 @@ from diffsim.scene import Scene
 
 INTEGRATORS = ("semi_implicit", "implicit")
 WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
-# A second thread speeds the kernels of 64 ants up by 1.8, but a whole training iteration got slower by a tenth: below this
-# many link-substeps (about 2 ms) per thread, waking threads between two torch operations costs more than it saves.
+# A second thread speeds the kernels of 64 ants up by 1.8, but slows a whole training iteration down by a tenth: below
+# this many link-substeps (about 2 ms) per thread, waking it between two torch operations costs more than it saves.
 MIN_WORK_PER_THREAD = 10_000
 
 
