@@ -89,6 +89,7 @@ class DiffEnv(VectorEnv):
         self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
         self.qpos, self.qvel, self._obs = (torch.empty(0),) * 3
         self._starts, self._time = (torch.empty(0),) * 3, 0
+        self._recorded = 0  # differentiable steps since the window began
         self._restart()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
@@ -122,12 +123,13 @@ class DiffEnv(VectorEnv):
         recorded = torch.is_grad_enabled() and (
             action.requires_grad or self.qpos.requires_grad or self.qvel.requires_grad
         )
+        if recorded and self._recorded == self.horizon:
+            raise RuntimeError(
+                f"horizon of {self.horizon} differentiable steps exceeded: call env.detach() to start a new "
+                "window, step under torch.no_grad(), or make the environment with a larger horizon"
+            )
+        self._recorded += recorded
         if self._time == self.horizon:
-            if recorded:
-                raise RuntimeError(
-                    f"horizon of {self.horizon} differentiable steps exceeded: call env.detach() to start a new "
-                    "window, step under torch.no_grad(), or make the environment with a larger horizon"
-                )
             self._draw_starts()
         start_qpos, start_qvel, start_obs = (start[self._time] for start in self._starts)
         self._time += 1
@@ -161,6 +163,7 @@ class DiffEnv(VectorEnv):
     def detach(self) -> Tensor:
         """Cut the graph at the current state, start a new window there, and return its observation (N, obs_dim)."""
         self.qpos, self.qvel, self._obs = self.qpos.detach(), self.qvel.detach(), self._obs.detach()
+        self._recorded = 0
         self.sim.rewind()
         self._draw_starts()
         return self._obs
@@ -216,6 +219,7 @@ class DiffEnv(VectorEnv):
     def _restart(self) -> None:
         self.episode_step.zero_()
         self._episode_return.zero_()
+        self._recorded = 0
         self.sim.rewind()
         qpos, qvel, obs = self._draw(1)
         self.qpos, self.qvel, self._obs = qpos[0], qvel[0], obs[0]

@@ -104,8 +104,7 @@ class Simulator:
         self._g_in = [tensor(n, k) for k in (self.nq, self.nv)]
         self._g_out = [tensor(n, k) for k in (self.nq, self.nv, self.nu)]
         self._checkpoint: list[wp.array] | None = None
-        self._nfactor = shape.nfactor
-        self._layout = (2, n) if cuda else (1, n)
+        self._shape = shape
         self._slot, self._last = 0, horizon
         self._version = [0] * horizon
         self.nonfinite_gradients = tensor(n, of=torch.int32)
@@ -235,9 +234,8 @@ class Simulator:
 
     def _rows(self, count: int) -> list[wp.array]:
         """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
-        where, n = self._layout
-        widths = (self.nq, self.nv, self.nv, self._nfactor)
-        sizes = [(count, k, n) if where == 2 else (count, n, k) for k in widths]
+        n, widths = self.num_envs, (self.nq, self.nv, self.nv, self._shape.nfactor)
+        sizes = [(count, k, n) if self._shape.env_last else (count, n, k) for k in widths]
         return [wp.zeros(size, dtype=WARP_DTYPE[self.dtype], device=str(self.device)) for size in sizes]
 
 

@@ -201,6 +201,19 @@ def test_horizon_is_a_limit_of_differentiable_steps_only():
             env.step(action)
 
 
+def test_steps_without_a_gradient_do_not_use_up_the_horizon():
+    env = diffsim.make("cartpole", num_envs=2, horizon=2, seed=0)
+    action = torch.zeros(2, 1, requires_grad=True)
+    with torch.no_grad():
+        env.step(action)
+        env.step(action)
+    env.step(action)
+    _, reward, *_ = env.step(action)
+    reward.sum().backward()
+    with pytest.raises(RuntimeError, match=r"horizon of 2 .*detach\(\)"):
+        env.step(action)
+
+
 def test_overwritten_checkpoint_is_noticed(rng):
     scene = task_scene("hopper")
     sim = Simulator(scene, 2, horizon=2)

@@ -86,9 +86,7 @@ def types(dtype: type) -> SimpleNamespace:
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
         gravity: vec3
-        carrier_height: (
-            dtype  # of the carrier's frame over the ground at q = 0 (fixed base), or minus the ground's height
-        )
+        carrier_height: dtype  # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
         k_n: dtype
         k_d: dtype
         k_t: dtype
