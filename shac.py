@@ -11,28 +11,22 @@ at the window's end (Eq. 5); the value function is fitted to the TD(lambda) retu
 from __future__ import annotations
 
 import copy
-import csv
 import dataclasses
-import json
 import math
-import os
-import signal
 import sys
-import tempfile
-import time
 from collections import deque
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 import tyro
 from torch import Tensor, nn
-from torch.utils.tensorboard import SummaryWriter
 
 import diffsim
-from diffsim import graph, render
+from diffsim import distributed, graph
+from diffsim.evaluation import Evaluation, evaluate, write_video
+from diffsim.run import EpisodeStatistics, Mark, Run, fail, flag, load_checkpoint
 
 
 @dataclass
@@ -41,15 +35,17 @@ class Args:
     """task: cartpole, hopper, half_cheetah, ant or humanoid"""
     seed: int = 1
     """seed of the networks, the policy's noise and the environments' resets"""
-    device: str = "cpu"
-    """torch device of simulation and learning, e.g. cpu or cuda:0"""
+    device: str | None = None
+    """torch device of simulation and learning, e.g. cpu or cuda:0; None: the GPU if there is one"""
+    cuda_graph: bool = True
+    """on a GPU, replay an iteration as CUDA graphs; without, the same code runs operation by operation"""
     threads: int | None = None
     """CPU threads of the simulator, which change no result; None: all cores"""
 
     iterations: int | None = None
     """learning iterations: the paper's learning episodes M; None: per task"""
     num_envs: int | None = None
-    """parallel environments N; None: per task"""
+    """parallel environments N, over all processes of torchrun; None: per task"""
     horizon: int = 32
     """control steps h of a window (1/60 s each)"""
     substeps: int | None = None
@@ -131,12 +127,6 @@ PROGRESS = {  # scalar of tensorboard: column of progress.csv, beside iteration,
 # fmt: on
 FIXED = ("env", "num_envs", "actor_hidden", "critic_hidden", "deterministic_policy")  # by a checkpoint
 FORMAT = "shac-1"  # of checkpoints
-EVALUATION_SEED = 1_000_000
-
-
-def fail(message: object) -> NoReturn:
-    print(f"shac.py: {message}", file=sys.stderr)
-    sys.exit(2)
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -190,12 +180,15 @@ class Normaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Adds obs (..., obs_dim) to the statistics (Chan et al.'s parallel variance)."""
+        """Adds obs (..., obs_dim) of all processes to the statistics (Chan et al.'s parallel variance)."""
         obs = obs.flatten(0, -2)
         var, mean = torch.var_mean(obs, dim=0, correction=0)
-        total, delta = self.count + len(obs), mean - self.mean
-        self.var.copy_((self.var * self.count + var * len(obs) + delta**2 * self.count * len(obs) / total) / total)
-        self.mean.add_(delta * len(obs) / total)
+        own, mean = mean, distributed.average(mean.clone())
+        var = distributed.average(var + (own - mean) ** 2)
+        new = len(obs) * distributed.size()
+        total, delta = self.count + new, mean - self.mean
+        self.var.copy_((self.var * self.count + var * new + delta**2 * self.count * new / total) / total)
+        self.mean.add_(delta * new / total)
         self.count.copy_(total)
         self.std.copy_((self.var + 1e-5).sqrt())
 
@@ -219,7 +212,7 @@ class ClippedAdam:
     def step(self, loss: Tensor) -> Tensor:
         """One descent step; returns the gradient's norm before clipping."""
         gradients = torch.autograd.grad(loss, self.parameters)
-        self.vector.grad = torch.cat([gradient.flatten() for gradient in gradients])
+        self.vector.grad = distributed.average(torch.cat([gradient.flatten() for gradient in gradients]))
         norm = torch.linalg.vector_norm(self.vector.grad)
         bad = (~(norm < 1e6)).to(norm.dtype)
         # GradScaler's hooks: fused Adam divides by grad_scale and, where found_inf is 1, leaves everything as it was.
@@ -297,94 +290,7 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
     return returns
 
 
-class Evaluation(NamedTuple):
-    returns: Tensor  # (n,) of one episode each
-    lengths: Tensor  # (n,) control steps
-    speed: float | None  # mean forward speed, m/s; None for a robot without ground
-    qpos: Tensor  # (T, n, nq) before each step; valid up to an episode's length
-
-    def scalars(self) -> dict[str, float]:
-        values = {"eval/return": self.returns.median().item(), "eval/length": self.lengths.float().mean().item()}
-        return values if self.speed is None else values | {"eval/speed": self.speed}
-
-    def __str__(self) -> str:
-        r = self.returns
-        speed = "" if self.speed is None else f", forward speed {self.speed:.2f} m/s"
-        spread = f"mean {r.mean():.1f}, std {r.std(correction=0):.1f}, min {r.min():.1f}"
-        return f"return median {r.median():.1f}, {spread}, length {self.lengths.float().mean():.1f}{speed}"
-
-
-@torch.no_grad()
-def evaluate(env: Any, actor: Actor, normalise: Normaliser) -> Evaluation:
-    """The first episode of each environment under the deterministic policy; always from the same initial states."""
-    obs, _ = env.reset(seed=EVALUATION_SEED)
-    alive = torch.ones(env.num_envs, dtype=torch.bool, device=obs.device)
-    returns, lengths, qpos = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long), []
-    while alive.any():
-        qpos.append(env.qpos)
-        obs, reward, terminated, truncated, _ = env.step(actor(normalise(obs)))
-        returns += torch.where(alive, reward, torch.zeros_like(reward))
-        lengths += alive
-        alive &= ~(terminated | truncated)
-    path = torch.stack(qpos)
-    speed = None
-    if "contact" in env.scene.features:  # the first coordinate of a robot that walks is its x
-        distance = path[..., 0].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, 0]
-        speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
-    return Evaluation(returns, lengths, speed, path)
-
-
-# Files ----------------------------------------------------------------------------------------------------------------
-
-
-def save_checkpoint(path: Path, checkpoint: dict[str, Any]) -> None:
-    """Replaces path in one step: whoever reads it finds the old checkpoint or the new one, whole."""
-    temporary = path.with_suffix(".tmp")
-    torch.save(checkpoint, temporary)
-    os.replace(temporary, path)
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        fail(f"no such checkpoint: {path}")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        if checkpoint["format"] == FORMAT:
-            return checkpoint
-    except Exception:  # torch.load raises whatever broken bytes lead it to
-        pass
-    fail(f"{path} is not a whole checkpoint of shac.py")
-
-
-def check_run_dir(path: Path, resume: Path | None) -> None:
-    """That a run can be written to path; leaves nothing there."""
-    if (path / "checkpoint.pt").exists() and (resume is None or not resume.samefile(path / "checkpoint.pt")):
-        fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
-    existing = next(p for p in (path, *path.absolute().parents) if p.exists())
-    try:
-        tempfile.TemporaryFile(dir=existing).close()
-    except OSError as error:
-        fail(f"cannot write to run directory {path}: {error.strerror}")
-
-
-def open_progress(path: Path, iteration: int) -> tuple[IO[str], csv.DictWriter]:
-    """progress.csv and its writer, after the rows that a resumed run has up to iteration."""
-    rows: list[dict[str, str]] = []
-    if iteration > 0 and path.is_file():
-        with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if int(row["iteration"]) <= iteration]
-    file = path.open("w", newline="")
-    writer = csv.DictWriter(file, ["iteration", "control_steps", "seconds", *PROGRESS.values()])
-    writer.writeheader()
-    writer.writerows(rows)
-    return file, writer
-
-
 # Runs -----------------------------------------------------------------------------------------------------------------
-
-
-def flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
@@ -393,14 +299,18 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
     if args.resume and args.evaluate:
         fail("--resume and --evaluate exclude each other")
     if path := args.resume or args.evaluate:
-        checkpoint = load_checkpoint(path)
+        checkpoint = load_checkpoint(path, FORMAT)
         saved = Args(**checkpoint["args"])
+        if args.evaluate:
+            saved.device = None  # wherever it was trained
         args = tyro.cli(Args, args=argv, description=__doc__, default=saved)
         for name in FIXED:
             if getattr(args, name) != getattr(saved, name):
                 fail(f"{path} has {flag(name)} {getattr(saved, name)}, not {getattr(args, name)}")
         if args.resume and checkpoint["iteration"] >= min(args.iterations, args.stop_after or args.iterations):
             fail(f"{path} is at iteration {checkpoint['iteration']} already: give more --iterations or --stop-after")
+        if args.resume and len(checkpoint["ranks"]) != distributed.size():
+            fail(f"{path} was trained by {len(checkpoint['ranks'])} processes, not {distributed.size()}")
     if args.env not in diffsim.TASKS:
         fail(f"unknown task {args.env!r}: choose from {', '.join(diffsim.TASKS)}")
     defaults = dict(zip(COLUMNS, PER_TASK.get(args.env, (*GENERAL, 2000)), strict=True))
@@ -412,19 +322,16 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
     for name in ("iterations", "critic_iterations", "critic_minibatches", "eval_episodes", "stop_after", "threads"):
         if (value := getattr(args, name)) is not None and value < 1:
             fail(f"{flag(name)} must be at least 1, not {value}")
+    if args.num_envs % distributed.size():
+        fail(f"--num-envs {args.num_envs} cannot be split evenly among {distributed.size()} processes")
+    args.device = distributed.choose_device(args.device)
     return args, checkpoint
 
 
-def clock(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
-
-
-def make_env(args: Args, num_envs: int, horizon: int) -> Any:
+def make_env(args: Args, num_envs: int, horizon: int, seed: int = 0) -> Any:
     options = dict(substeps=args.substeps, integrator=args.integrator, threads=args.threads)
     try:
-        return diffsim.make(args.env, num_envs, args.device, args.seed, horizon, **options)
+        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options)
     except ValueError as error:
         fail(error)
 
@@ -434,52 +341,46 @@ def build(args: Args, env: Any) -> tuple[Actor, Normaliser]:
     return Actor(args, obs_dim, action_dim).to(args.device), Normaliser(obs_dim).to(args.device)
 
 
+def film(directory: Path, env: Any, evaluation: Evaluation) -> None:
+    try:
+        print(f"video: {write_video(directory / 'video.mp4', env, evaluation)}")
+    except (ImportError, OSError, RuntimeError) as error:
+        fail(error)
+
+
 def evaluate_only(args: Args, checkpoint: dict[str, Any]) -> None:
     env = make_env(args, args.eval_episodes, horizon=1)
     actor, normalise = build(args, env)
     actor.load_state_dict(checkpoint["actor"])
     normalise.load_state_dict(checkpoint["normalise"])
-    evaluation = evaluate(env, actor, normalise)
+    evaluation = evaluate(env, lambda obs: actor(normalise(obs)))
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     if args.capture_video:
-        write_video(args.run_dir or args.evaluate.parent, env, evaluation)
-
-
-def write_video(directory: Path, env: Any, evaluation: Evaluation) -> None:
-    """The episode of median return, every other control step."""
-    episode = evaluation.returns.argsort()[(len(evaluation.returns) - 1) // 2]
-    qpos = evaluation.qpos[: evaluation.lengths[episode] : 2, episode].cpu().numpy()
-    try:
-        frames = render.render_frames(env.scene, qpos, width=480, height=360)
-        print(f"video: {render.write_video(directory / 'video.mp4', frames, fps=0.5 / env.control_dt)}")
-    except (ImportError, OSError, RuntimeError) as error:
-        fail(error)
+        film(args.run_dir or args.evaluate.parent, env, evaluation)
 
 
 def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
-    run_name = f"{args.env}__{Path(__file__).stem}__{args.seed}__{int(time.time())}"
-    run_dir = args.run_dir or (args.resume.parent if args.resume else Path("runs") / run_name)
-    check_run_dir(run_dir, args.resume)
-    if args.track:
-        try:
-            import wandb
-        except ImportError:
-            fail("--track needs Weights & Biases: pip install wandb")
-    torch.manual_seed(args.seed)
-    env, eval_env = make_env(args, args.num_envs, args.horizon), make_env(args, args.eval_episodes, horizon=1)
+    run = Run(args, Path(__file__).stem, PROGRESS)
+    rank, ranks = distributed.rank(), distributed.size()
+    num_envs, samples = args.num_envs // ranks, args.horizon * args.num_envs
+    env = make_env(args, num_envs, args.horizon, args.seed + rank * 1_000_003)
+    eval_env = make_env(args, args.eval_episodes, horizon=1)
+    distributed.join(env.device)
     args.substeps = args.substeps or env.task.substeps
+    torch.manual_seed(args.seed)
     actor, normalise = build(args, env)
     critic = mlp(normalise.mean.numel(), args.critic_hidden, 1, orthogonal=True).to(env.device)
     target = copy.deepcopy(critic).requires_grad_(False)
     actor_optimizer, critic_optimizer = ClippedAdam(actor, args), ClippedAdam(critic, args)
-    samples = args.horizon * args.num_envs
-    batch_obs = torch.zeros(samples, normalise.mean.numel(), device=env.device)
-    batch_value = torch.zeros(samples, device=env.device)
+    batch_obs = torch.zeros(args.horizon * num_envs, normalise.mean.numel(), device=env.device)
+    batch_value = torch.zeros(args.horizon * num_envs, device=env.device)
+    if rank > 0:  # from here on other numbers on every rank: the policy's noise
+        torch.manual_seed(args.seed + rank * 1_000_003)
 
     # The two halves of an iteration (Algorithm 1). They keep their state in tensors, change it in place and never wait
-    # for the device: on a GPU each becomes one CUDA graph.
-    def update_actor() -> tuple[Tensor, Tensor, Window]:
-        window = collect(env, actor, normalise, actor.sample_noise(args.horizon, args.num_envs))
+    # for the device: on a GPU each becomes one CUDA graph. Each returns numbers to be logged, see `report`.
+    def update_actor() -> Tensor:
+        window = collect(env, actor, normalise, actor.sample_noise(args.horizon, num_envs))
         next_value = next_values(target, normalise, window)
         loss = actor_loss(window.reward, next_value, window.done, args.gamma)
         norm = actor_optimizer.step(loss)
@@ -488,7 +389,8 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
         batch_value.copy_(value.flatten())
         batch_obs.copy_(normalise(window.obs).flatten(0, 1))
         normalise.update(window.obs)
-        return loss.detach(), norm, window
+        episodes = ((window.done * x).sum() for x in (1, window.episode_return, window.episode_length))
+        return torch.stack([loss.detach(), norm, window.nonfinite.sum(), *episodes])
 
     def update_critic() -> Tensor:
         batches = batch_obs.chunk(args.critic_minibatches), batch_value.chunk(args.critic_minibatches)
@@ -500,118 +402,111 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
                 losses.append(loss.detach())
         for slow, fast in zip(target.parameters(), critic.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
-        return torch.stack(losses).mean()  # of the last pass
+        skipped = actor_optimizer.skipped + critic_optimizer.skipped
+        return torch.stack([torch.stack(losses).mean(), skipped, env.sim.nonfinite_gradients.sum()])  # of the last pass
 
-    update_actor, update_critic = graph.capture(update_actor, env.device, env), graph.capture(update_critic, env.device)
+    if args.cuda_graph:
+        update_actor = graph.capture(update_actor, env.device, env)
+        update_critic = graph.capture(update_critic, env.device)
 
-    parts = dict(env=env, actor=actor, critic=critic, target=target, normalise=normalise)
+    parts = dict(actor=actor, critic=critic, target=target, normalise=normalise)
     parts |= dict(actor_optimizer=actor_optimizer, critic_optimizer=critic_optimizer)
-    rng = torch.cuda.default_generators[env.device.index or 0] if env.device.type == "cuda" else torch.default_generator
+    rng = torch.cuda.default_generators[env.device.index] if env.device.type == "cuda" else torch.default_generator
     start, seconds, nonfinite = 0, 0.0, 0
-    finished: deque[list[float]] = deque(maxlen=100)  # return and length of the last training episodes
+    episodes = EpisodeStatistics()  # of training
     if checkpoint:
         for name, part in parts.items():
             part.load_state_dict(checkpoint[name])
-        rng.set_state(checkpoint["rng"])
+        env.load_state_dict(checkpoint["ranks"][rank]["env"])
+        rng.set_state(checkpoint["ranks"][rank]["rng"])
         start, seconds, nonfinite = (checkpoint[name] for name in ("iteration", "seconds", "nonfinite"))
-        finished.extend(checkpoint["finished"])
+        episodes.windows.extend(checkpoint["episodes"])
 
     def save(iteration: int) -> None:
         state = {name: part.state_dict() for name, part in parts.items()}
-        state["args"] = dataclasses.asdict(args) | dict(resume=None, run_dir=None, stop_after=None)
-        state |= dict(format=FORMAT, rng=rng.get_state(), finished=list(finished))
-        state |= dict(iteration=iteration, seconds=seconds, nonfinite=nonfinite)
-        save_checkpoint(run_dir / "checkpoint.pt", state)
+        state["ranks"] = distributed.gather({"env": env.state_dict(), "rng": rng.get_state()})
+        device = args.device if ranks == 1 else env.device.type
+        state["args"] = dataclasses.asdict(args) | dict(device=device, resume=None, run_dir=None, stop_after=None)
+        state |= dict(format=FORMAT, episodes=list(episodes.windows))
+        run.save(state | dict(iteration=iteration, seconds=seconds, nonfinite=nonfinite))
 
-    run_dir.mkdir(parents=True, exist_ok=True)
-    arguments = dataclasses.asdict(args)
-    (run_dir / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
-    if args.track:
-        wandb.init(project="diffsim", name=run_dir.name, dir=run_dir, config=arguments, sync_tensorboard=True)
-    writer = SummaryWriter(str(run_dir), purge_step=start * samples + 1 if start else None)
-    table = "\n".join(f"|{name}|{value}|" for name, value in arguments.items())
-    writer.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}")
-    progress_file, progress = open_progress(run_dir / "progress.csv", start)
-
-    signals: list[int] = []
-
-    def on_signal(number: int, _frame: Any) -> None:
-        signals.append(number)  # the iteration is finished first; the same signal again has its usual effect
-        signal.signal(number, handlers[number])
-
-    handlers = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    run.open(start, start * samples)
     last = min(args.iterations, args.stop_after or args.iterations)
-    terminal, shown, durations = sys.stdout.isatty(), 0.0, deque(maxlen=50)
+    mark, evaluation, stopping = Mark(env.device), None, False
+    waiting: deque[tuple[Any, ...]] = deque()  # iterations that are not logged yet
+    behind = int(env.device.type == "cuda")
+
+    def report(numbers: Tensor, begin: Mark, middle: Mark, end: Mark, simulated: dict) -> dict[str, Any]:
+        """What there is to log of an iteration that the device has finished."""
+        nonlocal seconds, nonfinite, stopping
+        end.wait()
+        loss, norm, contained, *finished, critic_loss, skipped, nonfinite_gradients, signals = numbers.tolist()
+        seconds += end.since(begin)
+        nonfinite += round(contained * ranks)
+        episodes.add(*(total * ranks for total in finished))
+        stopping = stopping or signals > 0
+        scalars = {
+            "charts/SPS": samples / end.since(begin),
+            "losses/actor": loss,
+            "losses/critic": critic_loss,
+            "grad/norm": norm,
+            "grad/skipped": round(skipped),
+            "sim/nonfinite": nonfinite,
+            "sim/nonfinite_gradients": round(nonfinite_gradients * ranks),
+            "time/critic": end.since(middle),
+            "time/total": end.since(begin),
+            **{f"time/sim_{kernel}": spent for kernel, spent in simulated.items() if env.device.type == "cpu"},
+        }
+        if episodes.windows:
+            scalars["charts/episodic_return"], scalars["charts/episodic_length"] = episodes.means()
+        return scalars
+
     for iteration in range(start + 1, last + 1):
         for optimizer, lr in ((actor_optimizer, args.actor_lr), (critic_optimizer, args.critic_lr)):
             optimizer.lr.fill_(lr + (args.final_lr - lr) * (iteration - 1) / args.iterations)
-        simulated, begin = dict(env.sim.seconds), clock(env.device)
-        loss, norm, window = update_actor()
-        middle = clock(env.device)
-        critic_loss = update_critic()
-        end = clock(env.device)
+        simulated, begin = dict(env.sim.seconds), mark
+        numbers = update_actor()
+        middle = Mark(env.device)
+        numbers = torch.cat((numbers, update_critic(), numbers.new_full((1,), len(run.signals))))
+        numbers = distributed.average(numbers).to("cpu", non_blocking=True)
+        mark = Mark(env.device)
+        simulated = {kernel: spent - simulated[kernel] for kernel, spent in env.sim.seconds.items()}
+        waiting.append((iteration, numbers, begin, middle, mark, simulated))
 
-        durations.append(end - begin)
-        seconds += end - begin
-        nonfinite += int(window.nonfinite.sum())
-        nonfinite_gradients = int(env.sim.nonfinite_gradients.sum())
-        skipped = int(actor_optimizer.skipped + critic_optimizer.skipped)
-        finished.extend(torch.stack((window.episode_return, window.episode_length), -1)[window.done].tolist())
-        scalars = {
-            "charts/SPS": samples / (end - begin),
-            "losses/actor": loss.item(),
-            "losses/critic": critic_loss.item(),
-            "grad/norm": norm.item(),
-            "grad/skipped": skipped,
-            "sim/nonfinite": nonfinite,
-            "sim/nonfinite_gradients": nonfinite_gradients,
-            "time/sim_forward": env.sim.seconds["forward"] - simulated["forward"],
-            "time/sim_backward": env.sim.seconds["backward"] - simulated["backward"],
-            "time/critic": end - middle,
-            "time/total": end - begin,
-        }
-        if finished:
-            episodic_return, episodic_length = (sum(column) / len(finished) for column in zip(*finished, strict=True))
-            scalars |= {"charts/episodic_return": episodic_return, "charts/episodic_length": episodic_length}
-        evaluation = None
-        if iteration == args.iterations or (args.eval_every and iteration % args.eval_every == 0):
-            evaluation = evaluate(eval_env, actor, normalise)
-            scalars |= evaluation.scalars()
-        for key, value in scalars.items():
-            writer.add_scalar(key, value, iteration * samples)
-        row = dict(iteration=iteration, control_steps=iteration * samples, seconds=round(seconds, 3))
-        progress.writerow(row | {PROGRESS[key]: value for key, value in scalars.items() if key in PROGRESS})
-        progress_file.flush()
-
-        if evaluation and not args.quiet:
-            print(f"{f'iteration {iteration}: {evaluation}':<79}")
-        if not args.quiet and (iteration == last or time.monotonic() - shown > (0.1 if terminal else 10.0)):
-            shown, rate = time.monotonic(), len(durations) / sum(durations)
-            bar = f"{'#' * (20 * iteration // args.iterations):<20}"
-            left = timedelta(seconds=round((args.iterations - iteration) / rate))
-            mean_return = scalars.get("charts/episodic_return", math.nan)
-            line = f"[{bar}] {iteration}/{args.iterations}, return {mean_return:.1f}, {rate:.2f} it/s, {left} left"
-            print(f"{line:<79}", end="\r" if terminal and iteration < last else "\n", flush=True)
-        if signals or iteration == last or (args.save_every and iteration % args.save_every == 0):
+        # A GPU works on this iteration while the one before is logged, unless something has to be done in between.
+        evaluating = iteration == args.iterations or (args.eval_every and iteration % args.eval_every == 0)
+        saving = iteration == last or (args.save_every and iteration % args.save_every == 0)
+        while waiting and (len(waiting) > behind or evaluating or saving or stopping):
+            logged, *results = waiting.popleft()
+            scalars = report(*results)
+            if evaluating and logged == iteration and rank == 0:
+                evaluation = evaluate(eval_env, lambda obs: actor(normalise(obs)))
+                scalars |= evaluation.scalars()
+                run.print(f"iteration {iteration}: {evaluation}")
+            run.log(logged, logged * samples, seconds, scalars)
+            run.show(logged, scalars["time/total"], episodes.means()[0], logged == last)
+        if saving or stopping:
             save(iteration)
-        if signals:
+        if stopping:
             break
+        if saving or evaluating:
+            mark = Mark(env.device)
 
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-    writer.close()
-    progress_file.close()
-    print(f"{args.env}: {iteration} iterations, {iteration * samples:,} control steps, {seconds:.1f} s of training")
-    print(f"skipped {skipped} updates, contained {nonfinite} non-finite states and {nonfinite_gradients} gradients")
-    if evaluation:
-        print(f"deterministic policy, {args.eval_episodes} episodes: {evaluation}")
-    print(f"written to {run_dir}")
-    if iteration < args.iterations:
-        print(f"stopped early: python shac.py --resume {run_dir / 'checkpoint.pt'} goes on")
-    elif args.capture_video:
-        write_video(run_dir, eval_env, evaluation)
-    if signals:
-        sys.exit(128 + signals[0])
+    run.close()
+    distributed.leave()
+    if rank == 0:
+        skipped, blown_up = (scalars[name] for name in ("grad/skipped", "sim/nonfinite_gradients"))
+        print(f"{args.env}: {iteration} iterations, {iteration * samples:,} control steps, {seconds:.1f} s of training")
+        print(f"skipped {skipped} updates, contained {nonfinite} non-finite states and {blown_up} gradients")
+        if evaluation:
+            print(f"deterministic policy, {args.eval_episodes} episodes: {evaluation}")
+        print(f"written to {run.directory}")
+        if iteration < args.iterations:
+            print(f"stopped early: python shac.py --resume {run.directory / 'checkpoint.pt'} goes on")
+        elif args.capture_video:
+            film(run.directory, eval_env, evaluation)
+    if run.signals:
+        sys.exit(128 + run.signals[0])
 
 
 def main(argv: list[str] | None = None) -> None:
