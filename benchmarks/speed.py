@@ -2,14 +2,18 @@
 
     python benchmarks/speed.py --env ant --num-envs 64
     python benchmarks/speed.py                                every task, 64 and 256 environments
+    python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
+    python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
+    python benchmarks/speed.py --parts picture                only draws benchmarks/results/speed.png from the csv files
 
-Prints three markdown tables and writes their rows to benchmarks/results/speed_*.csv, in place of older rows of the same
+Prints markdown tables and writes their rows to benchmarks/results/speed_*.csv, in place of older rows of the same
 setting. A machine that does something else meanwhile gives wrong numbers.
 """
 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import json
 import os
 import subprocess
@@ -23,17 +27,23 @@ from pathlib import Path
 from statistics import median
 from typing import Annotated, Any, Literal, NoReturn
 
+import matplotlib
 import mujoco
+import numpy as np
 import torch
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import diffsim
+from diffsim import graph
 from diffsim.simulator import available_cores
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-Part = Literal["physics", "training", "compile"]
+Part = Literal["physics", "scaling", "training", "compile", "picture"]
 
 
 @dataclass
@@ -42,6 +52,14 @@ class Args:
     """tasks"""
     num_envs: tuple[int, ...] = (64, 256)
     """batch sizes of the physics table (training uses the task's own)"""
+    scaling: tuple[int, ...] = (64, 256, 1024, 4096, 16384, 65536)
+    """batch sizes of the scaling table, at a horizon of 32"""
+    horizons: tuple[int, ...] = (1, 4, 8, 16, 32, 64, 128)
+    """horizons of the scaling table, at 64 environments"""
+    max_memory: float = 40.0
+    """GiB; settings of the scaling table whose checkpoints would need more are left out"""
+    compare: tuple[Literal["mujoco", "mujoco_warp"], ...] = ("mujoco",)
+    """simulators in the physics table beside ours; mujoco_warp must be installed"""
     dtype: tuple[Literal["float32", "float64"], ...] = ("float32", "float64")
     """precisions of the physics table"""
     device: str = "cpu"
@@ -165,6 +183,44 @@ class MuJoCo:
         return {"mj_step": 1e6 * (time.perf_counter() - start)}
 
 
+class MuJoCoWarp:
+    """mujoco_warp's step of all environments, on a GPU as one CUDA graph: its own contact solver, no gradients."""
+
+    def __init__(self, args: Args, scene: diffsim.Scene, num_envs: int, substeps: int, control_dt: float) -> None:
+        import mujoco_warp
+        import warp as wp
+
+        model = mujoco.MjModel.from_xml_path(scene.path)
+        model.opt.timestep = control_dt / substeps
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        self.low, self.high = model.actuator_ctrlrange.T
+        with wp.ScopedDevice(args.device):
+            self.model = mujoco_warp.put_model(model)
+            self.data = mujoco_warp.make_data(model, nworld=num_envs, nconmax=64, njmax=256)
+
+            def steps() -> None:
+                for _ in range(substeps):
+                    mujoco_warp.step(self.model, self.data)
+
+            steps()
+            self.run = steps
+            if args.device != "cpu":
+                with wp.ScopedCapture() as capture:
+                    steps()
+                self.run = lambda: wp.capture_launch(capture.graph)
+        self.synchronize = wp.synchronize
+
+    def time(self, state: State) -> dict[str, float]:
+        ctrl = self.low + (state[2].numpy() + 1) / 2 * (self.high - self.low)
+        for array, value in zip((self.data.qpos, self.data.qvel, self.data.ctrl), (*state[:2], ctrl), strict=True):
+            array.assign(np.asarray(value, dtype=np.float32))
+        self.synchronize()
+        start = time.perf_counter()
+        self.run()
+        self.synchronize()
+        return {"mj_step": 1e6 * (time.perf_counter() - start)}
+
+
 def measure_physics(args: Args, table: Table) -> None:
     threads = [1] if args.device != "cpu" else [1, available_cores()]
     for name in args.env:
@@ -174,6 +230,8 @@ def measure_physics(args: Args, table: Table) -> None:
             scene = diffsim.load_scene(Path(diffsim.__file__).parent / "assets" / task.asset)
             reference = MuJoCo(scene, num_envs, task.substeps, task.control_dt)
             competitors: dict[Any, Callable[[State], dict[str, float]]] = {"mujoco": reference.time}
+            if "mujoco_warp" in args.compare:
+                competitors["mujoco_warp"] = MuJoCoWarp(args, scene, num_envs, task.substeps, task.control_dt).time
             for dtype in args.dtype:
                 for count in threads:
                     sim = diffsim.Simulator(
@@ -203,6 +261,7 @@ def measure_physics(args: Args, table: Table) -> None:
 def report_physics(args: Args, table: Table, name: str, num_envs: int, substeps: int, times: Any) -> None:
     per_substep = num_envs * substeps
     mj = median(times.pop("mujoco")["mj_step"]) / per_substep
+    mj_warp = median(times.pop("mujoco_warp")["mj_step"]) / per_substep if "mujoco_warp" in times else None
     for (dtype, count), measured in times.items():
         t = {what: median(values) for what, values in measured.items()}
         alone = {what: median(values) for what, values in times[dtype, 1].items()}
@@ -220,9 +279,107 @@ def report_physics(args: Args, table: Table, name: str, num_envs: int, substeps:
                 "control step backward (us)": t["step backward"],
                 "mj_step, one core (us/substep)": mj,
                 "mj_step/forward": mj * per_substep / t["kernel forward"],
+                "mujoco_warp (us/substep)": mj_warp if mj_warp is not None else "",
                 "one thread/this": total_alone / total,
             }
         )
+
+
+# Scaling --------------------------------------------------------------------------------------------------------------
+
+
+def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[str, Any]:
+    """Seconds of a window of control steps, without gradients, differentiably, and with its backward; peak memory."""
+    device = "cuda" if "cuda" in technique else "cpu"
+    if device == "cuda":
+        torch.cuda.empty_cache()
+        free = torch.cuda.mem_get_info()[0]
+    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique)
+    env = diffsim.make(name, num_envs=num_envs, seed=0, horizon=horizon, device=device, threads=threads)
+    sim, (start_qpos, start_qvel) = env.sim, (env.qpos.clone(), env.qvel.clone())
+    actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()
+
+    def forward() -> torch.Tensor:
+        sim.rewind()
+        qpos, qvel = start_qpos, start_qvel
+        for action in actions.unbind():
+            qpos, qvel = sim.step(qpos, qvel, action)
+        return qpos.sum() + qvel.sum()
+
+    def both() -> torch.Tensor:
+        return torch.autograd.grad(forward(), actions)[0]
+
+    seconds: dict[str, Any] = {}
+    for what, function in (("no_grad", torch.no_grad()(forward)), ("forward", forward), ("both", both)):
+        call = graph.capture(function, device) if technique == "cuda graph" else function
+        fastest = float("inf")
+        for k in range(7):
+            if device == "cuda":
+                torch.cuda.synchronize()
+            start = time.perf_counter()
+            call()
+            if device == "cuda":
+                torch.cuda.synchronize()
+            if k > 2:  # compilation, warm-up, capture
+                fastest = min(fastest, time.perf_counter() - start)
+        seconds[what] = fastest
+    memory = (free - torch.cuda.mem_get_info()[0]) / 2**30 if device == "cuda" else ""
+    return seconds | {"memory": memory}
+
+
+def measure_scaling(args: Args, table: Table) -> None:
+    techniques = ["cuda graph", "cuda, eager"] if args.device != "cpu" else ["cpu, 1 thread", "cpu, all cores"]
+    for name in args.env:
+        task = diffsim.TASKS[name]
+        settings = [(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons]
+        for num_envs, horizon in dict.fromkeys(settings):
+            scene = diffsim.load_scene(Path(diffsim.__file__).parent / "assets" / task.asset)
+            row = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # numbers of a checkpoint, see kernels/model.py
+            if 4 * row * num_envs * horizon * task.substeps > args.max_memory * 2**30:
+                continue
+            for technique in techniques:
+                t = time_window(name, num_envs, horizon, technique)
+                steps = num_envs * horizon
+                table.add(
+                    **{
+                        "task": name,
+                        "environments": num_envs,
+                        "horizon": horizon,
+                        "technique": technique,
+                        "forward (us/substep of all)": 1e6 * t["forward"] / horizon / task.substeps,
+                        "backward (us/substep of all)": 1e6 * (t["both"] - t["forward"]) / horizon / task.substeps,
+                        "differentiated control steps/s": steps / t["both"],
+                        "substeps/s without gradient": steps * task.substeps / t["no_grad"],
+                        "memory (GiB)": t["memory"],
+                    }
+                )
+
+
+def draw(directory: Path) -> None:
+    """Microseconds of one differentiated control step of one environment, against environments and horizon."""
+    path = directory / "speed_scaling.csv"
+    if not path.is_file():
+        fail(f"{path} does not exist: measure with --parts scaling first")
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
+    for axis, of, fixed, value in (
+        (axes[0], "environments", "horizon", "32"),
+        (axes[1], "horizon", "environments", "64"),
+    ):
+        curves: dict[str, list[tuple[int, float]]] = defaultdict(list)
+        for row in rows:
+            if row[fixed] == value:
+                label = f"{row['task']}, {row['technique']}"
+                curves[label].append((int(row[of]), 1e6 / float(row["differentiated control steps/s"])))
+        for label, points in curves.items():
+            axis.loglog(*zip(*sorted(points), strict=True), marker="o", markersize=3, label=label)
+        axis.set_xlabel(f"{of} ({fixed} {value})")
+        axis.grid(True, which="both", alpha=0.3)
+    axes[0].set_ylabel("us per control step, forward + backward")
+    axes[0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(directory / "speed.png", dpi=110)
 
 
 # Training and compilation ---------------------------------------------------------------------------------------------
@@ -278,10 +435,11 @@ def logged(directory: Path, tag: str) -> list[float]:
 
 
 def measure_training(args: Args, table: Table) -> None:
-    devices = [args.device] if args.device != "cpu" else ["cpu, 1 thread", "cpu, all cores"]
+    devices = ["cuda graph", "cuda, eager"] if args.device != "cpu" else ["cpu, 1 thread", "cpu, all cores"]
     for name in args.env:
         for device in devices:
-            options = ["--env", name, "--device", device.partition(",")[0], "--eval-every", "0", "--save-every", "0"]
+            options = ["--env", name, "--device", args.device, "--eval-every", "0", "--save-every", "0"]
+            options += ["--no-cuda-graph"] if "eager" in device else []
             options += [
                 "--iterations",
                 str(args.iterations),
@@ -292,8 +450,12 @@ def measure_training(args: Args, table: Table) -> None:
                 run_shac(Path(temporary) / "compile", [*options, "--stop-after", "1"])
                 directory = Path(temporary) / "run"
                 first, memory = run_shac(directory, options)
-                tags = ("time/total", "time/sim_forward", "time/sim_backward", "time/critic")
-                total, forward, backward, critic = (1e3 * median(logged(directory, tag)[3:]) for tag in tags)
+                tags = (
+                    "time/total",
+                    "time/critic",
+                    *(["time/sim_forward", "time/sim_backward"] * (args.device == "cpu")),
+                )
+                total, critic, *physics = (1e3 * median(logged(directory, tag)[3:]) for tag in tags)
                 num_envs = json.loads((directory / "args.json").read_text())["num_envs"]
             table.add(
                 **{
@@ -301,10 +463,10 @@ def measure_training(args: Args, table: Table) -> None:
                     "environments": num_envs,
                     "device": device,
                     "iteration (ms)": total,
-                    "physics forward": forward,
-                    "physics backward": backward,
+                    "physics forward": physics[0] if physics else "",
+                    "physics backward": physics[1] if physics else "",
                     "critic": critic,
-                    "policy, task, loss": total - forward - backward - critic,
+                    "policy, task, loss": total - critic - sum(physics),  # and the physics on a GPU
                     "start to first iteration (s)": first,
                     "peak memory (MiB)": memory,
                 }
@@ -317,13 +479,18 @@ def main(args: Args) -> None:
     if min(args.states, args.repeats, *args.num_envs) < 1 or args.iterations < 4:
         fail("--states, --repeats and --num-envs must be at least 1, --iterations at least 4")
     torch.set_num_threads(1)
+    if "mujoco_warp" in args.compare and importlib.util.find_spec("mujoco_warp") is None:
+        fail("--compare mujoco_warp needs it installed: pip install mujoco-warp")
     measures = {
         "physics": (measure_physics, ("task", "environments", "precision", "device")),
+        "scaling": (measure_scaling, ("task", "environments", "horizon", "technique")),
         "training": (measure_training, ("task", "environments", "device")),
         "compile": (measure_compile, ("task", "device")),
     }
     tables = []
     for part in args.parts:
+        if part == "picture":
+            continue
         measure, key = measures[part]
         print(f"{part}:", flush=True)
         tables.append(Table(part, key))
@@ -331,6 +498,8 @@ def main(args: Args) -> None:
         tables[-1].write(args.output)
     for table in tables:
         print(f"\n{table.markdown()}")
+    if {"scaling", "picture"} & set(args.parts):
+        draw(args.output)
 
 
 if __name__ == "__main__":
