@@ -33,13 +33,15 @@ class SceneError(ValueError):
 class Scene:
     """One articulated robot over a ground plane, in MuJoCo's conventions: SI units, z up.
 
-    Link 0 is the base: the floating body, or the world if the base is fixed. Each further link has one hinge or slide,
-    in MuJoCo's order of degrees of freedom; bodies with several joints become several links, welded bodies are merged.
-    A link's frame sits at its joint's anchor: R = R_parent rotation Rot(axis, q - q_ref).
+    Link 0 is the base: the floating body, or the world if the base is fixed. Each further link has one degree of
+    freedom, in MuJoCo's order; bodies with several joints become several links, welded bodies are merged. A link's
+    frame sits at its joint's anchor: R = R_parent rotation Rot(axis, q - q_ref). A ball joint makes three links in a
+    row, all in the frame of the body that it turns and about one axis of it each; only the last has mass.
 
     Attributes (nlink rows each unless said):
         parent: index of the parent link (the base's own is 0).
-        slide: True where the joint is a slide, False for a hinge.
+        slide: True where the joint is a slide.
+        ball: 0, 1, 2 for the three links of a ball joint, -1 elsewhere.
         rotation, position: (3, 3) and (3,), the frame in the parent's frame at the reference configuration.
         axis: (3,) unit joint axis in the link's frame.
         joint_ref: q at the reference configuration (MJCF `ref`).
@@ -58,6 +60,7 @@ class Scene:
     nv: int
     parent: Index
     slide: NDArray[np.bool_]
+    ball: Index
     rotation: Array
     position: Array
     axis: Array
@@ -99,6 +102,16 @@ class Scene:
         return len(self.contact_radius)
 
     @property
+    def nball(self) -> int:
+        return int((self.ball == 0).sum())
+
+    @property
+    def qpos_adr(self) -> Index:
+        """(nlink,) where each link's joint is in qpos; the links of a ball joint point to its quaternion's w, x, y."""
+        passed = np.concatenate([[0], np.cumsum(self.ball == 2)[:-1]])  # balls, each one number longer than its rates
+        return (np.arange(self.nlink) - 1 + (7 if self.floating else 0) + passed).astype(np.int32)
+
+    @property
     def qpos0(self) -> Array:
         """(nq,) the reference configuration of the MJCF."""
         return np.array(self.mj_model.qpos0)
@@ -109,8 +122,9 @@ class Scene:
         limited = np.isfinite(self.lower) | np.isfinite(self.upper)
         present = {
             "floating": self.floating,
-            "hinge": bool((~self.slide[1:]).any()),
+            "hinge": bool((~self.slide & (self.ball < 0))[1:].any()),
             "slide": bool(self.slide[1:].any()),
+            "ball": self.nball > 0,
             "contact": self.ncontact > 0,
             "limit": bool(limited.any()) and (self.k_limit > 0 or self.d_limit > 0),
             "stiffness": bool(self.stiffness.any()),
@@ -202,7 +216,7 @@ class _Reader:
         com = columns.pop("moment") / np.where(mass > 0, mass, 1.0)[:, None]
         about_origin = columns.pop("inertia")
         inertia = about_origin + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
-        columns["parent"] = columns["parent"].astype(np.int32)
+        columns |= {key: columns[key].astype(np.int32) for key in ("parent", "ball")}
         return Scene(
             name=self.file.stem,
             path=str(self.file),
@@ -247,8 +261,8 @@ class _Reader:
                 raise self._error(f"{name}: actuatorfrcrange is not simulated")
             if self._any("dof_dampingpoly", dof) or self._any("jnt_stiffnesspoly", j):
                 raise self._error(f"{name}: damping and stiffness are linear here, one number each")
-            if m.jnt_type[j] == joint.mjJNT_BALL:
-                raise self._error(f"{name}: ball joints are not simulated; use free, hinge or slide")
+            if m.jnt_type[j] == joint.mjJNT_BALL and m.jnt_limited[j]:
+                raise self._error(f"{name}: the limit of a ball joint is not simulated")
             if m.dof_frictionloss[dof]:
                 raise self._error(f"{name}: frictionloss is not simulated")
             if m.jnt_type[j] == joint.mjJNT_FREE:
@@ -257,22 +271,24 @@ class _Reader:
                 if j or m.body_parentid[m.jnt_bodyid[j]]:
                     raise self._error(f"{name}: one free joint, of the first moving body, is simulated")
 
-    def _add_link(self, parent: int, joint: int = -1, **values: Any) -> int:
+    def _add_link(self, parent: int, joint: int = -1, ball: int = -1, **values: Any) -> int:
         m = self.m
         dof, adr = (m.jnt_dofadr[joint], m.jnt_qposadr[joint]) if joint >= 0 else (-1, -1)
         moving = joint >= 0 and m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE
-        limited = moving and m.jnt_limited[joint]
+        limited, scalar = moving and m.jnt_limited[joint], moving and ball < 0
+        axis = np.array(m.jnt_axis[joint]) if scalar else np.zeros(3)
         link = {
             "parent": parent,
             "slide": moving and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE,
+            "ball": ball,
             "rotation": np.eye(3),
             "position": np.zeros(3),
-            "axis": np.array(m.jnt_axis[joint]) if moving else np.zeros(3),
-            "joint_ref": m.qpos0[adr] if moving else 0.0,
+            "axis": np.eye(3)[ball] if ball >= 0 else axis,
+            "joint_ref": m.qpos0[adr] if scalar else 0.0,
             "armature": m.dof_armature[dof] if moving else 0.0,
             "damping": m.dof_damping[dof] if moving else 0.0,
             "stiffness": m.jnt_stiffness[joint] if moving else 0.0,
-            "spring_ref": m.qpos_spring[adr] if moving else 0.0,
+            "spring_ref": m.qpos_spring[adr] if scalar else 0.0,  # a ball's is the identity in every MJCF
             "lower": m.jnt_range[joint, 0] if limited else -np.inf,
             "upper": m.jnt_range[joint, 1] if limited else np.inf,
             "mass": 0.0,
@@ -297,10 +313,11 @@ class _Reader:
                 raise self._error(f"{self._name(mujoco.mjtObj.mjOBJ_BODY, body)}: a second base beside a floating one")
             for joint in joints:
                 anchor = np.array(m.jnt_pos[joint])
-                link = self._add_link(
-                    parent=link, joint=joint, rotation=rotation, position=position + rotation @ anchor
-                )
-                rotation, position = np.eye(3), -anchor
+                position = position + rotation @ anchor
+                for ball in range(3) if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else (-1,):
+                    link = self._add_link(link, joint, ball, rotation=rotation, position=position)
+                    rotation, position = np.eye(3), np.zeros(3)
+                position = -anchor
         self.body.append((link, rotation, position))
         if link >= 0:
             self._add_inertia(self.links[link], body, rotation, position)
@@ -320,21 +337,28 @@ class _Reader:
         link, gear, bias = [], [], []
         for a in range(m.nu):
             name = self._name(mujoco.mjtObj.mjOBJ_ACTUATOR, a)
-            joint = m.actuator_trnid[a, 0]
+            joint, axis = m.actuator_trnid[a, 0], 0
+            on_joint = m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
+            on_ball = on_joint and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
+            if on_ball:  # a torque about one axis of the turned body's frame
+                axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
             if (
-                m.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT
+                not on_joint
                 or m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
                 or m.actuator_dyntype[a] != mujoco.mjtDyn.mjDYN_NONE
                 or m.actuator_gaintype[a] != mujoco.mjtGain.mjGAIN_FIXED
                 or m.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_NONE
+                or (on_ball and np.delete(m.actuator_gear[a, :3], axis).any())
                 or m.actuator_forcelimited[a]
                 or self._any("actuator_damping", a)
                 or self._any("actuator_armature", a)
             ):
-                raise self._error(f"{name}: only motors with a gear and a ctrlrange, on a hinge or slide")
+                raise self._error(
+                    f"{name}: only motors with a gear and a ctrlrange, on a hinge, a slide or one axis of a ball joint"
+                )
             low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
-            scale = m.actuator_gear[a, 0] * m.actuator_gainprm[a, 0]
-            link.append(self.joint_link[joint])
+            scale = m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
+            link.append(self.joint_link[joint] + (axis - 2 if on_ball else 0))
             gear.append(scale * (high - low) / 2)
             bias.append(scale * (high + low) / 2)
         return {"motor_link": np.array(link, np.int32), "gear": np.array(gear), "motor_bias": np.array(bias)}

@@ -49,6 +49,9 @@ def kinematics(scene: Scene, qpos: Array, qvel: Array) -> list[Link]:
         base.angular_velocity, base.angular_jacobian[:, 3:6] = base.rotation @ qvel[3:6], base.rotation
     links = [base]
     for i in range(1, scene.nlink):
+        if scene.ball[i] > 0:
+            links.append(links[-1])  # one joint of three degrees of freedom
+            continue
         q, qd, dof = qpos[joint_qpos(scene, i)], qvel[joint_dof(scene, i)], joint_dof(scene, i)
         parent = links[scene.parent[i]]
         frame = parent.rotation @ scene.rotation[i]
@@ -56,6 +59,8 @@ def kinematics(scene: Scene, qpos: Array, qvel: Array) -> list[Link]:
         offset = parent.rotation @ scene.position[i]
         if scene.slide[i]:
             offset = offset + axis * (q - scene.joint_ref[i])
+        elif scene.ball[i] == 0:
+            frame = frame @ quaternion_matrix(ball_quaternion(scene, i, qpos))
         else:
             frame = frame @ axis_angle_matrix(scene.axis[i], q - scene.joint_ref[i])
         velocity, jacobian, bias = parent.point(offset)
@@ -74,6 +79,11 @@ def kinematics(scene: Scene, qpos: Array, qvel: Array) -> list[Link]:
             link.velocity = velocity + axis * qd
             link.jacobian[:, dof] += axis
             link.bias = bias + 2 * np.cross(w, axis * qd)
+        elif scene.ball[i] == 0:
+            turn = frame @ qvel[dof : dof + 3]
+            link.angular_velocity = w + turn
+            link.angular_jacobian[:, dof : dof + 3] += frame
+            link.angular_bias = parent.angular_bias + np.cross(w, turn)
         else:
             link.angular_velocity = w + axis * qd
             link.angular_jacobian[:, dof] += axis
@@ -106,7 +116,7 @@ def joint_forces(
         force[joint_dof(scene, link)] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]
     for i in range(1, scene.nlink):
         dof, qd = joint_dof(scene, i), qvel[joint_dof(scene, i)]
-        q = qpos[joint_qpos(scene, i)] + theta * h * qd
+        q = joint_position(scene, i, qpos) + theta * h * qd
         bound = np.clip(q, scene.lower[i], scene.upper[i])
         beyond = q != bound
         damping = scene.damping[i] + beyond * scene.d_limit
@@ -165,13 +175,23 @@ def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float =
 
 def integrate(scene: Scene, qpos: Array, qvel: Array, h: float) -> Array:
     """qpos after moving with qvel for h seconds, the orientation by the exact exponential."""
-    if not scene.floating:
-        return qpos + h * qvel
-    rotation = h * qvel[3:6]
+    result = np.zeros_like(qpos)
+    if scene.floating:
+        result[:3] = qpos[:3] + h * qvel[:3]
+        result[3:7] = turned(qpos[3:7], h * qvel[3:6])
+    for i in range(1, scene.nlink):
+        adr, dof = joint_qpos(scene, i), joint_dof(scene, i)
+        if scene.ball[i] < 0:
+            result[adr] = qpos[adr] + h * qvel[dof]
+        elif scene.ball[i] == 0:
+            result[adr : adr + 4] = turned(qpos[adr : adr + 4], h * qvel[dof : dof + 3])
+    return result
+
+
+def turned(quaternion: Array, rotation: Array) -> Array:
     angle = np.linalg.norm(rotation)
     turn = np.array([np.cos(angle / 2), *(np.sinc(angle / (2 * np.pi)) / 2 * rotation)])
-    orientation = quaternion_product(qpos[3:7] / np.linalg.norm(qpos[3:7]), turn)
-    return np.concatenate([qpos[:3] + h * qvel[:3], orientation, qpos[7:] + h * qvel[6:]])
+    return quaternion_product(quaternion / np.linalg.norm(quaternion), turn)
 
 
 def step(
@@ -209,7 +229,7 @@ def energy(scene: Scene, qpos: Array, qvel: Array) -> float:
     """Kinetic energy and the potential of gravity and springs."""
     links = kinematics(scene, qpos, qvel)
     centres = np.array([link.position + link.rotation @ c for link, c in zip(links, scene.com, strict=True)])
-    stretch = qpos[-scene.nlink + 1 :] - scene.spring_ref[1:] if scene.nlink > 1 else np.zeros(0)
+    stretch = np.array([joint_position(scene, i, qpos) - scene.spring_ref[i] for i in range(1, scene.nlink)])
     potential = -scene.mass @ centres @ scene.gravity + stretch**2 @ scene.stiffness[1:] / 2
     return float(qvel @ mass_and_bias(scene, links)[0] @ qvel / 2 + potential)
 
@@ -219,7 +239,29 @@ def joint_dof(scene: Scene, link: int) -> int:
 
 
 def joint_qpos(scene: Scene, link: int) -> int:
-    return link - 1 + 7 * scene.floating
+    return link - 1 + 7 * scene.floating + int((scene.ball[:link] == 2).sum())
+
+
+def scalar_joints(scene: Scene) -> tuple[NDArray[np.intp], list[int]]:
+    """The links on a hinge or slide, and where in qpos their joints are."""
+    links = np.flatnonzero(scene.ball[1:] < 0) + 1
+    return links, [joint_qpos(scene, i) for i in links]
+
+
+def ball_quaternion(scene: Scene, link: int, qpos: Array) -> Array:
+    """Of a ball joint's first link."""
+    quaternion = qpos[joint_qpos(scene, link) :][:4]
+    return quaternion / np.linalg.norm(quaternion)
+
+
+def joint_position(scene: Scene, link: int, qpos: Array) -> float:
+    """What the joint's spring sees: its coordinate, or a component of a ball joint's rotation vector."""
+    axis = scene.ball[link]
+    if axis < 0:
+        return qpos[joint_qpos(scene, link)]
+    w, *v = ball_quaternion(scene, link - axis, qpos)
+    angle = 2 * np.arctan2(np.linalg.norm(v), abs(w))
+    return angle * np.sign(w) * v[axis] / np.linalg.norm(v) if angle > 0 else 0.0
 
 
 def quaternion_matrix(quaternion: Array) -> Array:

@@ -56,6 +56,21 @@ PENDULUM = """
   </worldbody>
 </mujoco>"""
 
+# A ball joint on the world, driven about two axes of the arm's frame, and a slide along the arm.
+SHOULDER = """
+<mujoco>
+  <worldbody>
+    <body pos="0.3 0.1 1" quat="0.6 0 0.8 0">
+      <joint name="shoulder" type="ball" pos="0 0 0.1" stiffness="30" damping="0.4" armature="0.05"/>
+      <inertial pos="0.1 0 -0.3" mass="1.5" diaginertia="0.1 0.2 0.15"/>
+      <body> <joint type="slide" axis="0 3 4"/> <inertial pos="0.2 0.1 0" mass="1" diaginertia="0.1 0.1 0.1"/> </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="shoulder" gear="0 5 0"/> <motor joint="shoulder" gear="0 0 -4" ctrllimited="true" ctrlrange="0 3"/>
+  </actuator>
+</mujoco>"""
+
 # One limited, driven hinge about the vertical, so that only its own laws act.
 HINGE = """
 <mujoco>
@@ -91,11 +106,14 @@ def tree_scene(base: str, seed: int) -> Scene:
 def random_tree(base: str, seed: int) -> str:
     """MJCF of a random tree: seven hinges and slides, up to three a body, welded bodies, everything else random.
 
-    `base` is "floating", "fixed" (the first joint is a hinge) or "planar" (two slides without mass lead to the rest).
+    `base` is "floating", "fixed" (the first joint is a hinge), "planar" (two slides without mass lead to the rest) or
+    "ball": floating, with two ball joints among the seven.
     All seeds of a base have the same shape, so one compiled kernel serves them. The ground is far below.
     """
     rng = np.random.default_rng(seed)
     joints = 0
+    given = list(rng.permutation(["ball", "ball", "hinge", "hinge", "slide"])) if base == "ball" else []
+    balls = set()
 
     def numbers(count: int) -> str:
         return " ".join(map(str, rng.normal(size=count)))
@@ -103,11 +121,22 @@ def random_tree(base: str, seed: int) -> str:
     def joint(kind: str) -> str:
         nonlocal joints
         joints += 1
+        if kind == "ball":
+            balls.add(joints)
+            spring = f'stiffness="{rng.uniform(0, 20)}" damping="{rng.uniform(0, 2)}"'
+            return f'<joint name="joint{joints}" type="ball" pos="{numbers(3)}" armature="{rng.random()}" {spring}/>'
         low, high = -rng.uniform(0.2, 1.5), rng.uniform(0.2, 1.5)
         spring = f'stiffness="{rng.uniform(0, 20)}" springref="{rng.normal()}" damping="{rng.uniform(0, 2)}"'
         limit = f'limited="true" range="{low} {high}"' if rng.random() < 0.7 else ""
         place = f'pos="{numbers(3)}" axis="{numbers(3)}" ref="{0.5 * rng.normal()}" armature="{rng.uniform(0, 0.5)}"'
         return f'<joint name="joint{joints}" type="{kind}" {place} {spring} {limit}/>'
+
+    def kinds(most: int) -> list[str]:
+        """Of a body's joints; one that turns freely is the only one."""
+        result: list[str] = []
+        while len(result) < most and "ball" not in result and not (result and given and given[-1] == "ball"):
+            result.append(given.pop() if given else rng.choice(["hinge", "slide"]))
+        return result
 
     def inertial() -> str:
         spread = rng.uniform(0.05, 0.5, 3)
@@ -126,6 +155,7 @@ def random_tree(base: str, seed: int) -> str:
 
     first = {
         "floating": "<freejoint/>",
+        "ball": "<freejoint/>",
         "fixed": joint("hinge") if base == "fixed" else "",
         "planar": joint("slide") + joint("slide") + joint("hinge") if base == "planar" else "",
     }[base]
@@ -134,10 +164,12 @@ def random_tree(base: str, seed: int) -> str:
         for _ in range(rng.integers(0, depth)):  # climb back to an ancestor, never beyond the first body
             text, depth = text + "</body>", depth - 1
         count = min(int(rng.integers(0, 4)), 7 - joints)  # 0: a welded body
-        text, depth = text + body("".join(joint(rng.choice(["hinge", "slide"])) for _ in range(count))), depth + 1
+        text, depth = text + body("".join(joint(kind) for kind in kinds(count))), depth + 1
     text += "</body>" * depth
+    about = ["", "0 ", "0 0 "]  # the axes of a ball joint before the one that is driven
     motors = "".join(
-        f'<motor joint="joint{j}" gear="{10 * rng.normal()}" ctrllimited="true" ctrlrange="{-rng.random()} 1.5"/>'
+        f'<motor joint="joint{j}" gear="{about[j % 3] if j in balls else ""}{10 * rng.normal()}" ctrllimited="true" '
+        f'ctrlrange="{-rng.random()} 1.5"/>'
         for j in rng.choice(np.arange(1, 8), 4, replace=False)
     )
     return f"""
@@ -159,8 +191,11 @@ def free_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Arr
     if scene.floating:
         qpos[:, :3] = rng.normal(size=(count, 3))
         qpos[:, 3:7] = unit(rng.normal(size=(count, 4)))
-    low, high = np.maximum(scene.lower[1:], -2.0), np.minimum(scene.upper[1:], 2.0)
-    qpos[:, scene.nq - scene.nlink + 1 :] = rng.uniform(low, high, (count, scene.nlink - 1))
+    links, joints = reference.scalar_joints(scene)
+    low, high = np.maximum(scene.lower[links], -2.0), np.minimum(scene.upper[links], 2.0)
+    qpos[:, joints] = rng.uniform(low, high, (count, len(links)))
+    for link in np.flatnonzero(scene.ball == 0):
+        qpos[:, reference.joint_qpos(scene, link) :][:, :4] = unit(rng.normal(size=(count, 4)))
     return qpos, rng.normal(size=(count, scene.nv)), rng.uniform(-1, 1, (count, scene.nu))
 
 
@@ -183,8 +218,8 @@ def acting_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[A
 
 def check_that_ground_and_limits_act(scene: Scene, qpos: Array, qvel: Array) -> None:
     """Every state touches the ground, half of them pass a limit; some contacts stick and some slide."""
-    joints = qpos[:, scene.nq - scene.nlink + 1 :]
-    assert ((joints < scene.lower[1:]) | (joints > scene.upper[1:])).any(-1).mean() >= 0.5
+    links, joints = reference.scalar_joints(scene)
+    assert ((qpos[:, joints] < scene.lower[links]) | (qpos[:, joints] > scene.upper[links])).any(-1).mean() >= 0.5
     if scene.ncontact:
         points = [reference.contacts(scene, *state) for state in zip(qpos, qvel, strict=True)]
         depths, velocities = np.array([p[0] for p in points]), np.array([p[1] for p in points])

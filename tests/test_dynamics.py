@@ -13,6 +13,7 @@ from scenes import (
     BALL,
     BLOCK,
     PENDULUM,
+    SHOULDER,
     acceleration,
     acting_states,
     check_that_ground_and_limits_act,
@@ -30,7 +31,7 @@ from scenes import (
 from diffsim.simulator import Simulator
 from diffsim.tasks import TASKS
 
-TREES = [(base, seed) for base in ("floating", "fixed", "planar") for seed in range(6)]
+TREES = [(base, seed) for base in ("floating", "fixed", "planar", "ball") for seed in range(6)]
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
 
 
@@ -75,6 +76,10 @@ def test_tree_accelerations_are_mujocos(base, seed, dtype, rng):
     check_against_mujoco(tree_scene(base, seed), dtype, rng)
 
 
+def test_ball_joint_on_the_world_has_mujocos_accelerations(rng):
+    check_against_mujoco(parse(SHOULDER), torch.float64, rng)
+
+
 # Against the plain NumPy reference
 
 
@@ -105,6 +110,22 @@ def test_tree_steps_are_the_references(base, seed, rng):
     check_against_reference(scene, qpos, qvel, ctrl, substeps=16)
 
 
+@pytest.mark.parametrize("theta", [0.0, 0.5])
+def test_ball_joint_takes_implicit_steps_as_the_reference(theta, rng):
+    scene = parse(SHOULDER)
+    check_against_reference(scene, *free_states(scene, 4, rng), substeps=4, integrator="implicit", theta=theta)
+
+
+def test_ball_joints_know_a_quaternion_and_its_negative_as_one(rng):
+    scene = parse(SHOULDER)
+    qpos, qvel, ctrl = free_states(scene, 16, rng)
+    q, v = run(scene, qpos, qvel, ctrl, substeps=64)
+    opposite_q, opposite_v = run(scene, qpos * [-1, -1, -1, -1, 1], qvel, ctrl, substeps=64)
+    np.testing.assert_array_equal(opposite_q * [-1, -1, -1, -1, 1], q)
+    np.testing.assert_array_equal(opposite_v, v)
+    np.testing.assert_allclose(np.linalg.norm(q[:, :4], axis=1), 1, rtol=1e-14)
+
+
 # Laws of motion
 
 
@@ -113,9 +134,10 @@ def halving_orders(errors):
     return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
 
 
-def test_free_flight_keeps_momentum_and_energy_to_first_order(rng):
+@pytest.mark.parametrize("base", ["floating", "ball"])
+def test_free_flight_keeps_momentum_and_energy_to_first_order(base, rng):
     """A tree that tumbles for a quarter of a second; gravity adds m g t, motors cannot change momentum."""
-    scene = tree_scene("floating", 0).without("contact", "limit", "damping")
+    scene = tree_scene(base, 0).without("contact", "limit", "damping")
     qpos, qvel, ctrl = free_states(scene, 1, rng)
     t, substeps = 0.25, [256, 512, 1024]
 

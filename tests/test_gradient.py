@@ -8,6 +8,7 @@ import torch
 from scenes import (
     BALL,
     HINGE,
+    SHOULDER,
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
@@ -75,12 +76,24 @@ def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
     check_gradients(scene, states, rng, substeps=TASKS[name].substeps, integrator=integrator, theta=theta)
 
 
-@pytest.mark.parametrize("base, seed", [(base, seed) for base in ("floating", "fixed", "planar") for seed in range(4)])
+@pytest.mark.parametrize(
+    "base, seed", [(base, seed) for base in ("floating", "fixed", "planar", "ball") for seed in range(4)]
+)
 def test_tree_gradient_is_that_of_differences(base, seed, rng):
     scene = tree_scene(base, seed)
     qpos, qvel, ctrl = free_states(scene, 4, rng)
     pass_limits(scene, qpos, rng)
     check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, substeps=16)
+
+
+@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
+def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
+    """Quaternions of any length and sign, and one turn of nothing, where the spring's rotation vector is zero."""
+    scene = parse(SHOULDER)
+    qpos, qvel, ctrl = free_states(scene, 8, rng)
+    qpos[:, :4] *= np.linspace(0.5, -2.0, 8)[:, None]
+    qpos[0, :4] = 1.0, 0.0, 0.0, 0.0
+    check_gradients(scene, (qpos, qvel, ctrl), rng, integrator=integrator, theta=theta)
 
 
 def test_quaternion_of_any_length(rng):

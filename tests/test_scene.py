@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import reference
-from scenes import BALL, free_states, parse, task_scene, tree_scene
+from scenes import BALL, SHOULDER, free_states, parse, task_scene, tree_scene
 
 from diffsim.scene import PENALTY_DEFAULTS, SceneError, load_scene
 from diffsim.tasks import TASKS
@@ -64,7 +64,22 @@ def test_body_with_several_joints_becomes_links_in_a_row():
     np.testing.assert_allclose(scene.position[2:], [[0.3, -0.2, -0.3], [0.6, 0, 0]])
 
 
-@pytest.mark.parametrize("base", ["floating", "fixed", "planar"])
+def test_ball_joint_becomes_three_links():
+    scene = parse(SHOULDER)
+    np.testing.assert_array_equal(scene.ball, [-1, 0, 1, 2, -1])
+    np.testing.assert_array_equal(scene.parent, [0, 0, 1, 2, 3])
+    np.testing.assert_array_equal(scene.qpos_adr[1:], [0, 1, 2, 4])
+    np.testing.assert_array_equal(scene.axis[1:4], np.eye(3))
+    np.testing.assert_array_equal(scene.mass, [0, 0, 0, 1.5, 1])
+    np.testing.assert_array_equal(scene.armature[1:4], 0.05)
+    np.testing.assert_array_equal(scene.motor_link, [2, 3])
+    np.testing.assert_allclose(scene.gear, [5, -6])
+    np.testing.assert_allclose(scene.motor_bias, [0, -6])
+    assert (scene.nq, scene.nv, scene.nball) == (5, 4, 1)
+    assert scene.features == {"ball", "slide", "stiffness", "damping", "motor"}
+
+
+@pytest.mark.parametrize("base", ["floating", "fixed", "planar", "ball"])
 def test_links_are_where_mujoco_has_them(base, rng):
     """Centres of mass of the bodies and of the spheres that touch the ground, in random poses."""
     scene = tree_scene(base, 3)
@@ -257,7 +272,17 @@ UNSUPPORTED = {
         pendulum(rest='<actuator><motor name="heavy" joint="hinge" armature="1"/></actuator>'),
         "heavy|armature",
     ),
-    "ball joint": (robot('<body><joint name="hip" type="ball"/><geom size="0.1"/></body>'), "hip"),
+    "ball joint with a limit": (
+        robot('<body><joint name="hip" type="ball" range="0 1" limited="true"/><geom size="0.1"/></body>'),
+        "hip",
+    ),
+    "motor on a ball joint about a slanted axis": (
+        robot(
+            '<body><joint name="hip" type="ball"/><geom size="0.1"/></body>',
+            '<actuator><motor name="twist" joint="hip" gear="1 1 0"/></actuator>',
+        ),
+        "twist.*one axis of a ball joint",
+    ),
     "free joint with damping": (robot('<body><joint name="r" type="free" damping="1"/><geom size="0.1"/></body>'), "r"),
     "free joint with armature": (
         robot('<body><joint name="r" type="free" armature="1"/><geom size="0.1"/></body>'),

@@ -31,14 +31,10 @@ from diffsim.kernels.spatial import spatial
 def backward_kernel(shape: Shape) -> wp.Kernel:
     t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
     T, vec3, vec6, mat3, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
-    join, force_at, point_velocity, momentum, exp_quat = (
-        sp.join,
-        sp.force_at,
-        sp.point_velocity,
-        sp.momentum,
-        sp.exp_quat,
-    )
+    join, force_at, point_velocity, momentum = sp.join, sp.force_at, sp.point_velocity, sp.momentum
+    exp_quat, to_tangent, from_tangent = sp.exp_quat, sp.to_tangent, sp.from_tangent
     load, place_links, sphere_state = kin.load, kin.place_links, kin.sphere_state
+    qpos_adr, load_quat, load_quat_row, place_balls = kin.qpos_adr, kin.load_quat, kin.load_quat_row, kin.place_balls
     contact = contact_law(T)
     touches, contact_force = contact.touches, contact.contact_force
     contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
@@ -46,7 +42,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
     NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
     FIRST = 0 if FLOATING else 1
-    VADR, QADR = shape.dof0 - 1, shape.dof0 - 1 + int(FLOATING)
+    VADR, NBALL, BALL_SPRING = shape.dof0 - 1, shape.nball, shape.nball > 0 and "stiffness" in uses
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
 
     @wp.func
@@ -61,6 +57,16 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         rg = wp.cross(r, g)
         rrg = wp.cross(r, rg)
         return g + k1 * rg + k2 * rrg, g + (T(1.0) - k2 * angle * angle) * rg + k1 * rrg
+
+    @wp.func
+    def log_adjoint(r: vec3, g: vec3):
+        """Adjoint of log(exp(r) exp(d)) with respect to d, at d = 0: the inverse of J_r(r)'."""
+        angle = wp.length(r)
+        k2 = T(1.0) / T(12.0) + angle * angle / T(720.0)
+        if angle > T(2e-2):
+            k2 = (T(1.0) - T(0.5) * angle / wp.tan(T(0.5) * angle)) / (angle * angle)
+        rg = wp.cross(r, g)
+        return g - T(0.5) * rg + k2 * wp.cross(r, rg)
 
     @wp.func
     def solve_base(ck_f: t.array3, row: int, e: int, b: vec6):
@@ -78,6 +84,12 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 y = y - load(ck_f, row, BASE + k * (k + 1) / 2 + r, e) * a[k]
             a[r] = y * load(ck_f, row, BASE + r * (r + 1) / 2 + r, e)
         return a
+
+    @wp.func
+    def next_rate(ck_v: t.array3, ck_a: t.array3, row: int, k: int, e: int, h: T):
+        """Three rates in a row at the end of the substep."""
+        v = vec3(load(ck_v, row, k, e), load(ck_v, row, k + 1, e), load(ck_v, row, k + 2, e))
+        return v + h * vec3(load(ck_a, row, k, e), load(ck_a, row, k + 1, e), load(ck_a, row, k + 2, e))
 
     @wp.func
     def link_adjoint(m: Model, i: int, R: mat3, x: vec3, V: vec6, A: vec6, W: vec6, height: T, h: T, theta: T):
@@ -170,20 +182,26 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         lam = wp.zeros(shape=NL, dtype=T)
         u = wp.zeros(shape=NL, dtype=T)
         for i in range(1, NL):
-            gq[i] = g_qpos_out[e, QADR + i]
+            gq[i] = g_qpos_out[e, qpos_adr(m, i)]
             gqd[i] = g_qvel_out[e, VADR + i]
         R[0] = wp.identity(3, dtype=T)
+        end = row0 + substeps - 1
+        if wp.static(NBALL > 0):
+            turn = wp.zeros(shape=NBALL, dtype=quat)
+            for b in range(NBALL):
+                i = m.ball_link[b]
+                wb = next_rate(ck_v, ck_a, end, VADR + i, e, h)
+                rot_b = wp.normalize(load_quat_row(ck_q, end, qpos_adr(m, i), e) * exp_quat(h * wb))
+                gb = to_tangent(rot_b, load_quat(g_qpos_out, e, qpos_adr(m, i)))
+                for k in range(3):
+                    gq[i + k] = gb[k]
         if wp.static(FLOATING):
-            # Of a unit quaternion r, turned by the body-frame rotation vector d: dr = r (d, 0) / 2.
-            end = row0 + substeps - 1
             w = vec3(load(ck_v, end, 3, e), load(ck_v, end, 4, e), load(ck_v, end, 5, e))
             w = w + h * vec3(load(ck_a, end, 3, e), load(ck_a, end, 4, e), load(ck_a, end, 5, e))
             rot = quat(load(ck_q, end, 4, e), load(ck_q, end, 5, e), load(ck_q, end, 6, e), load(ck_q, end, 3, e))
             rot = wp.normalize(rot * exp_quat(h * w))
-            gr4 = quat(g_qpos_out[e, 4], g_qpos_out[e, 5], g_qpos_out[e, 6], g_qpos_out[e, 3])
-            turn = wp.quat_inverse(rot) * gr4
             gp = vec3(g_qpos_out[e, 0], g_qpos_out[e, 1], g_qpos_out[e, 2])
-            gr = T(0.5) * vec3(turn[0], turn[1], turn[2])
+            gr = to_tangent(rot, load_quat(g_qpos_out, e, 3))
             gv = vec3(g_qvel_out[e, 0], g_qvel_out[e, 1], g_qvel_out[e, 2])
             gw = vec3(g_qvel_out[e, 3], g_qvel_out[e, 4], g_qvel_out[e, 5])
 
@@ -193,9 +211,19 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             height = m.carrier_height
             A[0] = join(vec3(), -m.gravity)
             for i in range(1, NL):
-                q[i] = load(ck_q, row, QADR + i, e)
+                q[i] = load(ck_q, row, qpos_adr(m, i), e)
                 qd[i] = load(ck_v, row, VADR + i, e)
                 gqd[i] = gqd[i] + h * gq[i]
+            if wp.static(NBALL > 0):
+                for b in range(NBALL):
+                    i = m.ball_link[b]
+                    turn[b] = load_quat_row(ck_q, row, qpos_adr(m, i), e)
+                    gb = vec3(gq[i], gq[i + 1], gq[i + 2])
+                    gb_turn, gb_start = exp_adjoint(h * next_rate(ck_v, ck_a, row, VADR + i, e, h), gb)
+                    for k in range(3):
+                        gqd[i + k] = gqd[i + k] + h * (gb_turn[k] - gb[k])
+                        gq[i + k] = gb_start[k]
+                place_balls(m, turn, R, q)
             if wp.static(FLOATING):
                 rot = quat(load(ck_q, row, 4, e), load(ck_q, row, 5, e), load(ck_q, row, 6, e), load(ck_q, row, 3, e))
                 v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
@@ -214,7 +242,10 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             for i in range(1, NL):
                 p = m.parent[i]
                 V[i] = V[p] + S[i] * qd[i]
-                A[i] = A[p] + S[i] * load(ck_a, row, VADR + i, e) + wp.spatial_cross(V[i], S[i] * qd[i])
+                n = i
+                if wp.static(NBALL > 0):
+                    n = m.inboard[i]
+                A[i] = A[p] + S[i] * load(ck_a, row, VADR + i, e) + wp.spatial_cross(V[n], S[i] * qd[i])
                 W[i] = vec6()
             # 2. lambda = -M^-1 g; on the way in, W holds the articulated bias force
             W[0] = vec6()
@@ -248,6 +279,10 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             for j in range(1, NL):
                 i = NL - j
                 p = m.parent[i]
+                n = i
+                if wp.static(NBALL > 0):
+                    p = m.inboard[i]
+                    n = m.outboard[i]
                 qi = q[i]
                 if wp.static(IMPLICIT):
                     qi = qi + theta * h * qd[i]
@@ -264,13 +299,23 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                     - wp.dot(adj_a[i], wp.spatial_cross(S[i], A[p]))
                     - lam[i] * gain[0]
                 )
-                gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[i], adj_a[i]), S[i]) - lam[i] * kv
+                gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[n], adj_a[i]), S[i]) - lam[i] * kv
                 gtau[i] = gtau[i] - lam[i]
+                if wp.static(NBALL > 0):
+                    p = m.parent[i]
                 if wp.static(FLOATING) or p > 0:
                     adj_a[p] = adj_a[p] + adj_a[i]
                     adj_v[p] = adj_v[p] + adj_v[i]
                     adj_w[p] = adj_w[p] + adj_w[i]
                     adj_p[p] = adj_p[p] + adj_p[i]
+            if wp.static(BALL_SPRING):
+                # The spring sees the rotation vector, whose derivative in the tangent space is not the identity.
+                for b in range(NBALL):
+                    i = m.ball_link[b]
+                    lb = vec3(lam[i], lam[i + 1], lam[i + 2])
+                    lb = m.stiffness[i] * (log_adjoint(vec3(q[i], q[i + 1], q[i + 2]), lb) - lb)
+                    for k in range(3):
+                        gq[i + k] = gq[i + k] + lb[k]
             if wp.static(FLOATING):
                 # The floating base is a translation, whose "parent" twists are pure linear ones, then a ball joint.
                 vp = join(vec3(), v)
@@ -301,12 +346,18 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         for k in range(NU):
             g_ctrl[e, k] = wp.where(keep, gtau[m.motor_link[k]] * m.gear[k], T(0.0))
         for i in range(1, NL):
-            g_qpos[e, QADR + i] = wp.where(keep, gq[i], T(0.0))
+            g_qpos[e, qpos_adr(m, i)] = wp.where(keep, gq[i], T(0.0))
             g_qvel[e, VADR + i] = wp.where(keep, gqd[i], T(0.0))
+        if wp.static(NBALL > 0):
+            for b in range(NBALL):
+                i = m.ball_link[b]
+                adr = qpos_adr(m, i)
+                gb4 = from_tangent(load_quat(qpos, e, adr), vec3(gq[i], gq[i + 1], gq[i + 2]))
+                g_qpos[e, adr] = wp.where(keep, gb4[3], T(0.0))
+                for k in range(3):
+                    g_qpos[e, adr + 1 + k] = wp.where(keep, gb4[k], T(0.0))
         if wp.static(FLOATING):
-            # The forward step normalises the quaternion that comes in, so its gradient is tangent and scales by 1/|r|.
-            r0 = quat(qpos[e, 4], qpos[e, 5], qpos[e, 6], qpos[e, 3])
-            g4 = (wp.normalize(r0) * quat(gr[0], gr[1], gr[2], T(0.0))) * (T(2.0) / wp.length(r0))
+            g4 = from_tangent(load_quat(qpos, e, 3), gr)
             for k in range(3):
                 g_qpos[e, k] = wp.where(keep, gp[k], T(0.0))
                 g_qpos[e, 4 + k] = wp.where(keep, g4[k], T(0.0))

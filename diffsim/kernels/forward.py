@@ -22,6 +22,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     T, vec3, vec6, mat3, mat6, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model
     join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
     store, place_links, sphere_state = kin.store, kin.place_links, kin.sphere_state
+    qpos_adr, load_quat, place_balls = kin.qpos_adr, kin.load_quat, kin.place_balls
     contact = contact_law(T)
     touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
     uses = shape.features
@@ -29,8 +30,8 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     passive_force, passive_gain = joint.passive_force, joint.passive_gain
     NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
     FIRST = 0 if FLOATING else 1  # the first link with inertia
-    VADR, QADR = shape.dof0 - 1, shape.dof0 - 1 + int(FLOATING)  # link i's joint in qvel and qpos
-    NQ, NV = shape.nq, shape.nv
+    VADR = shape.dof0 - 1  # link i's joint in qvel is VADR + i
+    NQ, NV, NBALL = shape.nq, shape.nv, shape.nball
 
     @wp.func
     def link_inertia(m: Model, i: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
@@ -134,8 +135,12 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
         for k in range(NU):
             motor[m.motor_link[k]] = motor[m.motor_link[k]] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
         for i in range(1, NL):
-            q[i] = qpos[e, QADR + i]
+            q[i] = qpos[e, qpos_adr(m, i)]
             qd[i] = qvel[e, VADR + i]
+        if wp.static(NBALL > 0):
+            turn = wp.zeros(shape=NBALL, dtype=quat)
+            for b in range(NBALL):
+                turn[b] = wp.normalize(load_quat(qpos, e, qpos_adr(m, m.ball_link[b])))
         R[0] = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
             pos = vec3(qpos[e, 0], qpos[e, 1], qpos[e, 2])
@@ -158,13 +163,25 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                         store(ck_v, row, 3 + k, e, w[k])
                     store(ck_q, row, 3, e, rot[3])
             # 1. outward: poses, velocities, velocity products, inertias and bias forces
+            if wp.static(NBALL > 0):
+                place_balls(m, turn, R, q)
             height = place_links(m, q, R, x, S, height)
             for i in range(1, NL):
                 V[i] = V[m.parent[i]] + S[i] * qd[i]
-                C[i] = wp.spatial_cross(V[i], S[i] * qd[i])
+                n = i
+                if wp.static(NBALL > 0):
+                    n = m.inboard[i]
+                C[i] = wp.spatial_cross(V[n], S[i] * qd[i])
                 if record == 1:
-                    store(ck_q, row, QADR + i, e, q[i])
+                    store(ck_q, row, qpos_adr(m, i), e, q[i])
                     store(ck_v, row, VADR + i, e, qd[i])
+            if wp.static(NBALL > 0):
+                for b in range(NBALL):
+                    if record == 1:
+                        adr = qpos_adr(m, m.ball_link[b])
+                        store(ck_q, row, adr, e, turn[b][3])
+                        for k in range(3):
+                            store(ck_q, row, adr + 1 + k, e, turn[b][k])
             for i in range(FIRST, NL):
                 ia, ib, id, force = link_inertia(m, i, R[i], x[i], V[i], height, h, theta)
                 Ia[i] = ia
@@ -233,6 +250,10 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                 q[i] = q[i] + h * qd[i]
                 if record == 1:
                     store(ck_a, row, VADR + i, e, qdd)
+            if wp.static(NBALL > 0):
+                for b in range(NBALL):
+                    i = m.ball_link[b]
+                    turn[b] = wp.normalize(turn[b] * exp_quat(h * vec3(qd[i], qd[i + 1], qd[i + 2])))
 
         # An environment that left the finite numbers is handed back as it came.
         finite = bool(True)
@@ -248,8 +269,15 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
             qpos_out[e, 3] = rot[3]
         for i in range(1, NL):
             finite = finite and wp.isfinite(q[i]) and wp.isfinite(qd[i])
-            qpos_out[e, QADR + i] = q[i]
+            qpos_out[e, qpos_adr(m, i)] = q[i]
             qvel_out[e, VADR + i] = qd[i]
+        if wp.static(NBALL > 0):
+            for b in range(NBALL):
+                adr = qpos_adr(m, m.ball_link[b])
+                qpos_out[e, adr] = turn[b][3]
+                for k in range(3):
+                    finite = finite and wp.isfinite(turn[b][k])
+                    qpos_out[e, adr + 1 + k] = turn[b][k]
         nonfinite[e] = not finite
         if not finite:
             for k in range(NQ):

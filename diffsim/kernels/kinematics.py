@@ -12,11 +12,12 @@ from diffsim.kernels.spatial import spatial
 @cache
 def kinematics(shape: Shape) -> SimpleNamespace:
     t = types(shape.dtype)
-    T, vec3, vec6, mat3, Model, array = shape.dtype, t.vec3, t.vec6, t.mat3, t.Model, t.array
+    T, vec3, vec6, mat3, quat, Model, array = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model, t.array
     sp = spatial(T)
-    join, point_velocity = sp.join, sp.point_velocity
-    mat3s, vec3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
-    NL, CARRIER = shape.nlink, shape.carrier
+    join, point_velocity, log_quat, quat_of = sp.join, sp.point_velocity, sp.log_quat, sp.quat_of
+    mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
+    NL, NBALL, CARRIER, QADR = shape.nlink, shape.nball, shape.carrier, shape.dof0 - 1 + int(shape.floating)
+    BALL, STIFFNESS = "ball" in shape.features, "stiffness" in shape.features
     HINGE, SLIDE = "hinge" in shape.features, "slide" in shape.features
     IMPLICIT, ENV_LAST = shape.implicit, shape.env_last
 
@@ -34,15 +35,50 @@ def kinematics(shape: Shape) -> SimpleNamespace:
             a[row, e, k] = value
 
     @wp.func
+    def qpos_adr(m: Model, i: int):
+        if wp.static(BALL):
+            return m.qpos_adr[i]
+        return QADR + i
+
+    @wp.func
+    def load_quat(a: t.array2, e: int, k: int):
+        return quat_of(a[e, k], a[e, k + 1], a[e, k + 2], a[e, k + 3])
+
+    @wp.func
+    def load_quat_row(a: t.array3, row: int, k: int, e: int):
+        return quat_of(load(a, row, k, e), load(a, row, k + 1, e), load(a, row, k + 2, e), load(a, row, k + 3, e))
+
+    @wp.func
+    def place_balls(m: Model, turn: quats, R: mat3s, q: array):
+        """Into the first link's R the turn of each ball joint, and into q, for the spring, its rotation vector."""
+        for b in range(NBALL):
+            i = m.ball_link[b]
+            R[i] = wp.quat_to_matrix(turn[b])
+            if wp.static(STIFFNESS):
+                r = log_quat(turn[b])
+                q[i] = r[0]
+                q[i + 1] = r[1]
+                q[i + 2] = r[2]
+
+    @wp.func
     def place_links(m: Model, q: array, R: mat3s, x: vec3s, S: vec6s, height: T):
-        """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's height."""
+        """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's height.
+
+        R[i] of a ball joint's first link comes with the joint's own turn.
+        """
         for i in range(1, NL):
+            if wp.static(BALL):
+                turn = R[i]
             p = m.parent[i]
             a = R[p] * m.axis[i]
             if wp.static(HINGE):
                 R[i] = R[p] * (m.turn0[i] + wp.sin(q[i]) * m.turn1[i] + wp.cos(q[i]) * m.turn2[i])
             else:
                 R[i] = R[p] * m.turn0[i]
+            if wp.static(BALL):
+                if m.outboard[i] == i + 2:
+                    R[i] = R[i] * turn
+                    a = vec3(R[i][0, 0], R[i][1, 0], R[i][2, 0])
             xi = x[p] + R[p] * m.position[i]
             Si = join(a, wp.cross(xi, a))
             if wp.static(SLIDE):
@@ -69,4 +105,13 @@ def kinematics(shape: Shape) -> SimpleNamespace:
             depth = depth + theta * h * v[2]
         return p, v, depth
 
-    return SimpleNamespace(load=load, store=store, place_links=place_links, sphere_state=sphere_state)
+    return SimpleNamespace(
+        load=load,
+        store=store,
+        qpos_adr=qpos_adr,
+        load_quat=load_quat,
+        load_quat_row=load_quat_row,
+        place_balls=place_balls,
+        place_links=place_links,
+        sphere_state=sphere_state,
+    )

@@ -18,6 +18,7 @@ class Shape:
     nlink: int
     nu: int
     carrier: int
+    nball: int
     features: frozenset[str]
     dtype: type
     implicit: bool
@@ -38,7 +39,7 @@ class Shape:
 
     @property
     def nq(self) -> int:
-        return self.nv + int(self.floating)
+        return self.nv + int(self.floating) + self.nball
 
     @property
     def nfactor(self) -> int:
@@ -47,7 +48,7 @@ class Shape:
 
 
 def shape_of(scene: Scene, dtype: type, implicit: bool, env_last: bool) -> Shape:
-    return Shape(scene.nlink, scene.nu, scene.carrier, scene.features, dtype, implicit, env_last)
+    return Shape(scene.nlink, scene.nu, scene.carrier, scene.nball, scene.features, dtype, implicit, env_last)
 
 
 def module_options(shape: Shape) -> dict[str, Any]:
@@ -70,6 +71,12 @@ def types(dtype: type) -> SimpleNamespace:
         turn2: wp.array(dtype=mat3)
         position: wp.array(dtype=vec3)
         axis: wp.array(dtype=vec3)
+        # read in scenes with ball joints only: the first link of each ball joint; of each link its place in qpos, the
+        # link that its joint hangs on, and the link that its joint turns
+        ball_link: wp.array(dtype=int)
+        qpos_adr: wp.array(dtype=int)
+        inboard: wp.array(dtype=int)
+        outboard: wp.array(dtype=int)
         mass: wp.array(dtype=dtype)
         com: wp.array(dtype=vec3)
         inertia: wp.array(dtype=mat3)
@@ -119,7 +126,7 @@ def model_of(scene: Scene, dtype: type, device: str) -> Any:
         return wp.array(values if len(values) else np.zeros((1, *values.shape[1:])), dtype=kind, device=device)
 
     skew = np.cross(np.eye(3)[None], scene.axis[:, None])  # skew(a) b = a x b
-    hinge = np.where(scene.slide, 0.0, 1.0)[:, None, None]
+    hinge = np.where(scene.slide | (scene.ball >= 0), 0.0, 1.0)[:, None, None]
     r, square = scene.rotation, skew @ skew
     cos, sin = np.cos(scene.joint_ref)[:, None, None], np.sin(scene.joint_ref)[:, None, None]
     axis = np.einsum("nij,nj->ni", r, scene.axis)
@@ -130,6 +137,10 @@ def model_of(scene: Scene, dtype: type, device: str) -> Any:
     position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * axis
     model.position, model.axis = put(position, t.vec3), put(axis, t.vec3)
     model.parent, model.slide = put(scene.parent, int), put(scene.slide.astype(np.int32), int)
+    first, last = (np.arange(scene.nlink) + np.where(scene.ball < 0, 0, k - scene.ball) for k in (0, 2))
+    model.ball_link = put(np.flatnonzero(scene.ball == 0).astype(np.int32), int)
+    model.qpos_adr, model.inboard = put(scene.qpos_adr, int), put(scene.parent[first], int)
+    model.outboard = put(last.astype(np.int32), int)
     model.com, model.inertia = put(scene.com, t.vec3), put(scene.inertia, t.mat3)
     for name in ("mass", "armature", "damping", "stiffness", "spring_ref", "lower", "upper", "gear", "motor_bias"):
         setattr(model, name, put(getattr(scene, name), dtype))

@@ -44,6 +44,40 @@ def spatial(dtype: type) -> SimpleNamespace:
             s = wp.sin(T(0.5) * angle) / angle
         return quat(s * r[0], s * r[1], s * r[2], wp.cos(T(0.5) * angle))
 
+    @wp.func
+    def log_quat(q: quat):
+        """The rotation vector of the unit quaternion q, no longer than pi; the same for q and -q."""
+        v = vec3(q[0], q[1], q[2])
+        s = wp.length(v)
+        scale = T(2.0) + s * s / T(3.0)
+        if s > T(1e-3):
+            scale = T(2.0) * wp.atan2(s, wp.abs(q[3])) / s
+        return v * wp.where(q[3] < T(0.0), -scale, scale)
+
+    @wp.func
+    def quat_of(w: T, x: T, y: T, z: T):
+        """From MuJoCo's order of a quaternion to Warp's."""
+        return quat(x, y, z, w)
+
+    @wp.func
+    def to_tangent(q: quat, g: quat):
+        """Of a unit quaternion q, turned by the body-frame rotation vector d: dq = q (d, 0) / 2. Its transpose on g."""
+        turn = wp.quat_inverse(q) * g
+        return T(0.5) * vec3(turn[0], turn[1], turn[2])
+
+    @wp.func
+    def from_tangent(q: quat, g: vec3):
+        """The gradient with respect to a quaternion that is normalised before use: tangent, and scaled by 1/|q|."""
+        return (wp.normalize(q) * quat(g[0], g[1], g[2], T(0.0))) * (T(2.0) / wp.length(q))
+
     return SimpleNamespace(
-        join=join, force_at=force_at, point_velocity=point_velocity, momentum=momentum, exp_quat=exp_quat
+        join=join,
+        force_at=force_at,
+        point_velocity=point_velocity,
+        momentum=momentum,
+        exp_quat=exp_quat,
+        log_quat=log_quat,
+        quat_of=quat_of,
+        to_tangent=to_tangent,
+        from_tangent=from_tangent,
     )
