@@ -24,6 +24,8 @@ PENALTY_DEFAULTS = {
     "d_limit": 0.0,  # joint limit damping, active beyond the limit only
 }
 
+MUSCLE_MODELS = ("linear", "hill")
+
 
 class SceneError(ValueError):
     """An MJCF file that is missing, broken, or holds something that is not simulated; names the element."""
@@ -48,6 +50,11 @@ class Scene:
         mass, com, inertia: kg, (3,) m in the link's frame, (3, 3) kg m^2 about the centre of mass, link axes.
         armature, damping, stiffness, spring_ref, lower, upper: of the joint; bounds are infinite where unlimited.
         motor_link, gear, motor_bias: (nu,) joint force = gear * ctrl + motor_bias for ctrl in [-1, 1] over ctrlrange.
+            Of a muscle the link is 0, and this is the maximum force times the activation.
+        segment_link, segment_position, segment_muscle: (ns, 2), (ns, 2, 3), (ns,) the pieces of the muscles' paths that
+            join two links: the links, the end points in their frames, and whose path it is; sorted by links.
+        hill: (nu, 9) numbers of the Hill-type model (kernels/muscle.py), NaN where not a <muscle>.
+        muscle_model: "linear" (the paper's: force = maximum force times activation) or "hill".
         contact_link, contact_position, contact_radius: (nc,), (nc, 3), (nc,) spheres that may touch the ground.
         k_n, k_d, k_t, mu, k_limit, d_limit: penalty constants, see PENALTY_DEFAULTS.
     """
@@ -77,6 +84,11 @@ class Scene:
     motor_link: Index
     gear: Array
     motor_bias: Array
+    segment_link: Index
+    segment_position: Array
+    segment_muscle: Index
+    hill: Array
+    muscle_model: str
     contact_link: Index
     contact_position: Array
     contact_radius: Array
@@ -88,6 +100,12 @@ class Scene:
     mu: float
     k_limit: float
     d_limit: float
+
+    def __post_init__(self) -> None:
+        if self.muscle_model not in MUSCLE_MODELS:
+            raise ValueError(f"unknown muscle_model {self.muscle_model!r}; choose from {', '.join(MUSCLE_MODELS)}")
+        if self.muscle_model == "hill" and np.isnan(self.hill[self.segment_muscle]).any():
+            raise ValueError("muscle_model 'hill' needs MuJoCo's <muscle> as the actuator of every muscle")
 
     @property
     def nlink(self) -> int:
@@ -129,7 +147,9 @@ class Scene:
             "limit": bool(limited.any()) and (self.k_limit > 0 or self.d_limit > 0),
             "stiffness": bool(self.stiffness.any()),
             "damping": bool(self.damping.any()),
-            "motor": self.nu > 0,
+            "motor": bool((self.motor_link > 0).any()),
+            "muscle": len(self.segment_muscle) > 0,
+            "hill": len(self.segment_muscle) > 0 and self.muscle_model == "hill",
         }
         return frozenset(name for name, used in present.items() if used)
 
@@ -143,13 +163,13 @@ class Scene:
         link = 0
         while not self.floating and link + 1 < self.nlink and self.slide[link + 1]:
             children = np.flatnonzero(self.parent[1:] == link) + 1
-            if len(children) != 1 or self.mass[link] > 0 or link in self.contact_link:
+            if len(children) != 1 or self.mass[link] > 0 or link in self.contact_link or link in self.segment_link:
                 break
             link += 1
         return link
 
     def without(self, *features: str) -> Scene:
-        """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping".
+        """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping", "muscle".
 
         Raises:
             ValueError: a feature that cannot be left out.
@@ -164,6 +184,11 @@ class Scene:
             "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
             "stiffness": {"stiffness": np.zeros(n)},
             "damping": {"damping": np.zeros(n)},
+            "muscle": {
+                "segment_link": np.zeros((0, 2), np.int32),
+                "segment_position": np.zeros((0, 2, 3)),
+                "segment_muscle": np.zeros(0, np.int32),
+            },
         }
         changes: dict[str, Any] = {}
         for feature in features:
@@ -229,7 +254,7 @@ class _Reader:
             inertia=inertia,
             gravity=np.array(m.opt.gravity),
             **columns,
-            **self._motors(),
+            **self._actuators(),
             **self._contacts(),
             **self._penalties(),
         )
@@ -247,9 +272,16 @@ class _Reader:
 
     def _reject_unsupported(self) -> None:
         m, obj, joint = self.m, mujoco.mjtObj, mujoco.mjtJoint
-        for kind, count in ((obj.mjOBJ_EQUALITY, m.neq), (obj.mjOBJ_TENDON, m.ntendon), (obj.mjOBJ_PAIR, m.npair)):
+        for kind, count in ((obj.mjOBJ_EQUALITY, m.neq), (obj.mjOBJ_PAIR, m.npair)):
             if count:
                 raise self._error(f"{self._name(kind, 0)}: not simulated")
+        for d in range(m.ntendon):
+            name, begin = self._name(obj.mjOBJ_TENDON, d), m.tendon_adr[d]
+            if (m.wrap_type[begin : begin + m.tendon_num[d]] != mujoco.mjtWrap.mjWRAP_SITE).any():
+                raise self._error(f"{name}: only spatial tendons through sites, without pulleys or wrapping geoms")
+            for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited"):
+                if self._any(f"tendon_{field}", d):
+                    raise self._error(f"{name}: {field} of a tendon is not simulated")
         if m.opt.density or m.opt.viscosity or np.any(m.opt.wind):
             raise self._error("option density, viscosity or wind: a fluid is not simulated")
         for b in range(m.nbody):
@@ -332,36 +364,110 @@ class _Reader:
         about_com = principal @ np.diag(m.body_inertia[body]) @ principal.T
         link["inertia"] = link["inertia"] + about_com - mass * _skew(com) @ _skew(com)
 
-    def _motors(self) -> dict[str, Any]:
+    def _actuators(self) -> dict[str, Any]:
         m = self.m
-        link, gear, bias = [], [], []
-        for a in range(m.nu):
-            name = self._name(mujoco.mjtObj.mjOBJ_ACTUATOR, a)
-            joint, axis = m.actuator_trnid[a, 0], 0
-            on_joint = m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
-            on_ball = on_joint and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
-            if on_ball:  # a torque about one axis of the turned body's frame
-                axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
-            if (
-                not on_joint
-                or m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
-                or m.actuator_dyntype[a] != mujoco.mjtDyn.mjDYN_NONE
-                or m.actuator_gaintype[a] != mujoco.mjtGain.mjGAIN_FIXED
-                or m.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_NONE
-                or (on_ball and np.delete(m.actuator_gear[a, :3], axis).any())
-                or m.actuator_forcelimited[a]
-                or self._any("actuator_damping", a)
-                or self._any("actuator_armature", a)
-            ):
+        rows = [
+            self._muscle(a) if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON else self._motor(a)
+            for a in range(m.nu)
+        ]
+        segments = sorted((s for row in rows for s in row["segments"]), key=lambda s: (s[0], s[2]))
+        text = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_TEXT, "muscle_model")
+        model = m.text_data[m.text_adr[text] :].partition(b"\0")[0].decode() if text >= 0 else "linear"
+        if model not in MUSCLE_MODELS:
+            raise self._error(f"text muscle_model is {model!r}; choose from {', '.join(MUSCLE_MODELS)}")
+        for a, row in enumerate(rows):
+            if model == "hill" and row["segments"] and np.isnan(row["hill"]).any():
                 raise self._error(
-                    f"{name}: only motors with a gear and a ctrlrange, on a hinge, a slide or one axis of a ball joint"
+                    f"{self._name(mujoco.mjtObj.mjOBJ_ACTUATOR, a)}: muscle_model 'hill' needs a <muscle>"
                 )
-            low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
-            scale = m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
-            link.append(self.joint_link[joint] + (axis - 2 if on_ball else 0))
-            gear.append(scale * (high - low) / 2)
-            bias.append(scale * (high + low) / 2)
-        return {"motor_link": np.array(link, np.int32), "gear": np.array(gear), "motor_bias": np.array(bias)}
+        return {
+            "motor_link": np.array([row["link"] for row in rows], np.int32),
+            "gear": np.array([row["scale"] * (row["high"] - row["low"]) / 2 for row in rows]),
+            "motor_bias": np.array([row["scale"] * (row["high"] + row["low"]) / 2 for row in rows]),
+            "segment_link": np.array([links for links, _, _ in segments], np.int32).reshape(-1, 2),
+            "segment_position": np.array([ends for _, ends, _ in segments]).reshape(-1, 2, 3),
+            "segment_muscle": np.array([muscle for _, _, muscle in segments], np.int32),
+            "hill": np.array([row["hill"] for row in rows]).reshape(-1, 9),
+            "muscle_model": model,
+        }
+
+    def _check_actuator(self, a: int, fits: bool, allowed: str) -> None:
+        m = self.m
+        extras = m.actuator_forcelimited[a] or self._any("actuator_damping", a) or self._any("actuator_armature", a)
+        if extras or not fits:
+            raise self._error(f"{self._name(mujoco.mjtObj.mjOBJ_ACTUATOR, a)}: only {allowed}")
+
+    def _is_motor(self, a: int) -> bool:
+        m = self.m
+        return (
+            m.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_NONE
+            and m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
+            and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
+        )
+
+    def _motor(self, a: int) -> dict[str, Any]:
+        m = self.m
+        joint, axis = m.actuator_trnid[a, 0], 0
+        fits = m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and self._is_motor(a)
+        kind = m.jnt_type[joint] if fits else mujoco.mjtJoint.mjJNT_FREE
+        if kind == mujoco.mjtJoint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
+            axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
+            fits = not np.delete(m.actuator_gear[a, :3], axis).any()
+        self._check_actuator(
+            a,
+            fits and kind != mujoco.mjtJoint.mjJNT_FREE,
+            "motors with a gear and a ctrlrange on a hinge, a slide or one axis of a ball joint, or muscles on tendons",
+        )
+        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
+        link = self.joint_link[joint] + (axis - 2 if kind == mujoco.mjtJoint.mjJNT_BALL else 0)
+        scale = m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
+        return {"link": link, "scale": scale, "low": low, "high": high, "segments": [], "hill": [np.nan] * 9}
+
+    def _muscle(self, a: int) -> dict[str, Any]:
+        m = self.m
+        strength = self._numeric("muscle_strength", 1.0)
+        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (0.0, 1.0)
+        gain, motor = m.actuator_gainprm[a, :9], self._is_motor(a)
+        scale = -strength * m.actuator_gear[a, 0] * gain[0]
+        muscle = (
+            m.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_MUSCLE
+            and m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE
+            and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_MUSCLE
+            and np.array_equal(gain, m.actuator_biasprm[a, :9])
+        )
+        self._check_actuator(
+            a,
+            (motor and min(scale * low, scale * high) >= 0)
+            or (muscle and m.actuator_gear[a, 0] == 1 and 0 <= low < high <= 1),
+            "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon",
+        )
+        constant, segments = self._path(m.actuator_trnid[a, 0], a)
+        hill = [np.nan] * 9
+        if muscle:
+            start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
+            scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
+            near, far = m.actuator_lengthrange[a]
+            fibre = (far - near) / (end - start)  # m, where the muscle is strongest
+            hill = [constant, 1 / fibre, start - near / fibre, 1 / (fibre * vmax), lmin, lmax, fpmax, fvmax, scale]
+        return {"link": 0, "scale": scale, "low": low, "high": high, "segments": segments, "hill": hill}
+
+    def _path(self, tendon: int, actuator: int) -> tuple[float, list[tuple[tuple[int, int], Array, int]]]:
+        """Of a tendon the length within links, and the segments between two: (links, end points, actuator)."""
+        m = self.m
+        points: list[tuple[int, Array]] = []
+        for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
+            link, rotation, position = self.body[m.site_bodyid[site]]
+            if link < 0:
+                name = self._name(mujoco.mjtObj.mjOBJ_SITE, site)
+                raise self._error(f"{name}: a muscle of a floating robot cannot hold on to the world")
+            points.append((link, position + rotation @ m.site_pos[site]))
+        constant, segments = 0.0, []
+        for (i, a), (j, b) in zip(points, points[1:], strict=False):
+            if i == j:
+                constant += float(np.linalg.norm(b - a))
+            else:
+                segments.append(((i, j) if i < j else (j, i), np.array([a, b] if i < j else [b, a]), actuator))
+        return constant, segments
 
     def _contacts(self) -> dict[str, Any]:
         m = self.m
@@ -432,15 +538,14 @@ class _Reader:
         return sorted(kept, key=lambda s: s[0])
 
     def _penalties(self) -> dict[str, Any]:
-        m = self.m
-        values: dict[str, Any] = dict(PENALTY_DEFAULTS)
-        for n in range(m.nnumeric):
-            name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_NUMERIC, n)
-            if name in values:
-                values[name] = float(m.numeric_data[m.numeric_adr[n]])
-                if not (np.isfinite(values[name]) and values[name] >= 0):
-                    raise self._error(f"numeric {name!r} is {values[name]}, must be finite and not negative")
-        return values
+        return {name: self._numeric(name, default) for name, default in PENALTY_DEFAULTS.items()}
+
+    def _numeric(self, name: str, default: float) -> float:
+        index = mujoco.mj_name2id(self.m, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+        value = float(self.m.numeric_data[self.m.numeric_adr[index]]) if index >= 0 else default
+        if not (np.isfinite(value) and value >= 0):
+            raise self._error(f"numeric {name!r} is {value}, must be finite and not negative")
+        return value
 
 
 def _matrix(quaternion: Array) -> Array:

@@ -230,7 +230,7 @@ class Simulator:
             out = [wp.from_torch(buffer) for buffer in self._out]
             return [*head, *state, int(record), row0, *rows, *out, nonfinite]
         gradients = [wp.from_torch(buffer) for buffer in (*self._g_in, *self._g_out, self.nonfinite_gradients)]
-        return [*head, row0, *rows, state[0], nonfinite, *gradients]
+        return [*head, row0, *rows, state[0], state[2], nonfinite, *gradients]
 
     def _rows(self, count: int) -> list[wp.array]:
         """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""

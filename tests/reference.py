@@ -113,7 +113,8 @@ def joint_forces(
     """Motors, springs, dampers and limits (Eq. 4) at zero acceleration, and their (nv,) resistance to it."""
     force, resistance = np.zeros(scene.nv), np.zeros(scene.nv)
     for motor, link in enumerate(scene.motor_link):
-        force[joint_dof(scene, link)] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]
+        if link > 0:  # else it is a muscle
+            force[joint_dof(scene, link)] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]
     for i in range(1, scene.nlink):
         dof, qd = joint_dof(scene, i), qvel[joint_dof(scene, i)]
         q = joint_position(scene, i, qpos) + theta * h * qd
@@ -125,6 +126,39 @@ def joint_forces(
             force[dof] += scene.k_limit * (bound - q)
         resistance[dof] = h * damping + theta * h**2 * (scene.stiffness[i] + beyond * scene.k_limit)
     return force, resistance
+
+
+def muscle_forces(scene: Scene, links: list[Link], ctrl: Array) -> Array:
+    """(nv,) the tension of every muscle, times the rate of its length that each joint rate makes."""
+    length, slope, rate = np.nan_to_num(scene.hill[:, 0]), np.zeros((scene.nu, scene.nv)), np.zeros(scene.nu)
+    for (i, j), (a, b), k in zip(scene.segment_link, scene.segment_position, scene.segment_muscle, strict=True):
+        (va, ja, _), (vb, jb, _) = (links[n].point(links[n].rotation @ p) for n, p in ((i, a), (j, b)))
+        apart = links[j].position + links[j].rotation @ b - links[i].position - links[i].rotation @ a
+        if (distance := np.linalg.norm(apart)) > 0:
+            length[k] += distance
+            slope[k] += apart / distance @ (jb - ja)
+            rate[k] += apart / distance @ (vb - va)
+    tension = scene.gear * ctrl + scene.motor_bias
+    for k in np.unique(scene.segment_muscle) if scene.muscle_model == "hill" else ():
+        _, per_length, offset, per_rate, low, high, passive, fast, strength = scene.hill[k]
+        x, v = per_length * length[k] + offset, per_rate * rate[k]
+        knees = [low, (1 + low) / 2, 1, (1 + high) / 2, high]
+        curve = interpolate_parabolas(x, knees, [0, 0.5, 1, 0.5, 0]) * (
+            np.clip(1 + v, 0, None) ** 2 if v < 0 else fast - np.clip(fast - 1 - v, 0, None) ** 2 / (fast - 1)
+        )
+        stretch = max(x - 1, 0) / (knees[3] - 1)
+        tension[k] = tension[k] * curve + strength * passive * (stretch**2 / 2 if stretch < 1 else stretch - 0.5)
+    return -tension @ slope
+
+
+def interpolate_parabolas(x: float, knees: list[float], values: list[float]) -> float:
+    """A bell of four parabolas through its knees, level at the first, the middle and the last."""
+    if not knees[0] <= x <= knees[-1]:
+        return 0.0
+    piece = max(n for n in range(4) if x >= knees[n])
+    level = [0, 2, 2, 4][piece]  # the end of the piece where it is level
+    part = (x - knees[level]) / (knees[piece + 1] - knees[piece])
+    return values[level] + (0.5 if values[level] == 0 else -0.5) * part**2
 
 
 def contact_law(scene: Scene, depth: float, velocity: Array, h: float = 0.0, theta: float = 0.0) -> tuple[Array, Array]:
@@ -163,6 +197,7 @@ def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float =
     mass, bias = mass_and_bias(scene, links)
     force, resistance = joint_forces(scene, qpos, qvel, ctrl, h, theta)
     mass, force = mass + np.diag(resistance), force - bias
+    force = force + muscle_forces(scene, links, ctrl)
     for link, lowest, depth in lowest_points(scene, links):
         velocity, jacobian, drift = link.point(lowest)
         push, resistance = contact_law(scene, depth + theta * h * velocity[2], velocity, h, theta)

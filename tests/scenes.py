@@ -71,6 +71,66 @@ SHOULDER = """
   </actuator>
 </mujoco>"""
 
+# A leg on a floating pelvis: a muscle over the hip, one over hip and knee with a piece along the thigh, one that begins
+# with a segment of no length at the hip's centre, one that goes to and fro; and a motor in their midst.
+LEG = """
+<mujoco>
+  <custom> {custom} </custom>
+  <worldbody>
+    <body>
+      <freejoint/> <geom type="box" size="0.1 0.12 0.08" mass="8"/>
+      <site name="p1" pos="0.05 0.1 0.05"/> <site name="p2" pos="-0.1 0.05 0"/> <site name="hip" pos="0 0.1 -0.05"/>
+      <body pos="0 0.1 -0.05">
+        <joint name="hip" type="ball" damping="1" stiffness="2"/> <geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/>
+        <site name="head"/> <site name="f1" pos="0.06 0 -0.1"/> <site name="f2" pos="-0.05 0.02 -0.2"/>
+        <site name="f3" pos="-0.05 0 -0.35"/>
+        <body pos="0 0 -0.4">
+          <joint name="knee" axis="0 1 0" armature="0.1"/> <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".04"/>
+          <site name="t1" pos="-0.03 0 -0.05"/> <site name="t2" pos="0.05 0 -0.1"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="gluteus"> <site site="p1"/> <site site="f1"/> </spatial>
+    <spatial name="hamstring"> <site site="p2"/> <site site="f2"/> <site site="f3"/> <site site="t1"/> </spatial>
+    <spatial name="iliacus"> <site site="hip"/> <site site="head"/> <site site="f1"/> <site site="t2"/> </spatial>
+    <spatial name="zigzag"> <site site="t2"/> <site site="f2"/> <site site="t1"/> <site site="p1"/> </spatial>
+  </tendon>
+  <actuator> {actuators} </actuator>
+</mujoco>"""
+MUSCLES = {"gluteus": (400, 0.18), "hamstring": (300, 0.52), "iliacus": (250, 0.55), "zigzag": (100, 1.1)}  # N, m
+
+
+@cache
+def leg_scene(model: str) -> Scene:
+    """With MuJoCo's <muscle> if "hill"; if "linear" with the same forces as plain actuators."""
+    actuators = ['<motor joint="knee" gear="7"/>'] * (len(MUSCLES) + 1)
+    for n, (name, (force, length)) in enumerate(MUSCLES.items()):
+        if model == "hill":
+            lengths, curves = f"{0.6 * length} {1.3 * length}", 'range="0.6 1.5" vmax="3" fpmax="1.3" fvmax="1.3"'
+            muscle = f'<muscle tendon="{name}" force="{force}" lengthrange="{lengths}" {curves}/>'
+        else:
+            muscle = f'<general tendon="{name}" gainprm="{-force}" ctrllimited="true" ctrlrange="0 1"/>'
+        actuators[n + (n >= 2)] = muscle
+    custom = f'<text name="muscle_model" data="{model}"/>'
+    return parse(LEG.format(custom=custom, actuators="".join(actuators)))
+
+
+# A pendulum on a cart that is pulled from the wall.
+CRANE = """
+<mujoco>
+  <worldbody>
+    <site name="wall" pos="0.5 0.2 1"/>
+    <body>
+      <joint type="slide" axis="1 0 0"/> <joint type="slide" axis="0 0 1"/> <joint axis="0 1 0"/>
+      <inertial pos="0 0 -0.8" mass="1.5" diaginertia="0.1 0.2 0.15"/> <site name="end" pos="0.1 0 -1"/>
+    </body>
+  </worldbody>
+  <tendon> <spatial name="rope"> <site site="end"/> <site site="wall"/> </spatial> </tendon>
+  <actuator> <motor name="winch" tendon="rope" gear="-9" ctrllimited="true" ctrlrange="0 1"/> </actuator>
+</mujoco>"""
+
 # One limited, driven hinge about the vertical, so that only its own laws act.
 HINGE = """
 <mujoco>

@@ -12,12 +12,14 @@ import torch
 from scenes import (
     BALL,
     BLOCK,
+    CRANE,
     PENDULUM,
     SHOULDER,
     acceleration,
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
+    leg_scene,
     parse,
     pass_limits,
     raise_ground,
@@ -51,6 +53,8 @@ def mujoco_acceleration(scene, qpos, qvel, ctrl):
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     for e in range(len(qpos)):
         data.qpos, data.qvel, data.ctrl = qpos[e], qvel[e], low + (ctrl[e] + 1) / 2 * (high - low)
+        if model.na:  # of a <muscle>, whose activation follows ctrl at once here
+            data.act = (ctrl[e, model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE] + 1) / 2
         mujoco.mj_forward(model, data)
         qacc[e] = data.qacc
     model.opt.disableflags = flags
@@ -78,6 +82,17 @@ def test_tree_accelerations_are_mujocos(base, seed, dtype, rng):
 
 def test_ball_joint_on_the_world_has_mujocos_accelerations(rng):
     check_against_mujoco(parse(SHOULDER), torch.float64, rng)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("model", ["linear", "hill"])
+def test_muscles_pull_as_mujocos(model, dtype, rng):
+    """Moment arms, and for the Hill-type force also lengths and their rates, in every part of its curves."""
+    check_against_mujoco(leg_scene(model), dtype, rng)
+
+
+def test_muscle_on_the_world_pulls_as_mujocos(rng):
+    check_against_mujoco(parse(CRANE), torch.float64, rng)
 
 
 # Against the plain NumPy reference
@@ -114,6 +129,12 @@ def test_tree_steps_are_the_references(base, seed, rng):
 def test_ball_joint_takes_implicit_steps_as_the_reference(theta, rng):
     scene = parse(SHOULDER)
     check_against_reference(scene, *free_states(scene, 4, rng), substeps=4, integrator="implicit", theta=theta)
+
+
+@pytest.mark.parametrize("model", ["linear", "hill"])
+def test_muscle_steps_are_the_references(model, rng):
+    scene = leg_scene(model)
+    check_against_reference(scene, *free_states(scene, 4, rng), substeps=16)
 
 
 def test_ball_joints_know_a_quaternion_and_its_negative_as_one(rng):

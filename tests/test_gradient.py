@@ -12,6 +12,7 @@ from scenes import (
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
+    leg_scene,
     parse,
     pass_limits,
     raise_ground,
@@ -94,6 +95,12 @@ def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
     qpos[:, :4] *= np.linspace(0.5, -2.0, 8)[:, None]
     qpos[0, :4] = 1.0, 0.0, 0.0, 0.0
     check_gradients(scene, (qpos, qvel, ctrl), rng, integrator=integrator, theta=theta)
+
+
+@pytest.mark.parametrize("model", ["linear", "hill"])
+def test_muscle_gradient_is_that_of_differences(model, rng):
+    scene = leg_scene(model)
+    check_gradients(scene, free_states(scene, 16, rng), rng, substeps=8)
 
 
 def test_quaternion_of_any_length(rng):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
 import reference
-from scenes import BALL, SHOULDER, free_states, parse, task_scene, tree_scene
+from scenes import BALL, CRANE, SHOULDER, free_states, leg_scene, parse, task_scene, tree_scene
 
 from diffsim.scene import PENALTY_DEFAULTS, SceneError, load_scene
 from diffsim.tasks import TASKS
@@ -207,14 +209,62 @@ def test_features_of_the_tasks(name):
     assert task_scene(name).features == expected[name]
 
 
+def test_muscles():
+    """Segments between two links, by pairs of links; the rest of a path has a constant length."""
+    scene = leg_scene("hill")
+    pelvis, thigh, shin = 0, 3, 4
+    np.testing.assert_array_equal(scene.motor_link, [0, 0, shin, 0, 0])
+    np.testing.assert_allclose(scene.gear, [200, 150, 7, 125, 50])
+    np.testing.assert_allclose(scene.motor_bias, [200, 150, 0, 125, 50])  # N, at half the activation
+    pairs = [(pelvis, thigh)] * 3 + [(pelvis, shin)] + [(thigh, shin)] * 4
+    np.testing.assert_array_equal(scene.segment_link, pairs)
+    np.testing.assert_array_equal(scene.segment_muscle, [0, 1, 3, 4, 1, 3, 4, 4])
+    np.testing.assert_allclose(scene.segment_position[3], [[0.05, 0.1, 0.05], [-0.03, 0, -0.05]])
+    np.testing.assert_allclose(scene.hill[:, 0], [0, np.hypot(0.02, 0.15), np.nan, np.hypot(0.06, 0.1), 0])
+    assert {"muscle", "hill", "ball"} < scene.features and "hill" not in leg_scene("linear").features
+    bare = scene.without("muscle")
+    assert bare.features == scene.features - {"muscle", "hill"} and bare.nu == 5
+
+
+def test_strength_of_muscles():
+    strength = '<numeric name="muscle_strength" data="0.36"/>'
+    scene = parse(tendon(actuator=f"<muscle {MUSCLE}/>", custom=strength))
+    np.testing.assert_allclose([scene.gear[0], scene.motor_bias[0], scene.hill[0, -1]], [0.9, 0.9, 1.8])
+    half = tendon(actuator=f'<muscle {MUSCLE} ctrllimited="true" ctrlrange="0 0.5"/>')
+    np.testing.assert_allclose([parse(half).gear[0], parse(half).motor_bias[0]], [1.25, 1.25])
+
+
+def test_hill_model_needs_muscles():
+    with pytest.raises(ValueError, match="<muscle>"):
+        dataclasses.replace(leg_scene("linear"), muscle_model="hill")
+    with pytest.raises(ValueError, match="'rubber'; choose from linear, hill"):
+        dataclasses.replace(leg_scene("linear"), muscle_model="rubber")
+
+
+def test_carrier_is_no_slide_that_a_muscle_of_the_world_could_notice():
+    assert parse(CRANE).carrier == 0 and parse(CRANE).without("muscle").carrier == 2
+
+
 def test_without():
     scene = task_scene("humanoid")
     bare = scene.without("contact", "limit", "stiffness", "damping")
     assert bare.features == {"floating", "hinge", "motor"} and bare.ncontact == 0
     assert scene.features > bare.features
     assert scene.without("contact").features == scene.features - {"contact"}
-    with pytest.raises(ValueError, match="floating.*contact, limit, stiffness, damping"):
+    with pytest.raises(ValueError, match="floating.*contact, limit, stiffness, damping, muscle"):
         scene.without("floating")
+
+
+MUSCLE = 'name="biceps" tendon="string" force="5" lengthrange="1 2"'
+
+
+def tendon(more: str = "", spring: str = "", joint: str = "<joint/>", actuator: str = "", custom: str = "") -> str:
+    """A string from the world's site w to the body's site b."""
+    body = (
+        f'<site name="w"/><body>{joint}<geom name="g" size="0.1"/><site name="a" pos="1 0 0"/><site name="b"/></body>'
+    )
+    path = f'<spatial name="string" {spring}><site site="w"/><site site="a"/>{more}<site site="b"/></spatial>'
+    return robot(body, f"<tendon>{path}</tendon><actuator>{actuator}</actuator><custom>{custom}</custom>")
 
 
 MESH = """<asset><mesh name="tetra" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>"""
@@ -235,9 +285,25 @@ UNSUPPORTED = {
         ),
         "glue",
     ),
-    "tendon": (
+    "fixed tendon": (
         pendulum(rest='<tendon><fixed name="string"><joint joint="hinge" coef="1"/></fixed></tendon>'),
         "string",
+    ),
+    "tendon around a geom": (tendon('<geom geom="g"/>'), "string"),
+    "pulley": (tendon('<pulley divisor="2"/><site site="a"/>'), "string"),
+    "elastic tendon": (tendon(spring='stiffness="3"'), "string.*stiffness"),
+    "tendon with a damper": (tendon(spring='damping="3"'), "string.*damping"),
+    "muscle that pushes": (tendon(actuator='<motor name="pusher" tendon="string"/>'), "pusher.*never push"),
+    "position actuator on a tendon": (tendon(actuator='<position name="servo" tendon="string" kp="1"/>'), "servo"),
+    "muscle with a gear": (tendon(actuator=f'<muscle gear="2" {MUSCLE}/>'), "biceps.*gear"),
+    "muscle on the world beside a floating base": (tendon(joint="<freejoint/>", actuator=f"<muscle {MUSCLE}/>"), "'w'"),
+    "unknown model of muscles": (tendon(custom='<text name="muscle_model" data="rubber"/>'), "rubber.*linear, hill"),
+    "Hill-type model of a plain actuator": (
+        tendon(
+            actuator='<motor name="rope" tendon="string" gear="-1" ctrlrange="0 1" ctrllimited="true"/>',
+            custom='<text name="muscle_model" data="hill"/>',
+        ),
+        "rope.*<muscle>",
     ),
     "contact pair": (
         pendulum(

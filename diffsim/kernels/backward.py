@@ -24,6 +24,7 @@ from diffsim.kernels.contact import contact_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import Shape, module_options, types
+from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 
 
@@ -38,9 +39,12 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     contact = contact_law(T)
     touches, contact_force = contact.touches, contact.contact_force
     contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
+    muscle = muscle_law(shape)
+    measure, hill, add_pull_adjoint = muscle.measure, muscle.hill, muscle.add_pull_adjoint
     uses = shape.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
     NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
+    MUSCLE, HILL = "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1
     VADR, NBALL, BALL_SPRING = shape.dof0 - 1, shape.nball, shape.nball > 0 and "stiffness" in uses
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
@@ -153,6 +157,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         ck_f: t.array3,
         # the state that came in (its quaternion may not be of unit length), and whether the step was contained
         qpos: t.array2,
+        ctrl: t.array2,
         nonfinite: wp.array(dtype=wp.bool),
         # gradient in
         g_qpos_out: t.array2,
@@ -184,6 +189,21 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         for i in range(1, NL):
             gq[i] = g_qpos_out[e, qpos_adr(m, i)]
             gqd[i] = g_qvel_out[e, VADR + i]
+        if wp.static(MUSCLE):
+            pull = wp.zeros(shape=NU, dtype=T)
+            g_pull = wp.zeros(shape=NU, dtype=T)
+            for k in range(NU):
+                pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+            tension = pull
+            by_length = pull
+            by_rate = pull
+        if wp.static(HILL):
+            tension = wp.zeros(shape=NU, dtype=T)
+            by_length = wp.zeros(shape=NU, dtype=T)
+            by_rate = wp.zeros(shape=NU, dtype=T)
+            by_u = wp.zeros(shape=NU, dtype=T)
+            power = wp.zeros(shape=NU, dtype=T)
+            path = wp.zeros(shape=NU, dtype=T)
         R[0] = wp.identity(3, dtype=T)
         end = row0 + substeps - 1
         if wp.static(NBALL > 0):
@@ -275,6 +295,21 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 adj_v[i] = lv
                 adj_w[i] = lw
                 adj_p[i] = lp
+            if wp.static(HILL):
+                measure(m, R, x, V, path, by_rate)
+                for k in range(NU):
+                    law = hill(m, k, pull[k], path[k], by_rate[k])
+                    tension[k] = law[0]
+                    by_u[k] = law[1]
+                    by_length[k] = law[2]
+                    by_rate[k] = law[3]
+                measure(m, R, x, W, path, power)
+                for k in range(NU):
+                    g_pull[k] = g_pull[k] + power[k] * by_u[k]
+                    by_length[k] = by_length[k] * power[k]
+                    by_rate[k] = by_rate[k] * power[k]
+            if wp.static(MUSCLE):
+                add_pull_adjoint(m, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, g_pull)
             # 4. inward: sum over subtrees, project on the joints
             for j in range(1, NL):
                 i = NL - j
@@ -339,12 +374,17 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 finite = (
                     finite and wp.isfinite(gp[k]) and wp.isfinite(gr[k]) and wp.isfinite(gv[k]) and wp.isfinite(gw[k])
                 )
+        if wp.static(MUSCLE):
+            for k in range(NU):
+                finite = finite and wp.isfinite(g_pull[k])
         contained = nonfinite[e]
         if not finite and not contained:
             nonfinite_gradients[e] = nonfinite_gradients[e] + 1
         keep = finite and not contained
         for k in range(NU):
             g_ctrl[e, k] = wp.where(keep, gtau[m.motor_link[k]] * m.gear[k], T(0.0))
+            if wp.static(MUSCLE):
+                g_ctrl[e, k] = wp.where(keep, (gtau[m.motor_link[k]] + g_pull[k]) * m.gear[k], T(0.0))
         for i in range(1, NL):
             g_qpos[e, qpos_adr(m, i)] = wp.where(keep, gq[i], T(0.0))
             g_qvel[e, VADR + i] = wp.where(keep, gqd[i], T(0.0))

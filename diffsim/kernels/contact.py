@@ -22,8 +22,7 @@ from diffsim.kernels.model import types
 @cache
 def contact_law(dtype: type) -> SimpleNamespace:
     t = types(dtype)
-    T, vec3, Model = dtype, t.vec3, t.Model
-    vec4 = wp.types.vector(4, T)
+    T, vec3, vec4, Model = dtype, t.vec3, t.vec4, t.Model
 
     @wp.func
     def touches(m: Model, d: T, v: vec3):

@@ -13,6 +13,7 @@ from diffsim.kernels.contact import contact_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import Shape, module_options, types
+from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 
 
@@ -28,7 +29,10 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     uses = shape.features
     joint = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses)
     passive_force, passive_gain = joint.passive_force, joint.passive_gain
+    muscle = muscle_law(shape)
+    add_pull, measure, hill = muscle.add_pull, muscle.measure, muscle.hill
     NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
+    MUSCLE, HILL = "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1  # the first link with inertia
     VADR = shape.dof0 - 1  # link i's joint in qvel is VADR + i
     NQ, NV, NBALL = shape.nq, shape.nv, shape.nball
@@ -132,6 +136,15 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
         q = wp.zeros(shape=NL, dtype=T)
         qd = wp.zeros(shape=NL, dtype=T)
         motor = wp.zeros(shape=NL, dtype=T)
+        if wp.static(MUSCLE):
+            pull = wp.zeros(shape=NU, dtype=T)
+            for k in range(NU):
+                pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+            tension = pull
+        if wp.static(HILL):
+            tension = wp.zeros(shape=NU, dtype=T)
+            lengths = wp.zeros(shape=NU, dtype=T)
+            rates = wp.zeros(shape=NU, dtype=T)
         for k in range(NU):
             motor[m.motor_link[k]] = motor[m.motor_link[k]] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
         for i in range(1, NL):
@@ -188,6 +201,12 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                 Ib[i] = ib
                 Id[i] = id
                 P[i] = force
+            if wp.static(HILL):
+                measure(m, R, x, V, lengths, rates)
+                for k in range(NU):
+                    tension[k] = hill(m, k, pull[k], lengths[k], rates[k])[0]
+            if wp.static(MUSCLE):
+                add_pull(m, tension, R, x, P)
             # 2. inward: articulated inertias
             for j in range(1, NL):
                 i = NL - j

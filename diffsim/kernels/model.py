@@ -59,7 +59,7 @@ def module_options(shape: Shape) -> dict[str, Any]:
 @cache
 def types(dtype: type) -> SimpleNamespace:
     """Warp's vector types of one precision, and the struct of a scene's numbers."""
-    vec3, mat3 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
+    vec3, mat3, vec9 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype), wp.types.vector(9, dtype)
 
     @wp.struct
     class Model:
@@ -89,6 +89,14 @@ def types(dtype: type) -> SimpleNamespace:
         motor_link: wp.array(dtype=int)
         gear: wp.array(dtype=dtype)
         motor_bias: wp.array(dtype=dtype)
+        # segments of muscles, from a in the frame of pair_link[2 k] to b in that of pair_link[2 k + 1]
+        npair: int
+        pair_link: wp.array(dtype=int)
+        pair_begin: wp.array(dtype=int)  # the segments of pair k are pair_begin[k] .. pair_begin[k + 1]
+        segment_a: wp.array(dtype=vec3)
+        segment_b: wp.array(dtype=vec3)
+        segment_muscle: wp.array(dtype=int)
+        hill: wp.array(dtype=vec9)
         contact_begin: wp.array(dtype=int)  # spheres of link i are contact_begin[i] .. contact_begin[i + 1]
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
@@ -105,7 +113,9 @@ def types(dtype: type) -> SimpleNamespace:
         dtype=dtype,
         vec3=vec3,
         mat3=mat3,
+        vec4=wp.types.vector(4, dtype),
         vec6=wp.types.vector(6, dtype),
+        vec9=vec9,
         mat6=wp.types.matrix((6, 6), dtype),
         quat=wp.types.quaternion(dtype),
         array=wp.array(dtype=dtype),
@@ -145,6 +155,11 @@ def model_of(scene: Scene, dtype: type, device: str) -> Any:
     for name in ("mass", "armature", "damping", "stiffness", "spring_ref", "lower", "upper", "gear", "motor_bias"):
         setattr(model, name, put(getattr(scene, name), dtype))
     model.motor_link = put(scene.motor_link, int)
+    pairs, start = np.unique(scene.segment_link, axis=0, return_index=True)
+    model.npair, model.pair_link = len(pairs), put(pairs.flatten(), int)
+    model.pair_begin = put(np.append(start, len(scene.segment_link)).astype(np.int32), int)
+    model.segment_a, model.segment_b = (put(scene.segment_position[:, end], t.vec3) for end in (0, 1))
+    model.segment_muscle, model.hill = put(scene.segment_muscle, int), put(np.nan_to_num(scene.hill), t.vec9)
     begin = np.searchsorted(scene.contact_link, np.arange(scene.nlink + 1)).astype(np.int32)
     model.contact_begin = put(begin, int)
     model.contact_position, model.contact_radius = put(scene.contact_position, t.vec3), put(scene.contact_radius, dtype)

@@ -1,0 +1,202 @@
+"""Muscles, which pull along the segments of their paths, and the adjoint of the pull.
+
+A segment runs from a point a of link i to a point b of link j, with length l and direction n from a to b. The tension T
+of its muscle acts on i as the wrench T (a x n, n) and on j as the opposite one. What it adds to phi (backward.py) is
+T L with L = n . w(b), the rate of length under lambda: w is the twist W_j - W_i and w(b) its velocity at b. Hence
+
+    adj_T = L,   adj_w_j = -adj_w_i = T (a x n, n),   adj_p_j = -adj_p_i = (a x e, e) + W_i x* T (a x n, n)
+
+with e = T/l (1 - n n') w(b); the last term turns W along with the links, as everywhere in backward.py. All is computed
+in the frame of link i, where a is a constant, and for all segments between one pair of links at once. A segment shorter
+than SHORTEST has no direction and pulls nothing.
+
+linear: T = u, the maximum force times the activation. hill: T = u f_L(l) f_V(l') + F f_P(l) with the curves of MuJoCo's
+<muscle>, l the length of the whole path; then adj_l = L dT/dl adds (a x n, n) adj_l to adj_p_j, and adj_l' = L dT/dl'
+is to the twists V what T is to W.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.model import Shape, types
+from diffsim.kernels.spatial import spatial
+
+SHORTEST = 1e-6  # m
+
+
+@cache
+def muscle_law(shape: Shape) -> SimpleNamespace:
+    t, sp = types(shape.dtype), spatial(shape.dtype)
+    T, vec3, vec4, vec6, Model, array = shape.dtype, t.vec3, t.vec4, t.vec6, t.Model, t.array
+    join, point_velocity = sp.join, sp.point_velocity
+    mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
+    NU, HILL = shape.nu, "hill" in shape.features
+
+    @wp.func
+    def outward(R: t.mat3, x: vec3, torque: vec3, force: vec3):
+        """A wrench in a link's frame, in world axes about the carrier."""
+        f = R * force
+        return join(R * torque + wp.cross(x, f), f)
+
+    @wp.func
+    def inward(R: t.mat3, x: vec3, v: vec6):
+        """A twist about the carrier in world axes, in a link's frame."""
+        return join(wp.transpose(R) * wp.spatial_top(v), wp.transpose(R) * point_velocity(v, x))
+
+    @wp.func
+    def add_pull(m: Model, tension: array, R: mat3s, x: vec3s, P: vec6s):
+        """Adds the muscles to the links' bias forces P."""
+        for pair in range(m.npair):
+            i = m.pair_link[2 * pair]
+            j = m.pair_link[2 * pair + 1]
+            turn = wp.transpose(R[i]) * R[j]
+            shift = wp.transpose(R[i]) * (x[j] - x[i])
+            force = vec3()
+            torque = vec3()
+            for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
+                a = m.segment_a[s]
+                d = shift + turn * m.segment_b[s] - a
+                length = wp.length(d)
+                if length > T(SHORTEST):
+                    f = d * (tension[m.segment_muscle[s]] / length)
+                    force = force + f
+                    torque = torque + wp.cross(a, f)
+            wrench = outward(R[i], x[i], torque, force)
+            P[i] = P[i] - wrench
+            P[j] = P[j] + wrench
+
+    @wp.func
+    def measure(m: Model, R: mat3s, x: vec3s, V: vec6s, lengths: array, rates: array):
+        """Length of each muscle's path, and its rate if the links move with the twists V."""
+        for k in range(NU):
+            lengths[k] = m.hill[k][0]
+            rates[k] = T(0.0)
+        for pair in range(m.npair):
+            i = m.pair_link[2 * pair]
+            j = m.pair_link[2 * pair + 1]
+            turn = wp.transpose(R[i]) * R[j]
+            shift = wp.transpose(R[i]) * (x[j] - x[i])
+            v = inward(R[i], x[i], V[j] - V[i])
+            for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
+                b = shift + turn * m.segment_b[s]
+                d = b - m.segment_a[s]
+                length = wp.length(d)
+                if length > T(SHORTEST):
+                    k = m.segment_muscle[s]
+                    lengths[k] = lengths[k] + length
+                    rates[k] = rates[k] + wp.dot(d, point_velocity(v, b)) / length
+
+    @wp.func
+    def hill(m: Model, k: int, u: T, path: T, path_rate: T):
+        """(T, dT/du, dT/dl, dT/dl') of muscle k."""
+        p = m.hill[k]  # length within links; of the fibre: l = p1 path + p2, v = p3 path_rate; the curves' corners; F
+        l = p[1] * path + p[2]
+        v = p[3] * path_rate
+        lmin = p[4]
+        lmax = p[5]
+        low = T(0.5) * (lmin + T(1.0))
+        high = T(0.5) * (T(1.0) + lmax)
+        # f_L: four parabolas between lmin and lmax, f_L(1) = 1; s is the slope
+        f = T(0.0)
+        s = T(0.0)
+        if l > lmin and l <= low:
+            f = T(0.5) * (l - lmin) * (l - lmin) / ((low - lmin) * (low - lmin))
+            s = (l - lmin) / ((low - lmin) * (low - lmin))
+        elif l > low and l <= T(1.0):
+            f = T(1.0) - T(0.5) * (T(1.0) - l) * (T(1.0) - l) / ((T(1.0) - low) * (T(1.0) - low))
+            s = (T(1.0) - l) / ((T(1.0) - low) * (T(1.0) - low))
+        elif l > T(1.0) and l <= high:
+            f = T(1.0) - T(0.5) * (l - T(1.0)) * (l - T(1.0)) / ((high - T(1.0)) * (high - T(1.0)))
+            s = (T(1.0) - l) / ((high - T(1.0)) * (high - T(1.0)))
+        elif l > high and l < lmax:
+            f = T(0.5) * (lmax - l) * (lmax - l) / ((lmax - high) * (lmax - high))
+            s = (l - lmax) / ((lmax - high) * (lmax - high))
+        # f_V: a parabola while the fibre shortens, f_V(0) = 1, another up to fvmax while it lengthens
+        y = p[7] - T(1.0)
+        f_v = T(0.0)
+        s_v = T(0.0)
+        if v > T(-1.0) and v <= T(0.0):
+            f_v = (v + T(1.0)) * (v + T(1.0))
+            s_v = T(2.0) * (v + T(1.0))
+        elif v > T(0.0) and v <= y:
+            f_v = p[7] - (y - v) * (y - v) / y
+            s_v = T(2.0) * (y - v) / y
+        elif v > y:
+            f_v = p[7]
+        # f_P: a parabola, then a straight line; F f_P
+        passive = T(0.0)
+        s_p = T(0.0)
+        if l > T(1.0):
+            z = (l - T(1.0)) / (high - T(1.0))
+            passive = p[8] * p[6] * wp.where(l <= high, T(0.5) * z * z, z - T(0.5))
+            s_p = p[8] * p[6] * wp.min(z, T(1.0)) / (high - T(1.0))
+        return vec4(u * f * f_v + passive, f * f_v, (u * s * f_v + s_p) * p[1], u * f * s_v * p[3])
+
+    @wp.func
+    def add_pull_adjoint(
+        m: Model,
+        tension: array,
+        g_length: array,  # L dT/dl and
+        g_rate: array,  # L dT/dl' of each muscle: read by hill only
+        R: mat3s,
+        x: vec3s,
+        V: vec6s,
+        W: vec6s,
+        adj_v: vec6s,
+        adj_w: vec6s,
+        adj_p: vec6s,
+        g_pull: array,  # the adjoint of u: written by linear only
+    ):
+        """Adds the muscles' part of phi to the links' adjoints."""
+        for pair in range(m.npair):
+            i = m.pair_link[2 * pair]
+            j = m.pair_link[2 * pair + 1]
+            turn = wp.transpose(R[i]) * R[j]
+            shift = wp.transpose(R[i]) * (x[j] - x[i])
+            w = inward(R[i], x[i], W[j] - W[i])
+            force = vec3()
+            torque = vec3()
+            place = vec3()
+            place_torque = vec3()
+            if wp.static(HILL):
+                v = inward(R[i], x[i], V[j] - V[i])
+                damp = vec3()
+                damp_torque = vec3()
+            for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
+                a = m.segment_a[s]
+                b = shift + turn * m.segment_b[s]
+                d = b - a
+                length = wp.length(d)
+                if length > T(SHORTEST):
+                    k = m.segment_muscle[s]
+                    n = d / length
+                    f = n * tension[k]
+                    z = point_velocity(w, b)
+                    if wp.static(HILL):
+                        z = z * tension[k] + point_velocity(v, b) * g_rate[k]
+                        e = (z - n * wp.dot(n, z)) / length + n * g_length[k]
+                        damp = damp + n * g_rate[k]
+                        damp_torque = damp_torque + wp.cross(a, n * g_rate[k])
+                    else:
+                        rate = wp.dot(n, z)
+                        g_pull[k] = g_pull[k] + rate
+                        e = (z - n * rate) * (tension[k] / length)
+                    force = force + f
+                    torque = torque + wp.cross(a, f)
+                    place = place + e
+                    place_torque = place_torque + wp.cross(a, e)
+            wrench = outward(R[i], x[i], torque, force)
+            gp = outward(R[i], x[i], place_torque, place) + wp.spatial_cross_dual(W[i], wrench)
+            if wp.static(HILL):
+                gv = outward(R[i], x[i], damp_torque, damp)
+                gp = gp + wp.spatial_cross_dual(V[i], gv)
+                adj_v[i] = adj_v[i] - gv
+                adj_v[j] = adj_v[j] + gv
+            adj_w[i] = adj_w[i] - wrench
+            adj_w[j] = adj_w[j] + wrench
+            adj_p[i] = adj_p[i] - gp
+            adj_p[j] = adj_p[j] + gp
+
+    return SimpleNamespace(add_pull=add_pull, measure=measure, hill=hill, add_pull_adjoint=add_pull_adjoint)
