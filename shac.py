@@ -32,7 +32,7 @@ from diffsim.run import EpisodeStatistics, Mark, Run, fail, flag, load_checkpoin
 @dataclass
 class Args:
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
-    """task: cartpole, hopper, half_cheetah, ant or humanoid"""
+    """task: cartpole, hopper, half_cheetah, ant, humanoid or humanoid_mtu"""
     seed: int = 1
     """seed of the networks, the policy's noise and the environments' resets"""
     device: str | None = None
@@ -115,6 +115,7 @@ PER_TASK = {
     "half_cheetah": ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,    64, 2000),
     "ant":          ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.2,    64, 2000),
     "humanoid":     ((256, 128),    (128, 128), 2e-3, 5e-4, 0.995,  64, 2000),
+    "humanoid_mtu": ((512, 256),    (256, 256), 2e-3, 5e-4, 0.995,  64, 2000),
 }
 GENERAL =           ((256, 128),    (128, 128), 2e-3, 5e-4, 0.995,  64)
 

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .scene import Scene
 
+AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.1, 1.0])  # colours of a muscle
+
 
 def render_frames(
     scene: Scene | str | os.PathLike[str],
@@ -22,20 +24,27 @@ def render_frames(
     width: int = 640,
     height: int = 480,
     camera: str = "track",
+    ctrl: ArrayLike | None = None,
 ) -> NDArray[np.uint8]:
     """Draw a scene, or an MJCF file, in each of the configurations qpos (T, nq), seen from a camera of the MJCF.
+
+    With ctrl (T, nu) in [-1, 1], muscles are coloured by their activation: blue at rest, red at full force.
 
     Returns:
         Frames (T, height, width, 3).
 
     Raises:
-        ValueError: qpos has another shape, or the MJCF has no such camera.
+        ValueError: qpos or ctrl has another shape, or the MJCF has no such camera.
         RuntimeError: the machine has no OpenGL.
     """
     model = copy.copy(scene.mj_model) if isinstance(scene, Scene) else mujoco.MjModel.from_xml_path(os.fspath(scene))
     qpos = np.asarray(qpos, dtype=np.float64)
     if qpos.ndim != 2 or qpos.shape[1] != model.nq:
         raise ValueError(f"qpos must have shape (T, {model.nq}), not {qpos.shape}")
+    muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
+    activation = np.zeros((len(qpos), model.nu)) if ctrl is None else (np.asarray(ctrl, dtype=np.float64) + 1) / 2
+    if activation.shape != (len(qpos), model.nu):
+        raise ValueError(f"ctrl must have shape ({len(qpos)}, {model.nu}), not {activation.shape}")
     cameras = [model.camera(i).name for i in range(model.ncam)]
     if camera not in cameras:
         raise ValueError(f"no camera {camera!r} in this scene; it has: {', '.join(cameras) or 'none'}")
@@ -51,8 +60,10 @@ def render_frames(
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         picture, area = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
-        for frame, q in zip(frames, qpos, strict=True):
+        for frame, q, a in zip(frames, qpos, activation[:, muscles, None].clip(0, 1), strict=True):
             data.qpos[:] = q
+            if ctrl is not None:
+                model.tendon_rgba[model.actuator_trnid[muscles, 0]] = a * FULL_FORCE + (1 - a) * AT_REST
             mujoco.mj_forward(model, data)
             mujoco.mjv_updateScene(model, data, option, perturb, view, mujoco.mjtCatBit.mjCAT_ALL, picture)
             mujoco.mjr_render(area, picture, context)

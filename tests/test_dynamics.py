@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import mujoco
@@ -46,18 +47,21 @@ def relative_error(value, expected):
 
 
 def mujoco_acceleration(scene, qpos, qvel, ctrl):
-    model = scene.mj_model
-    flags = model.opt.disableflags
+    model = copy.copy(scene.mj_model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    muscles = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
+    if scene.muscle_model == "linear":  # a <muscle> of that force without its curves
+        model.actuator_gaintype[muscles] = mujoco.mjtGain.mjGAIN_FIXED
+        model.actuator_biastype[muscles] = mujoco.mjtBias.mjBIAS_NONE
+        model.actuator_gainprm[muscles, 0] = -2 * scene.gear[muscles]
     data, qacc = mujoco.MjData(model), np.empty_like(qvel)
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     for e in range(len(qpos)):
         data.qpos, data.qvel, data.ctrl = qpos[e], qvel[e], low + (ctrl[e] + 1) / 2 * (high - low)
         if model.na:  # of a <muscle>, whose activation follows ctrl at once here
-            data.act = (ctrl[e, model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE] + 1) / 2
+            data.act = (ctrl[e, muscles] + 1) / 2
         mujoco.mj_forward(model, data)
         qacc[e] = data.qacc
-    model.opt.disableflags = flags
     return qacc
 
 

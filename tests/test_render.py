@@ -12,7 +12,8 @@ import diffsim.tasks
 from diffsim.render import render_frames, write_video
 from diffsim.scene import load_scene
 
-HOPPER = Path(diffsim.tasks.__file__).parent.parent / "assets" / "hopper.xml"
+ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
+HOPPER, MUSCLES = ASSETS / "hopper.xml", ASSETS / "humanoid_mtu.xml"
 
 
 def draw(*args: object, **kwargs: object) -> np.ndarray:
@@ -36,6 +37,20 @@ def test_frames_show_the_configurations() -> None:
     assert len(foot) > 50 and foot[:, 0].min() > 60
     np.testing.assert_array_equal(draw(HOPPER, qpos[:1], width=160, height=120)[0], frames[0])
     assert draw(scene, qpos[:1], width=2000, height=10).shape == (1, 10, 2000, 3)  # wider than the model's buffer
+
+
+def test_muscles_are_coloured_by_activation() -> None:
+    qpos = np.zeros((3, 29))
+    qpos[:, [2, 3, 7, 12, 18, 23]] = 1.0  # height and quaternions
+    ctrl = np.full((3, 152), -1.0)
+    ctrl[1] = 1.0
+    frames = draw(MUSCLES, qpos, width=160, height=120, ctrl=ctrl)
+    np.testing.assert_array_equal(frames[0], frames[2])
+    red, blue = (frames[:2, ..., k].astype(int) - frames[:2, ..., 2 - k] for k in (0, 2))
+    assert ((red > 60).sum((1, 2)) > 100).tolist() == [False, True]
+    assert (blue[0] - blue[1] > 60).sum() > 100
+    with pytest.raises(ValueError, match=r"ctrl must have shape \(3, 152\), not \(3, 2\)"):
+        render_frames(MUSCLES, qpos, ctrl=ctrl[:, :2])
 
 
 def test_mistakes_are_named() -> None:

@@ -143,7 +143,8 @@ def test_spheres_inside_another_are_dropped():
 
 
 @pytest.mark.parametrize(
-    "name, count", {"cartpole": 0, "hopper": 6, "half_cheetah": 16, "ant": 13, "humanoid": 35}.items()
+    "name, count",
+    {"cartpole": 0, "hopper": 6, "half_cheetah": 16, "ant": 13, "humanoid": 35, "humanoid_mtu": 88}.items(),
 )
 def test_contact_spheres_of_the_tasks(name, count):
     assert task_scene(name).ncontact == count
@@ -205,6 +206,7 @@ def test_features_of_the_tasks(name):
         "half_cheetah": {"hinge", "slide", "limit", "damping", "motor", "contact", "stiffness"},
         "ant": {"floating", "hinge", "limit", "damping", "motor", "contact"},
         "humanoid": {"floating", "hinge", "limit", "damping", "motor", "contact", "stiffness"},
+        "humanoid_mtu": {"floating", "ball", "hinge", "limit", "damping", "contact", "stiffness", "muscle"},
     }
     assert task_scene(name).features == expected[name]
 

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 import diffsim.tasks
+from diffsim.scene import load_scene
 from diffsim.tasks import TASKS, Task
 
 Array = NDArray[np.float64]
@@ -71,8 +72,21 @@ LINKS = {
         0 | -.8165 .4082 -.4082 | 0 .17 .06 | -1.047 1.047 | 10 5 10 | .01 | 0 | 0 0 0
         19 | 0 -.7071 -.7071 | 0 0 0 | -1.047 1.047 | 10 5 10 | .01 | 1.66108 | .08 .08 -.08
         20 | 0 -.7071 -.7071 | .18 .18 -.18 | -1.571 .8727 | 2 1 10 | .006 | 1.22954 | .1096 -.1096 .1096""",
+    # Turned from y up to z up. No axis: a ball joint; the benchmark's spring k pulls back by k sin(angle / 2).
+    "humanoid_mtu": """
+        0 | | .0192 -.0903 -.0472 | | 1.708 2 0 | .05 | 7 | -.0111 -.0056 -.2096
+        1 | 0 1 0 | .0013 -.0092 -.395 | 0 2.3 | 2.236 2 2 | .05 | 3 | -.0238 .0067 -.2369
+        2 | | -.0316 .0195 -.4611 | | 0.5 2 0 | .05 | 0.6 | .0177 -.0026 -.0373
+        3 | 0 1 0 | .1111 .0019 -.0575 | -.6 .6 | 0.5774 2 0.1333 | .05 | 0.2 | .0246 .0016 .0067
+        3 | 0 1 0 | .0913 -.0427 -.0634 | -.6 .6 | 0.5774 2 0.1333 | .05 | 0.2 | .0316 -.0017 .0127
+        0 | | .0192 .0903 -.0472 | | 1.708 2 0 | .05 | 7 | -.0111 .0056 -.2096
+        6 | 0 1 0 | .0013 .0092 -.395 | 0 2.3 | 2.236 2 2 | .05 | 3 | -.0238 -.0067 -.2369
+        7 | | -.0316 -.0195 -.4611 | | 0.5 2 0 | .05 | 0.6 | .0177 .0026 -.0373
+        8 | 0 1 0 | .0913 .0415 -.066 | -.6 .6 | 0.5774 2 0.1333 | .05 | 0.2 | .0316 .0029 .0153
+        8 | 0 1 0 | .1095 -.0044 -.0658 | -.6 .6 | 0.5774 2 0.1333 | .05 | 0.2 | .0262 .0009 .015""",
 }
-# A geom a line: link | size (radius; radius and half length; half extents) | centre | direction of a capsule's axis.
+# A geom a line: link | size (radius; radius and half length; half extents) | centre | direction of a capsule's axis, or
+# quaternion xyzw of a box.
 GEOMS = {
     "cartpole": "1 | .25 .25 .1 | 0 0 0 |; 2 | .025 .025 .5 | 0 0 .5 |",
     "hopper": """3 | .05 .2 | 0 0 0 | 0 0 1; 4 | .05 .225 | 0 0 -.225 | 0 0 1; 5 | .04 .25 | 0 0 -.25 | 0 0 1;
@@ -96,9 +110,25 @@ GEOMS = {
         17 | .04 .1386 | .08 -.08 -.08 | .5774 -.5774 -.5774; 18 | .031 .1386 | .09 .09 .09 | .5774 .5774 .5774;
         18 | .04 | .18 .18 .18 |; 20 | .04 .1386 | .08 .08 -.08 | .5774 .5774 -.5774;
         21 | .031 .1386 | .09 -.09 .09 | .5774 -.5774 .5774; 21 | .04 | .18 -.18 .18 |""",
+    "humanoid_mtu": """
+        0 | .0647 .1042 .0727 | 0 0 0 | 0 0 0 1;
+        1 | .0699 .06355 .2021 | -.0111 -.0056 -.2096 | -.05303 .9985 -.008714 .008589;
+        2 | .05705 .0599 .2078 | -.0238 .0067 -.2369 | -.0007508 .9989 .01744 -.04362;
+        3 | .0785 .0378 .0249 | .0177 -.0026 -.0373 | .1044 .9944 .01144 -.01363;
+        4 | .02815 .02035 .0131 | .0246 .0016 .0067 | .08724 .9961 -.005672 -.009361;
+        5 | .02645 .0211 .0119 | .0316 -.0017 .0127 | .1729 .9849 .005305 -.00627;
+        6 | .0699 .06355 .2021 | -.0111 .0056 -.2096 | .008714 -.008589 -.05303 .9985;
+        7 | .05705 .0599 .2078 | -.0238 -.0067 -.2369 | -.01744 .04362 -.0007508 .9989;
+        8 | .0785 .0378 .0249 | .0177 .0026 -.0373 | -.01144 .01363 .1044 .9944;
+        9 | .02815 .02035 .0131 | .0316 .0029 .0153 | -.005305 .00627 .1729 .9849;
+        10 | .02645 .0211 .0119 | .0262 .0009 .015 | .005672 .009361 .08724 .9961""",
 }
-FREE_BASE = {"ant": (0.75, 96.776, (0, 0, 0)), "humanoid": (1.35, 8.90746, (-0.002539, 0, 0.03466))}  # z, kg, com
-SLIDES = {"cartpole": 1, "hopper": 2, "half_cheetah": 2, "ant": 0, "humanoid": 0}  # the first so many joints
+FREE_BASE = {  # z, kg, com
+    "ant": (0.75, 96.776, (0, 0, 0)),
+    "humanoid": (1.35, 8.90746, (-0.002539, 0, 0.03466)),
+    "humanoid_mtu": (1.0, 15, (0, 0, 0)),
+}
+SLIDES = {"cartpole": 1, "hopper": 2, "half_cheetah": 2, "ant": 0, "humanoid": 0, "humanoid_mtu": 0}  # first so many
 STRENGTH = [200, 200, 200, *(200, 200, 600, 400, 100, 100) * 2, 100, 100, 200, 100, 100, 200]
 GEAR = {
     "cartpole": [1000.0],
@@ -113,8 +143,10 @@ PENALTIES = {
     "half_cheetah": {"k_n": 2e4, "k_d": 1e3, "k_t": 1e3, "mu": 1, "k_limit": 1e3},
     "ant": {"k_n": 4e4, "k_d": 1e4, "k_t": 3e3, "mu": 0.75, "k_limit": 1e3},
     "humanoid": {"k_n": 2e4, "k_d": 5e3, "k_t": 1e3, "mu": 0.75, "k_limit": 1e3},
+    "humanoid_mtu": {"k_n": 5e3, "k_d": 2e3, "k_t": 1e3, "mu": 0.5, "k_limit": 200, "muscle_strength": 0.36},
 }
-TOTAL_MASS = {"cartpole": 52.5, "hopper": 15.82, "half_cheetah": 21.1837, "ant": 182.176, "humanoid": 40.844}  # kg
+TOTAL_MASS = {"cartpole": 52.5, "hopper": 15.82, "half_cheetah": 21.1837, "ant": 182.176, "humanoid": 40.844}
+TOTAL_MASS |= {"humanoid_mtu": 37}  # kg
 # substeps, episode length, length of the observation, height of the end
 SIZES = {
     "cartpole": (4, 240, 5, None),
@@ -122,8 +154,12 @@ SIZES = {
     "half_cheetah": (16, 1000, 17, None),
     "ant": (16, 1000, 37, 0.27),
     "humanoid": (48, 1000, 76, 0.74),
+    "humanoid_mtu": (48, 1000, 53, 0.46),
 }
-FREE = ["ant", "humanoid"]
+FREE = ["ant", "humanoid", "humanoid_mtu"]
+TARGET = {"ant": 10_000.0, "humanoid": 200.0, "humanoid_mtu": 10_000.0}  # m
+SEES_ACTION = ["ant", "humanoid"]
+LEG_START = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0]  # of a muscle-driven leg: hip, knee, ankle, toes
 PRINTED = {"rtol": 2e-4, "atol": 6e-5}  # the tables have four digits
 
 every_task = pytest.mark.parametrize("name", list(LINKS))
@@ -141,15 +177,15 @@ def rows(table: str) -> list[list[Array]]:
     return [[numbers(cell) for cell in row.split("|")] for row in table.replace(";", "\n").strip().splitlines() if row]
 
 
-def hinges_and_slides(model: mujoco.MjModel) -> list[int]:
-    """The joints that are links 1, 2, ..."""
+def moving_joints(model: mujoco.MjModel) -> list[int]:
+    """The joints of the tables' links 1, 2, ..."""
     return [j for j in range(model.njnt) if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
 
 
 def link_of_body(model: mujoco.MjModel, body: int) -> int:
     """The link that a body's last joint moves; 0 for the world and the floating base."""
     last = model.body_jntadr[body] + model.body_jntnum[body] - 1
-    joints = hinges_and_slides(model)
+    joints = moving_joints(model)
     return joints.index(last) + 1 if model.body_jntnum[body] and last in joints else 0
 
 
@@ -159,7 +195,7 @@ def link_of_body(model: mujoco.MjModel, body: int) -> int:
 @every_task
 def test_joints_are_the_tables(name: str) -> None:
     model = load(name)
-    joints, table = hinges_and_slides(model), rows(LINKS[name])
+    joints, table = moving_joints(model), rows(LINKS[name])
     assert len(joints) == len(table)
     np.testing.assert_array_equal(model.body_quat[1:], [[1, 0, 0, 0]] * (model.nbody - 1))
     np.testing.assert_array_equal(model.jnt_pos, np.zeros((model.njnt, 3)))
@@ -171,8 +207,10 @@ def test_joints_are_the_tables(name: str) -> None:
         last = joint == model.body_jntadr[body] + model.body_jntnum[body] - 1
         assert parent == (link_of_body(model, model.body_parentid[body]) if first else link - 1)
         slide = link <= SLIDES[name]
-        assert model.jnt_type[joint] == (mujoco.mjtJoint.mjJNT_SLIDE if slide else mujoco.mjtJoint.mjJNT_HINGE)
-        np.testing.assert_allclose(model.jnt_axis[joint], axis, **PRINTED)
+        kind = mujoco.mjtJoint.mjJNT_HINGE if len(axis) else mujoco.mjtJoint.mjJNT_BALL
+        assert model.jnt_type[joint] == (mujoco.mjtJoint.mjJNT_SLIDE if slide else kind)
+        if len(axis):
+            np.testing.assert_allclose(model.jnt_axis[joint], axis, **PRINTED)
         if slide:
             height += position[2]
         elif first:
@@ -183,7 +221,7 @@ def test_joints_are_the_tables(name: str) -> None:
         if len(bounds):
             np.testing.assert_allclose(model.jnt_range[joint], bounds, **PRINTED)
         assert model.jnt_stiffness[joint].item() == stiffness
-        assert model.qpos_spring[model.jnt_qposadr[joint]] == 0
+        assert model.qpos_spring[model.jnt_qposadr[joint]] == (0 if len(axis) else 1)
         np.testing.assert_allclose(model.dof_damping[dof], damping + limit_damping, rtol=1e-12)
         assert model.dof_armature[dof] == armature
         np.testing.assert_allclose(model.body_mass[body] if last else 0, mass.item(), **PRINTED)
@@ -209,9 +247,44 @@ def test_geoms_are_the_tables(name: str) -> None:
         np.testing.assert_allclose(model.geom_size[geom, : len(size)], size, **PRINTED)
         np.testing.assert_allclose(model.geom_pos[geom], centre, **PRINTED)
         if len(direction):
-            matrix = np.zeros(9)
-            mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
-            np.testing.assert_allclose(abs(matrix.reshape(3, 3)[:, 2] @ direction), 1, **PRINTED)
+            axes = matrix(model.geom_quat[geom])
+            if len(direction) == 4:  # a box looks the same after half a turn about each of its axes
+                axes = abs(axes.T @ matrix(direction[[3, 0, 1, 2]]))
+                np.testing.assert_allclose(axes, np.eye(3), atol=1e-3)
+            else:
+                np.testing.assert_allclose(abs(axes[:, 2] @ direction), 1, **PRINTED)
+
+
+def matrix(quaternion: Array) -> Array:
+    result = np.zeros(9)
+    mujoco.mju_quat2Mat(result, quaternion)
+    return result.reshape(3, 3)
+
+
+def test_muscles_of_the_mtu_humanoid() -> None:
+    """Numbers of muscles, points and segments; maximum forces; the fibres' lengths at rest: .8 / lm, lm = 1 or 1.2."""
+    model, scene = load("humanoid_mtu"), load_scene(ASSETS / "humanoid_mtu.xml")
+    assert (model.nu, model.nsite, model.ntendon) == (152, 636, 152)
+    assert np.bincount(model.tendon_num).tolist() == [0, 0, 6, 38, 64, 18, 18, 8]
+    np.testing.assert_array_equal(model.actuator_trnid[:, 0], range(152))
+    assert len(scene.segment_muscle) == 198 and (np.bincount(scene.segment_muscle) > 0).all()
+    force = scene.gear + scene.motor_bias
+    np.testing.assert_array_equal(scene.gear, scene.motor_bias)  # no pull at -1
+    np.testing.assert_allclose([force.min(), force.max(), force.sum()], 0.36 * np.array([45, 1792.95, 55158.5]))
+    assert len(np.unique(force.round(3))) == 34
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    fibre = scene.hill[:, 1] * data.ten_length + scene.hill[:, 2]
+    np.testing.assert_allclose(np.unique(fibre.round(3)), [0.667, 0.8])
+    # The two legs are mirror images.
+    sides = {name: [model.actuator(f"{side}_{name[2:]}") for side in "LR"] for name in muscle_names(model, "L_")}
+    assert len(sides) == 76
+    for left, right in sides.values():
+        np.testing.assert_allclose(left.gainprm, right.gainprm)
+
+
+def muscle_names(model: mujoco.MjModel, start: str) -> list[str]:
+    return [model.actuator(i).name for i in range(model.nu) if model.actuator(i).name.startswith(start)]
 
 
 def test_inertias_are_those_of_the_geoms() -> None:
@@ -228,10 +301,11 @@ def test_inertias_are_those_of_the_geoms() -> None:
 @every_task
 def test_motors_penalties_and_options(name: str) -> None:
     model = load(name)
-    motors = hinges_and_slides(model)[-model.nu :] if name != "cartpole" else [0]
-    np.testing.assert_array_equal(model.actuator_trnid[:, 0], motors)
-    np.testing.assert_allclose(model.actuator_gear[:, 0], GEAR[name])
-    np.testing.assert_array_equal(model.actuator_ctrlrange, [[-1, 1]] * model.nu)
+    if name in GEAR:
+        motors = moving_joints(model)[-model.nu :] if name != "cartpole" else [0]
+        np.testing.assert_array_equal(model.actuator_trnid[:, 0], motors)
+        np.testing.assert_allclose(model.actuator_gear[:, 0], GEAR[name])
+        np.testing.assert_array_equal(model.actuator_ctrlrange, [[-1, 1]] * model.nu)
     assert model.actuator_ctrllimited.all()
     assert {model.numeric(i).name: model.numeric(i).data.item() for i in range(model.nnumeric)} == PENALTIES[name]
     np.testing.assert_allclose(model.opt.timestep * SIZES[name][0], 1 / 60)
@@ -286,7 +360,7 @@ def random_states(name: str, shape: tuple[int, ...], rng: np.random.Generator) -
     if name == "cartpole":
         qpos[..., 1] *= 5  # the angle is wrapped
     if name in FREE:
-        qpos[..., :2] *= {"ant": 4000, "humanoid": 80}[name]  # the way to the target turns
+        qpos[..., :2] *= 0.4 * TARGET[name]  # the way to the target turns
         qpos[..., 3:7] = rng.normal(size=(*shape, 4))
         qpos[..., 3:7] /= np.linalg.norm(qpos[..., 3:7], axis=-1, keepdims=True)
     action = rng.uniform(-1, 1, (*shape, model.nu))
@@ -304,11 +378,12 @@ def plain_observation(name: str, model: mujoco.MjModel, q: Array, v: Array, acti
     twist = np.zeros(6)  # of the torso's frame in world axes: angular, linear
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, 1, twist, 0)
     torso = data.body(1).xmat.reshape(3, 3)
-    way = np.array([{"ant": 10_000.0, "humanoid": 200.0}[name] - q[0], -q[1], 0.0])
+    way = np.array([TARGET[name] - q[0], -q[1], 0.0])
     mujoco.mju_normalize3(way)
     up, heading = torso[2, 2], torso[:, 0] @ way
     w, x, y, z = q[3:7]
-    return np.array([q[2], x, y, z, w, *twist[3:], *twist[:3], *q[7:], *(0.1 * v[6:]), up, heading, *action])
+    seen = action if name in SEES_ACTION else ()
+    return np.array([q[2], x, y, z, w, *twist[3:], *twist[:3], *q[7:], *(0.1 * v[6:]), up, heading, *seen])
 
 
 def plain_height_reward(d: float, upper: float, slope: float) -> float:
@@ -326,10 +401,14 @@ def plain_reward(name: str, obs: Array, action: Array) -> float:
         return obs[5] + plain_height_reward(obs[0] + 0.3, 0.3, 1) + angle - 0.1 * effort
     if name == "half_cheetah":
         return obs[8] - 0.1 * effort
-    up, heading = obs[-2 - len(action)], obs[-1 - len(action)]
+    last = len(obs) - (len(action) if name in SEES_ACTION else 0)
+    up, heading = obs[last - 2], obs[last - 1]
     running = obs[5] + 0.1 * up + heading
     if name == "ant":
         return running + obs[0] - 0.27
+    if name == "humanoid_mtu":
+        effort = float(np.sum((action / 2 + 0.5) ** 2))  # of activations
+        return running + plain_height_reward(obs[0] - 0.51, 0.05, 4) - 0.001 * effort
     return running + plain_height_reward(obs[0] - 0.84, 0.1, 10) - 0.002 * effort
 
 
@@ -354,16 +433,17 @@ def test_observation_reward_and_end(name: str, rng: np.random.Generator) -> None
     torch.testing.assert_close(task.reward(one, action[0, 0]), reward[0, 0])
 
 
-@pytest.mark.parametrize("name, level", [("hopper", -0.3), ("humanoid", 0.84)])
+@pytest.mark.parametrize("name, level", [("hopper", -0.3), ("humanoid", 0.84), ("humanoid_mtu", 0.51)])
 def test_height_reward_at_its_corners(name: str, level: float) -> None:
-    """Eqs. 16-17, 21-22: parabola, line and the two clips; the gradient at the corner is the line's."""
+    """Eqs. 16-17, 21-22, 24-25: parabola, line and the two clips; the gradient at the corner is the line's."""
     task = TASKS[name](dtype=torch.float64)
-    upper, slope = {"hopper": (0.3, 1.0), "humanoid": (0.1, 10.0)}[name]
+    upper, slope = {"hopper": (0.3, 1.0), "humanoid": (0.1, 10.0), "humanoid_mtu": (0.05, 4.0)}[name]
     depth = torch.tensor([-3, -1.5, -0.5, -0.1, 0.0, upper / 2, 2 * upper, 5], dtype=torch.float64)
     obs = torch.zeros(len(depth), task.obs_dim, dtype=torch.float64)
     obs[:, 0] = depth + level
     obs.requires_grad_()
-    reward = task.reward(obs, torch.zeros(len(depth), 1, dtype=torch.float64))
+    idle = -1.0 if name == "humanoid_mtu" else 0.0
+    reward = task.reward(obs, torch.full((len(depth), 1), idle, dtype=torch.float64))
     base = 1.0 if name == "hopper" else 0.0  # R_angle of an upright hopper
     expected = [-200, -200, -50, -2, 0, slope * upper / 2, slope * upper, slope * upper]
     np.testing.assert_allclose(reward.detach() - base, expected, atol=1e-12)
@@ -375,7 +455,7 @@ def test_height_reward_at_its_corners(name: str, level: float) -> None:
 def test_gradients(name: str, rng: np.random.Generator) -> None:
     task = TASKS[name](dtype=torch.float64)
     states = [x.requires_grad_() for x in random_states(name, (3,), rng)]
-    if name in FREE:  # an action enters the observation, and its gradient with it
+    if name in SEES_ACTION:  # an action enters the observation, and its gradient with it
         obs = task.observe(*states)
         torch.testing.assert_close(torch.autograd.grad(obs.sum(), states[2])[0], torch.ones_like(states[2]))
     assert torch.autograd.gradcheck(task.observe, states)
@@ -400,6 +480,7 @@ def test_middle_of_the_draw_is_the_unperturbed_start(name: str, dtype: torch.dty
         "half_cheetah": [0, -0.2, *[0] * 7],
         "ant": [0, 0, 0.75, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1],
         "humanoid": [0, 0, 1.35, 1, 0, 0, 0, *[0] * 21],
+        "humanoid_mtu": [0, 0, 1, 1, 0, 0, 0, *LEG_START, *LEG_START],
     }[name]
     assert torch.equal(qpos, torch.tensor([start] * 2, dtype=dtype))
     assert torch.equal(qvel, torch.zeros_like(qvel))
@@ -415,6 +496,7 @@ def plain_draws(name: str, q: Array, v: Array) -> Array:
     start, joints = {
         "ant": ([0, 0, 0.75], [0, 1, 0, -1, 0, -1, 0, 1]),
         "humanoid": ([0, 0, 1.35], [0] * 21),
+        "humanoid_mtu": ([0, 0, 1.0], LEG_START * 2),
     }[name]
     angular, turn = np.zeros(3), np.zeros(3)
     mujoco.mju_rotVecQuat(angular, v[3:6], q[3:7])  # body to world
@@ -424,6 +506,8 @@ def plain_draws(name: str, q: Array, v: Array) -> Array:
     angle = math.copysign(np.linalg.norm(turn), turn[0]) / math.radians(7.5)
     cube = turn / np.abs(turn).max() if turn[0] > 0 else -turn / np.abs(turn).max()
     draws = [(q[:3] - start) / 0.1, [angle], cube[1:], (q[7:] - joints) / 0.2, angular / 0.25, at_origin / 0.25]
+    if name == "humanoid_mtu":  # always starts in the same posture
+        assert not draws.pop(3).any()
     return np.concatenate([*draws, v[6:] / 0.25])
 
 
@@ -434,7 +518,8 @@ def test_resets_fill_the_benchmark_s_distribution(name: str) -> None:
     rand = torch.rand(count, task.num_random, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     qpos, qvel = task.reset(rand)
     draws = np.array([plain_draws(name, q, v) for q, v in zip(qpos.numpy(), qvel.numpy(), strict=True)])
-    assert draws.shape[1] == task.num_random - (1 if name in FREE else 0)  # a direction has one number less
+    unused = (1 if name in FREE else 0) + (22 if name == "humanoid_mtu" else 0)  # a direction has one number less
+    assert draws.shape[1] == task.num_random - unused
     uniform = np.ones(draws.shape[1], bool)
     if name in FREE:
         np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, rtol=1e-12)

@@ -8,7 +8,8 @@ from .cartpole import CartPole
 from .half_cheetah import HalfCheetah
 from .hopper import Hopper
 from .humanoid import Humanoid
+from .humanoid_mtu import HumanoidMTU
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU)}
 
 __all__ = ["TASKS", "Task"]

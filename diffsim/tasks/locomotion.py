@@ -1,4 +1,4 @@
-"""What ant and humanoid share: a robot with a free root that runs along x. Appendix A.3.4 and A.3.5."""
+"""What ant and the humanoids share: a robot with a free root that runs along x. Appendix A.3.4 to A.3.6."""
 
 from __future__ import annotations
 
@@ -25,21 +25,26 @@ class Locomotion(Task):
     """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates)."""
 
     start_height: ClassVar[float]  # m
-    start_joints: ClassVar[tuple[float, ...]]  # rad
+    start_joints: ClassVar[tuple[float, ...]]  # rad; of a ball joint a quaternion wxyz
+    joint_rates: ClassVar[int | None] = None  # as many as start_joints, unless some are ball joints
+    joint_spread: ClassVar[float] = 0.4  # rad
+    observe_action: ClassVar[bool] = True
     target: ClassVar[float]  # m; the robot is to face the point (target, 0)
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         joints = len(self.start_joints)
+        rates = joints if self.joint_rates is None else self.joint_rates
         # What is drawn: position, angle and axis of a turn, joints; angular and linear velocity, joint rates.
-        self.start = (0.0, 0.0, self.start_height, 0.0, 0.0, 0.0, 0.0, *self.start_joints) + (0.0,) * (6 + joints)
-        self.spread = (0.2,) * 3 + (math.pi / 12,) + (1.0,) * 3 + (0.4,) * joints + (0.5,) * (6 + joints)
+        self.start = (0.0, 0.0, self.start_height, 0.0, 0.0, 0.0, 0.0, *self.start_joints) + (0.0,) * (6 + rates)
+        joint_spread = (self.joint_spread,) * joints
+        self.spread = (0.2,) * 3 + (math.pi / 12,) + (1.0,) * 3 + joint_spread + (0.5,) * (6 + rates)
         super().__init__(device, dtype)
-        self._drawn = (3, 1, 3, joints, 3, 3, joints)
+        self._drawn = (3, 1, 3, joints, 3, 3, rates)
         self._target = torch.tensor((self.target, 0.0), device=device, dtype=dtype)
         self._axes = torch.tensor(((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), device=device, dtype=dtype)
-        # R_v + 0.1 R_up + R_heading, the common part of Eqs. 19 and 20, is linear in the observation.
+        # R_v + 0.1 R_up + R_heading, the common part of Eqs. 19, 20 and 23, is linear in the observation.
         self._progress = torch.zeros(self.obs_dim, device=device, dtype=dtype)
-        up = 11 + 2 * joints
+        up = 11 + joints + rates
         self._progress[FORWARD_VELOCITY], self._progress[up], self._progress[up + 1] = 1.0, 0.1, 1.0
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,8 +58,8 @@ class Locomotion(Task):
         return torch.cat((position, w, u, joints), dim=-1), torch.cat((velocity, angular, rates), dim=-1)
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """Tables 9 and 10, vectors in the world frame: height, quaternion xyzw, linear and angular velocity, joints,
-        0.1 joint rates, the body's z axis along up, its x axis along the way to the target, action."""
+        """Tables 9 to 11, vectors in the world frame: height, quaternion xyzw, linear and angular velocity, joints,
+        0.1 joint rates, the body's z axis along up, its x axis along the way to the target, action (if observed)."""
         position, quat, joints = qpos.split((3, 4, qpos.shape[-1] - 7), dim=-1)
         velocity, angular, rates = qvel.split((3, 3, qvel.shape[-1] - 6), dim=-1)
         body = torch.cat((angular.unsqueeze(-2), self._axes.expand(*angular.shape[:-1], 2, 3)), dim=-2)
@@ -64,8 +69,9 @@ class Locomotion(Task):
         heading = (x_axis[..., :2] * to_target).sum(-1, keepdim=True)
         w, xyz = quat.split((1, 3), dim=-1)
         height = position[..., 2:]
-        return torch.cat((height, xyz, w, velocity, angular, joints, 0.1 * rates, up, heading, action), dim=-1)
+        seen = (height, xyz, w, velocity, angular, joints, 0.1 * rates, up, heading)
+        return torch.cat((*seen, action) if self.observe_action else seen, dim=-1)
 
     def progress(self, obs: Tensor) -> Tensor:
-        """R_v + 0.1 R_up + R_heading of Eqs. 19 and 20 (...)."""
+        """R_v + 0.1 R_up + R_heading of Eqs. 19, 20 and 23 (...)."""
         return (obs * self._progress).sum(-1)
