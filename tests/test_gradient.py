@@ -21,7 +21,7 @@ from scenes import (
     tree_scene,
 )
 
-import diffsim
+from diffsim.env import DiffEnv
 from diffsim.simulator import Simulator
 from diffsim.tasks import TASKS
 
@@ -193,7 +193,7 @@ def test_gradcheck_through_policy_reward_and_three_control_steps(name, rng):
 
     def total_reward(policy):
         # gradcheck holds on to its first graph while it makes others, so each has an environment of its own.
-        env = diffsim.make(name, num_envs=2, horizon=3, dtype=torch.float64, early_termination=False)
+        env = DiffEnv(task(dtype=torch.float64), scene, 2, horizon=3, dtype=torch.float64, early_termination=False)
         obs, total = env.set_state(qpos, qvel), 0.0
         for _ in range(3):
             obs, reward, _, _, _ = env.step(torch.tanh((obs @ features) @ policy))
