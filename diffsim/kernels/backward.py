@@ -39,7 +39,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     contact = contact_law(T)
     touches, contact_force = contact.touches, contact.contact_force
     contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
-    muscle = muscle_law(shape)
+    muscle = muscle_law(shape, adjoint=True)
     measure, hill, add_pull_adjoint = muscle.measure, muscle.hill, muscle.add_pull_adjoint
     uses = shape.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
@@ -201,7 +201,6 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             tension = wp.zeros(shape=NU, dtype=T)
             by_length = wp.zeros(shape=NU, dtype=T)
             by_rate = wp.zeros(shape=NU, dtype=T)
-            by_u = wp.zeros(shape=NU, dtype=T)
             power = wp.zeros(shape=NU, dtype=T)
             path = wp.zeros(shape=NU, dtype=T)
         R[0] = wp.identity(3, dtype=T)
@@ -296,18 +295,13 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 adj_w[i] = lw
                 adj_p[i] = lp
             if wp.static(HILL):
-                measure(m, R, x, V, path, by_rate)
+                measure(m, R, x, V, W, path, by_rate, power)
                 for k in range(NU):
                     law = hill(m, k, pull[k], path[k], by_rate[k])
                     tension[k] = law[0]
-                    by_u[k] = law[1]
-                    by_length[k] = law[2]
-                    by_rate[k] = law[3]
-                measure(m, R, x, W, path, power)
-                for k in range(NU):
-                    g_pull[k] = g_pull[k] + power[k] * by_u[k]
-                    by_length[k] = by_length[k] * power[k]
-                    by_rate[k] = by_rate[k] * power[k]
+                    g_pull[k] = g_pull[k] + power[k] * law[1]
+                    by_length[k] = power[k] * law[2]
+                    by_rate[k] = power[k] * law[3]
             if wp.static(MUSCLE):
                 add_pull_adjoint(m, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, g_pull)
             # 4. inward: sum over subtrees, project on the joints

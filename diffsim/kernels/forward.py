@@ -29,7 +29,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     uses = shape.features
     joint = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses)
     passive_force, passive_gain = joint.passive_force, joint.passive_gain
-    muscle = muscle_law(shape)
+    muscle = muscle_law(shape, adjoint=False)
     add_pull, measure, hill = muscle.add_pull, muscle.measure, muscle.hill
     NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
     MUSCLE, HILL = "muscle" in uses, "hill" in uses
@@ -202,7 +202,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                 Id[i] = id
                 P[i] = force
             if wp.static(HILL):
-                measure(m, R, x, V, lengths, rates)
+                measure(m, R, x, V, V, lengths, rates, rates)
                 for k in range(NU):
                     tension[k] = hill(m, k, pull[k], lengths[k], rates[k])[0]
             if wp.static(MUSCLE):

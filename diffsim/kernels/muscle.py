@@ -27,7 +27,7 @@ SHORTEST = 1e-6  # m
 
 
 @cache
-def muscle_law(shape: Shape) -> SimpleNamespace:
+def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
     t, sp = types(shape.dtype), spatial(shape.dtype)
     T, vec3, vec4, vec6, Model, array = shape.dtype, t.vec3, t.vec4, t.vec6, t.Model, t.array
     join, point_velocity = sp.join, sp.point_velocity
@@ -68,25 +68,32 @@ def muscle_law(shape: Shape) -> SimpleNamespace:
             P[j] = P[j] + wrench
 
     @wp.func
-    def measure(m: Model, R: mat3s, x: vec3s, V: vec6s, lengths: array, rates: array):
-        """Length of each muscle's path, and its rate if the links move with the twists V."""
+    def measure(m: Model, R: mat3s, x: vec3s, V: vec6s, W: vec6s, lengths: array, rates: array, powers: array):
+        """Length of each muscle's path, and its rates under the twists V and, in the adjoint, W."""
         for k in range(NU):
             lengths[k] = m.hill[k][0]
             rates[k] = T(0.0)
+            if wp.static(adjoint):
+                powers[k] = T(0.0)
         for pair in range(m.npair):
             i = m.pair_link[2 * pair]
             j = m.pair_link[2 * pair + 1]
             turn = wp.transpose(R[i]) * R[j]
             shift = wp.transpose(R[i]) * (x[j] - x[i])
             v = inward(R[i], x[i], V[j] - V[i])
+            if wp.static(adjoint):
+                w = inward(R[i], x[i], W[j] - W[i])
             for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
                 b = shift + turn * m.segment_b[s]
                 d = b - m.segment_a[s]
                 length = wp.length(d)
                 if length > T(SHORTEST):
                     k = m.segment_muscle[s]
+                    n = d / length
                     lengths[k] = lengths[k] + length
-                    rates[k] = rates[k] + wp.dot(d, point_velocity(v, b)) / length
+                    rates[k] = rates[k] + wp.dot(n, point_velocity(v, b))
+                    if wp.static(adjoint):
+                        powers[k] = powers[k] + wp.dot(n, point_velocity(w, b))
 
     @wp.func
     def hill(m: Model, k: int, u: T, path: T, path_rate: T):
