@@ -1,4 +1,4 @@
-"""Draws docs/tasks.png, the five robots side by side at the start of an episode: python tools/draw_tasks.py"""
+"""Draws docs/tasks.png, the six robots side by side at the start of an episode: python tools/draw_tasks.py"""
 
 from pathlib import Path
 
