@@ -45,8 +45,9 @@ THRESHOLDS = {
     "half_cheetah": (),
     "ant": (5000, 7300, 7661),
     "humanoid": (5000, 7000, 8387),
+    "humanoid_mtu": (4246, 6964),
 }
-PUBLISHED = {"hopper": 4837, "ant": 7661, "humanoid": 8387}
+PUBLISHED = {"hopper": 4837, "ant": 7661, "humanoid": 8387, "humanoid_mtu": 6114}
 
 
 @dataclass
