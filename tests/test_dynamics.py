@@ -95,6 +95,51 @@ def test_muscles_pull_as_mujocos(model, dtype, rng):
     check_against_mujoco(leg_scene(model), dtype, rng)
 
 
+def mujoco_tendons(scene, qpos):
+    """MuJoCo's ten_length (nt,), and the columns of its ten_J (nt, nv): ten_velocity under one joint rate at a time."""
+    data, arms = mujoco.MjData(scene.mj_model), []
+    for rate in np.eye(scene.nv):
+        data.qpos, data.qvel = qpos, rate
+        mujoco.mj_forward(scene.mj_model, data)
+        arms.append(data.ten_velocity.copy())
+    return data.ten_length, np.array(arms).T
+
+
+def joint_force(scene, qpos, change):
+    """The generalised forces that make these changes (..., nv) of the acceleration."""
+    mass, _ = reference.mass_and_bias(scene, reference.kinematics(scene, qpos, np.zeros(scene.nv)))
+    return change @ mass
+
+
+def test_moment_arms_are_mujocos_ten_j(rng):
+    """Of each of the 152 muscles: the joint forces that appear when it alone is fully active, in a few random poses."""
+    scene = without_ground(task_scene("humanoid_mtu"))
+    active = np.concatenate([-np.ones((1, scene.nu)), 2 * np.eye(scene.nu) - 1])
+    for qpos in free_states(scene, 4, rng)[0]:
+        qacc = acceleration(scene, np.tile(qpos, (len(active), 1)), np.zeros((len(active), scene.nv)), active)
+        arms = -joint_force(scene, qpos, qacc[1:] - qacc[0]) / (2 * scene.gear[:, None])
+        np.testing.assert_allclose(arms, mujoco_tendons(scene, qpos)[1], rtol=0, atol=1e-10)
+
+
+def test_lengths_are_mujocos_ten_length(rng):
+    """Read off a passive force that is set to 1 N plus 1 N/m of the length."""
+    scene = without_ground(leg_scene("hill"))
+    muscles, (poses, _, _) = np.delete(np.arange(scene.nu), 2), free_states(scene, 8, rng)  # 2 is the motor
+    still, idle = np.zeros((8, scene.nv)), np.full((8, scene.nu), -1.0)
+    idle[:, 2] = 0.0
+    hill = scene.hill.copy()
+    hill[:, 1:] = 1.0, 2.5, 1.0, 0.5, 3.0, 1.0, 1.3, 0.0  # f_P(l) = l - 1.5 beyond l = 2, of l = length + 2.5
+    slack = acceleration(dataclasses.replace(scene, hill=hill), poses, still, idle)
+    for tendon, k in enumerate(muscles):
+        stiff = hill.copy()
+        stiff[k, -1] = 1.0  # N
+        qacc = acceleration(dataclasses.replace(scene, hill=stiff), poses, still, idle) - slack
+        for qpos, change in zip(poses, qacc, strict=True):
+            lengths, arms = mujoco_tendons(scene, qpos)
+            pull = -joint_force(scene, qpos, change) @ arms[tendon] / (arms[tendon] @ arms[tendon])
+            np.testing.assert_allclose(pull - 1.0, lengths[tendon], rtol=0, atol=1e-10)
+
+
 def test_muscle_on_the_world_pulls_as_mujocos(rng):
     check_against_mujoco(parse(CRANE), torch.float64, rng)
 

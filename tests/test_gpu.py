@@ -26,11 +26,18 @@ HORIZON = 32
 
 @pytest.mark.parametrize("name", diffsim.TASKS)
 def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> None:
-    shape = shape_of(task_scene(name), wp.float32, implicit=False, env_last=True)
+    """And they hold no code for what the scene lacks."""
+    scene = task_scene(name)
+    shape = shape_of(scene, wp.float32, implicit=False, env_last=True)
+    functions = {"add_pull": "muscle", "measure": "hill", "place_balls": "ball", "sphere_state": "contact"}
     for kernel in (forward_kernel(shape), backward_kernel(shape)):
         directory = tmp_path / kernel.key
         wp.compile_aot_module(kernel.module, device=None, arch=90, module_dir=directory, strip_hash=True)
         assert any(path.stat().st_size > 10_000 for path in (*directory.glob("*.cubin"), *directory.glob("*.ptx")))
+        (source,) = directory.glob("*.cu")
+        code = source.read_text()
+        for function, feature in functions.items():
+            assert (function in code) == (feature in scene.features), function
 
 
 def episode(name: str, device: str) -> dict[str, torch.Tensor]:
