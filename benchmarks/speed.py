@@ -4,6 +4,7 @@
     python benchmarks/speed.py                                every task, 64 and 256 environments
     python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
+    python benchmarks/speed.py --parts muscles --env humanoid_mtu    what muscles cost in a substep
     python benchmarks/speed.py --parts picture                only draws benchmarks/results/speed.png from the csv files
 
 Prints markdown tables and writes their rows to benchmarks/results/speed_*.csv, in place of older rows of the same
@@ -13,7 +14,9 @@ setting. A machine that does something else meanwhile gives wrong numbers.
 from __future__ import annotations
 
 import csv
+import dataclasses
 import importlib.util
+import itertools
 import json
 import os
 import subprocess
@@ -43,7 +46,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-Part = Literal["physics", "scaling", "training", "compile", "picture"]
+Part = Literal["physics", "muscles", "scaling", "training", "compile", "picture"]
 
 
 @dataclass
@@ -285,6 +288,54 @@ def report_physics(args: Args, table: Table, name: str, num_envs: int, substeps:
         )
 
 
+# Muscles --------------------------------------------------------------------------------------------------------------
+
+
+def measure_muscles(args: Args, table: Table) -> None:
+    """A substep without muscles, with linear and with Hill-type ones; their share is what the first lacks."""
+    for name in args.env:
+        task = diffsim.TASKS[name]
+        scene = diffsim.load_scene(Path(diffsim.__file__).parent / "assets" / task.asset)
+        if "muscle" not in scene.features:
+            continue
+        scenes = {"none": scene.without("muscle")}
+        scenes |= {model: dataclasses.replace(scene, muscle_model=model) for model in ("linear", "hill")}
+        for num_envs, dtype in itertools.product(args.num_envs, args.dtype):
+            options: dict[str, Any] = dict(device=args.device, dtype=DTYPES[dtype], threads=1)
+            sims = {
+                muscles: diffsim.Simulator(s, num_envs, task.control_dt, task.substeps, **options)
+                for muscles, s in scenes.items()
+            }
+            times: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+            for k, state in enumerate(visited_states(name, num_envs, args.states + 1)):
+                fastest: dict[str, dict[str, float]] = defaultdict(dict)
+                for _ in range(args.repeats):
+                    for muscles, sim in sims.items():
+                        for what, value in time_diffsim(sim, state).items():
+                            fastest[muscles][what] = min(value, fastest[muscles].get(what, value))
+                if k > 0:  # the first state compiles and fills caches
+                    for muscles, values in fastest.items():
+                        for what in ("forward", "backward"):
+                            times[muscles][what].append(values[f"kernel {what}"] / num_envs / task.substeps)
+            t = {muscles: {what: median(values) for what, values in of.items()} for muscles, of in times.items()}
+            for muscles, own in t.items():
+                bare, both = t["none"], own["forward"] + own["backward"]
+                table.add(
+                    **{
+                        "task": name,
+                        "environments": num_envs,
+                        "precision": dtype,
+                        "device": args.device if args.device != "cpu" else "cpu, 1 thread",
+                        "muscles": muscles,
+                        "forward (us/substep)": own["forward"],
+                        "backward (us/substep)": own["backward"],
+                        "muscles' share, forward": 1 - bare["forward"] / own["forward"],
+                        "backward": 1 - bare["backward"] / own["backward"],
+                        "both": 1 - (bare["forward"] + bare["backward"]) / both,
+                    }
+                )
+
+
 # Scaling --------------------------------------------------------------------------------------------------------------
 
 
@@ -483,6 +534,7 @@ def main(args: Args) -> None:
         fail("--compare mujoco_warp needs it installed: pip install mujoco-warp")
     measures = {
         "physics": (measure_physics, ("task", "environments", "precision", "device")),
+        "muscles": (measure_muscles, ("task", "environments", "precision", "device", "muscles")),
         "scaling": (measure_scaling, ("task", "environments", "horizon", "technique")),
         "training": (measure_training, ("task", "environments", "device")),
         "compile": (measure_compile, ("task", "device")),
@@ -495,6 +547,8 @@ def main(args: Args) -> None:
         print(f"{part}:", flush=True)
         tables.append(Table(part, key))
         measure(args, tables[-1])
+        if not tables[-1].rows:
+            fail(f"none of {', '.join(args.env)} has muscles")
         tables[-1].write(args.output)
     for table in tables:
         print(f"\n{table.markdown()}")
