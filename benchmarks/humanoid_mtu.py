@@ -54,6 +54,13 @@ class Args:
     """directory of what is written"""
 
 
+SETTING = ("environments", "substeps", "device")  # equal in the runs of one line, which differ in their seeds
+
+
+def setting(row: dict[str, str]) -> tuple[str, ...]:
+    return tuple(row[name] for name in SETTING)
+
+
 def read_csv(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         fail(f"{path} does not exist")
@@ -85,7 +92,9 @@ def read_run(args: Args, folder: Path) -> tuple[dict[str, Any], list[dict[str, A
     normalise.load_state_dict(checkpoint["normalise"])
     evaluation = evaluate(env, lambda obs: actor(normalise(obs)))
     saved = json.loads((folder / "args.json").read_text())
-    key = {"environments": options.num_envs, "seed": options.seed, "device": saved["device"].partition(":")[0]}
+    substeps = f"{options.substeps}{', implicit' if options.integrator == 'implicit' else ''}"
+    key = {"environments": options.num_envs, "substeps": substeps, "device": saved["device"].partition(":")[0]}
+    key |= {"seed": options.seed}
     seconds = np.diff([float(row["seconds"]) for row in progress])
     row = key | {
         "iterations": checkpoint["iteration"],
@@ -105,12 +114,12 @@ def read_run(args: Args, folder: Path) -> tuple[dict[str, Any], list[dict[str, A
 
 
 def write_table(args: Args, rows: list[dict[str, str]]) -> None:
-    """Rows of equal batch size become one line: the median over the seeds, and each seed's value."""
+    """Rows of equal settings become one line: the median over the seeds, and each seed's value."""
     lines = [
-        "| environments | device | seeds | iteration | return | forward speed | falls per episode "
+        "| environments | substeps | device | seeds | iteration | return | forward speed | falls per episode "
         + "".join(f"| training return passes {least:,} " for least in TIMED)
         + "|",
-        "|" + "---|" * (7 + len(TIMED)),
+        "|" + "---|" * (8 + len(TIMED)),
     ]
 
     def cell(group: list[dict[str, str]], column: str, unit: str = "") -> str:
@@ -121,9 +130,9 @@ def write_table(args: Args, rows: list[dict[str, str]]) -> None:
         steps, seconds = row[f"steps to {least}"], row[f"seconds to {least}"]
         return f"{float(steps) / 1e6:.2f} M steps, {seconds} s" if steps else "not"
 
-    for environments, device in sorted({(int(row["environments"]), row["device"]) for row in rows}):
-        group = [row for row in rows if (row["environments"], row["device"]) == (str(environments), device)]
-        cells = [str(environments), device, " ".join(row["seed"] for row in group)]
+    for key in dict.fromkeys(setting(row) for row in rows):
+        group = [row for row in rows if setting(row) == key]
+        cells = [*key, " ".join(row["seed"] for row in group)]
         cells += [cell(group, "iteration (ms)", " ms"), cell(group, "return"), cell(group, "speed (m/s)", " m/s")]
         cells += [cell(group, "falls per episode")]
         cells += ["; ".join(passing(row, least) for row in group) for least in TIMED]
@@ -139,14 +148,13 @@ def write_table(args: Args, rows: list[dict[str, str]]) -> None:
 
 def draw(args: Args, points: list[dict[str, str]]) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
-    sizes = sorted({int(point["environments"]) for point in points})
-    for environments, seed, device in dict.fromkeys((p["environments"], p["seed"], p["device"]) for p in points):
-        curve = [p for p in points if (p["environments"], p["seed"], p["device"]) == (environments, seed, device)]
-        curve = [p for p in curve if p["return"]]
-        colour = f"C{sizes.index(int(environments))}"
+    settings = list(dict.fromkeys(setting(point) for point in points))
+    for key, seed in dict.fromkeys((setting(point), point["seed"]) for point in points):
+        curve = [p for p in points if (setting(p), p["seed"]) == (key, seed) and p["return"]]
+        colour = f"C{settings.index(key)}"
         for axis, column, scale in ((axes[0], "control_steps", 1e-6), (axes[1], "seconds", 1 / 60)):
             x = [scale * float(p[column]) for p in curve]
-            axis.plot(x, [float(p["return"]) for p in curve], colour, lw=1, label=f"{environments} on {device}")
+            axis.plot(x, [float(p["return"]) for p in curve], colour, lw=1, label=" / ".join(key))
     for axis, label in zip(axes, ("control steps, millions", "minutes of training"), strict=True):
         for name, value in PUBLISHED.items():
             axis.axhline(value, color="0.4", linestyle="--", linewidth=0.8)
@@ -157,7 +165,7 @@ def draw(args: Args, points: list[dict[str, str]]) -> None:
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("return of training episodes")
     labels = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
-    axes[0].legend(labels.values(), labels, title="environments", fontsize=7, title_fontsize=7)
+    axes[0].legend(labels.values(), labels, title=" / ".join(SETTING), fontsize=7, title_fontsize=7)
     figure.savefig(args.docs / "humanoid_mtu.png", dpi=110)
 
 
@@ -167,7 +175,7 @@ def main(args: Args) -> None:
         if not args.runs:
             fail("give the directories of finished runs, or --draw-only")
         rows, curves = zip(*(read_run(args, folder) for folder in args.runs), strict=True)
-        write_csv(paths[0], sorted(rows, key=lambda row: (row["environments"], row["seed"])))
+        write_csv(paths[0], sorted(rows, key=lambda row: (row["environments"], row["substeps"], row["seed"])))
         write_csv(paths[1], [point for curve in curves for point in curve])
     write_table(args, read_csv(paths[0]))
     draw(args, read_csv(paths[1]))
