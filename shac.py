@@ -57,6 +57,8 @@ class Args:
     """the paper's one setting for all tasks (Table 5) instead of the per-task ones"""
     deterministic_policy: bool = False
     """train a policy without noise (A.4.4)"""
+    no_critic: bool = False
+    """the ablation of section 4.3: nothing stands for what comes after the window"""
     actor_hidden: tuple[int, ...] | None = None
     """units of the actor's hidden layers; None: per task"""
     critic_hidden: tuple[int, ...] | None = None
@@ -126,7 +128,7 @@ PROGRESS = {  # scalar of tensorboard: column of progress.csv, beside iteration,
     "grad/norm": "grad_norm", "grad/skipped": "skipped", "sim/nonfinite": "nonfinite",
 }
 # fmt: on
-FIXED = ("env", "num_envs", "actor_hidden", "critic_hidden", "deterministic_policy")  # by a checkpoint
+FIXED = ("env", "num_envs", "actor_hidden", "critic_hidden", "deterministic_policy", "no_critic")  # by a checkpoint
 FORMAT = "shac-1"  # of checkpoints
 
 
@@ -383,6 +385,8 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
     def update_actor() -> Tensor:
         window = collect(env, actor, normalise, actor.sample_noise(args.horizon, num_envs))
         next_value = next_values(target, normalise, window)
+        if args.no_critic:
+            next_value = torch.zeros_like(next_value)
         loss = actor_loss(window.reward, next_value, window.done, args.gamma)
         norm = actor_optimizer.step(loss)
         window = Window(*(tensor.detach() for tensor in window))
@@ -395,7 +399,8 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
 
     def update_critic() -> Tensor:
         batches = batch_obs.chunk(args.critic_minibatches), batch_value.chunk(args.critic_minibatches)
-        for _ in range(args.critic_iterations):
+        losses = [torch.zeros_like(critic_optimizer.skipped)]
+        for _ in range(0 if args.no_critic else args.critic_iterations):
             losses = []
             for obs, value in zip(*batches, strict=True):
                 loss = (critic(obs).squeeze(-1) - value).square().mean()  # Eq. 6

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -18,6 +19,8 @@ from diffsim.kernels.model import shape_of
 from diffsim.simulator import Simulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import bptt  # noqa: E402
+import ppo_baseline  # noqa: E402
 import shac  # noqa: E402
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU, and PyTorch sees none")
@@ -120,13 +123,14 @@ def test_a_graph_contains_what_is_not_finite() -> None:
 
 @pytest.mark.gpu
 @cuda
+@pytest.mark.parametrize("learner", [shac, bptt, ppo_baseline])
 @pytest.mark.parametrize("eager", [[], ["--no-cuda-graph"]])
-def test_same_seed_same_weights_on_a_gpu(tmp_path: Path, eager: list[str]) -> None:
-    weights = []
+def test_same_seed_same_weights_on_a_gpu(tmp_path: Path, learner: ModuleType, eager: list[str]) -> None:
+    checkpoints = []
     for run in ("a", "b"):
         arguments = "--env cartpole --num-envs 8 --iterations 12 --eval-every 5 --eval-episodes 2 --quiet".split()
-        shac.main([*arguments, "--device", "cuda", "--run-dir", str(tmp_path / run), *eager])
-        weights.append(torch.load(tmp_path / run / "checkpoint.pt", weights_only=True, map_location="cpu"))
-    for part in ("actor", "critic", "target", "normalise"):
-        for name, value in weights[0][part].items():
-            assert torch.equal(weights[1][part][name], value), (part, name)
+        learner.main([*arguments, "--device", "cuda", "--run-dir", str(tmp_path / run), *eager])
+        checkpoints.append(torch.load(tmp_path / run / "checkpoint.pt", weights_only=True, map_location="cpu"))
+    for part in {"actor", "critic", "target", "policy", "normalise"} & checkpoints[0].keys():
+        for name, value in checkpoints[0][part].items():
+            assert torch.equal(checkpoints[1][part][name], value), (part, name)

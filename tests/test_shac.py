@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from learners import ROOT, assert_same
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import diffsim
 from diffsim import evaluation
 
-ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import shac  # noqa: E402
 
@@ -173,21 +173,6 @@ def run(directory: Path, *arguments: object) -> dict[str, Any]:
     return torch.load(directory / "checkpoint.pt", weights_only=True)
 
 
-def assert_same(a: Any, b: Any, same: bool = True) -> None:
-    """Bitwise, whatever a checkpoint holds."""
-    assert type(a) is type(b)
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        for key in a:
-            assert_same(a[key], b[key])
-    elif isinstance(a, list | tuple):
-        assert len(a) == len(b)
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
-    else:
-        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("trained")
@@ -320,6 +305,22 @@ def test_unusual_settings_train(arguments: str, tmp_path: Path, capsys: pytest.C
         assert checkpoint["args"]["iterations"] == 3 and checkpoint["args"]["num_envs"] == 3
     out = capsys.readouterr().out
     assert "3/3" in out and "it/s" in out and "left" in out and "return median" in out
+
+
+def test_without_critic_only_the_rewards_of_the_window_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loss, next_values = shac.actor_loss, []
+
+    def recorded(reward: torch.Tensor, next_value: torch.Tensor, *rest: Any) -> torch.Tensor:
+        next_values.append(next_value)
+        return loss(reward, next_value, *rest)
+
+    monkeypatch.setattr(shac, "actor_loss", recorded)
+    without = run(tmp_path / "without", *SMALL, "--no-critic", "--stop-after", 2)
+    assert len(next_values) == 2 and not any(value.any() for value in next_values)
+    assert not without["critic_optimizer"]["adam"]["state"]  # never stepped
+    assert_same(without["critic"], without["target"])
+    run(tmp_path / "with", *SMALL, "--stop-after", 1)
+    assert next_values[2].any()
 
 
 def test_a_bad_gradient_is_seen_counted_and_skipped(

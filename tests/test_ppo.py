@@ -1,0 +1,140 @@
+"""PPO's parts against plain reference implementations."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from learners import ROOT, run
+from torch.distributions import Normal, kl_divergence
+
+import diffsim
+
+sys.path.insert(0, str(ROOT))
+import ppo_baseline as ppo  # noqa: E402
+
+
+@pytest.mark.parametrize("lam", [0.0, 0.9, 1.0])
+@pytest.mark.parametrize("horizon", [1, 12])
+def test_gae_is_the_weighted_sum_of_all_its_n_step_advantages(
+    rng: np.random.Generator, lam: float, horizon: int
+) -> None:
+    """Schulman et al. 2016, Eq. 11-16, with ends of both kinds at random."""
+    gamma, size = 0.97, (horizon, 50)
+    kind = rng.choice(3, size=size, p=(0.8, 0.1, 0.1))
+    terminated, done = kind == 1, kind > 0
+    reward, value, following = (rng.normal(size=size) for _ in range(3))
+    following[terminated] = 0.0  # V(s_{t+1}): of the last state where time ran out, nothing where the episode failed
+    for t, i in zip(*np.nonzero(~done[:-1]), strict=True):
+        following[t, i] = value[t + 1, i]
+
+    expected = np.zeros(size)
+    for i in range(size[1]):
+        for t in range(horizon):
+            n = next((k for k in range(1, horizon - t) if done[t + k - 1, i]), horizon - t)  # steps to the end
+            advantages = []
+            for k in range(1, n + 1):
+                rewards = sum(gamma**j * reward[t + j, i] for j in range(k))
+                advantages.append(rewards + gamma**k * following[t + k - 1, i] - value[t, i])
+            weights = [(1 - lam) * lam ** (k - 1) for k in range(1, n)] + [lam ** (n - 1)]
+            expected[t, i] = np.dot(weights, advantages)
+    tensors = (torch.tensor(x) for x in (reward, value, following, done))
+    np.testing.assert_allclose(ppo.gae(*tensors, gamma, lam), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_values_after_a_window_are_of_the_last_states_before_any_reset() -> None:
+    """Of three ants that run out of time, fall, and do neither, the values and rewards that GAE gets."""
+    torch.manual_seed(0)
+    env = diffsim.make("ant", num_envs=3, seed=0, horizon=8)
+    policy, normalise = ppo.build(ppo.Args(hidden=(16,)), env)
+    env.episode_step[1] = env.episode_length - 4
+    qpos, qvel = env.qpos.clone(), env.qvel.clone()
+    qpos[2, 2], qvel[2, 2] = 0.3, -6.0
+    env.set_state(qpos, qvel)
+    noise = torch.randn(8, 3, 8)
+    window = ppo.collect(env, policy, normalise, noise)
+    assert window.truncated.nonzero().tolist() == [[3, 1]] and window.terminated.any(0).tolist() == [False, False, True]
+    assert not any(tensor.requires_grad for tensor in window)
+    same = window.next_obs[:-1] == window.obs[1:]
+    torch.testing.assert_close(same.all(-1), ~window.done[:-1])
+    mean, value = policy(normalise(window.obs))
+    torch.testing.assert_close(window.mean, mean)
+    torch.testing.assert_close(window.value, value)
+    torch.testing.assert_close(window.action, mean + policy.log_std.exp() * noise)
+
+
+def gaussians(count: int = 40) -> tuple[ppo.Batch, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A batch acted by one policy, and mean, log_std of another, and the first one's log_std."""
+    torch.manual_seed(0)
+    mean, other = torch.randn(2, count, 3, dtype=torch.float64)
+    log_std, old_log_std = 0.3 * torch.randn(2, 3, dtype=torch.float64)
+    action = mean + old_log_std.exp() * torch.randn_like(mean)
+    batch = ppo.Batch(torch.zeros(count, 1), mean, action, torch.randn(count, dtype=torch.float64), torch.zeros(count))
+    return batch, other, log_std, old_log_std
+
+
+def test_ratio_and_divergence_are_those_of_the_distributions() -> None:
+    batch, mean, log_std, old_log_std = gaussians()
+    new, old = Normal(mean, log_std.exp()), Normal(batch.mean, old_log_std.exp())
+    expected = (new.log_prob(batch.action) - old.log_prob(batch.action)).sum(-1)
+    torch.testing.assert_close(ppo.log_ratio(batch, mean, log_std, old_log_std), expected)
+    result = ppo.kl_divergence(batch.mean, old_log_std, mean, log_std)
+    torch.testing.assert_close(result, kl_divergence(old, new).sum(-1).mean())
+
+
+def test_clipped_objective_and_its_gradient_case_by_case() -> None:
+    """Figure 1 of the PPO paper: the gain is bounded on one side, which depends on the advantage's sign."""
+    cases = [  # ratio, advantage, loss, its derivative in log ratio
+        (1.0, 2.0, -2.0, -2.0),
+        (1.1, 2.0, -2.2, -2.2),
+        (1.5, 2.0, -2.4, 0.0),
+        (0.5, 2.0, -1.0, -1.0),
+        (1.5, -2.0, 3.0, 3.0),
+        (0.5, -2.0, 1.6, 0.0),
+        (0.9, -2.0, 1.8, 1.8),
+    ]
+    for ratio, advantage, loss, slope in cases:
+        log_ratio = torch.tensor([ratio], dtype=torch.float64).log().requires_grad_()
+        result = ppo.clipped_loss(log_ratio, torch.tensor([advantage], dtype=torch.float64), 0.2)
+        assert result.item() == pytest.approx(loss)
+        assert torch.autograd.grad(result, log_ratio)[0].item() == pytest.approx(slope), (ratio, advantage)
+
+
+@pytest.mark.parametrize(
+    ("lr", "kl", "expected"),
+    [(1e-3, 0.3, 1e-3 / 1.5), (1e-3, 0.19, 1e-3), (1e-3, 0.06, 1e-3), (1e-3, 0.04, 1.5e-3), (1e-3, float("nan"), 1e-3)]
+    + [(1.2e-6, 0.3, 1e-6), (9e-3, 0.01, 1e-2)],
+)
+def test_learning_rate_follows_the_divergence(lr: float, kl: float, expected: float) -> None:
+    tensor = torch.tensor(lr)
+    ppo.adapt(tensor, torch.tensor(kl), 0.1, (1e-6, 1e-2))
+    assert tensor.item() == pytest.approx(expected)
+
+
+def test_running_statistics_are_those_of_all_data(rng: np.random.Generator) -> None:
+    normalise, scalar = ppo.Normaliser(4), ppo.Normaliser()
+    windows = [rng.normal((0, 5, -100, 1e-3), (1, 10, 0.1, 1e-3), size=(8, 6, 4)) for _ in range(20)]
+    probe = torch.randn(5, 4)
+    torch.testing.assert_close(normalise(probe), probe)  # nothing seen yet
+    for window in windows:
+        normalise.update(torch.tensor(window, dtype=torch.float32))
+        scalar.update(torch.tensor(window[..., 1], dtype=torch.float32))
+    data = np.concatenate(windows).reshape(-1, 4)
+    np.testing.assert_allclose(normalise.mean, data.mean(0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(normalise.var, data.var(0), rtol=1e-3)
+    expected = (probe.double() - torch.tensor(data.mean(0))) / torch.tensor(data.var(0) + 1e-5).sqrt()
+    torch.testing.assert_close(normalise(probe).double(), expected, rtol=1e-3, atol=1e-3)
+    assert scalar.mean.shape == () and scalar.var.item() == pytest.approx(data[:, 1].var(), rel=1e-3)
+
+
+def test_cartpole_improves_within_seconds(tmp_path: Path) -> None:
+    """From about -2,900 per episode; a wrong sign of advantage, ratio or clipping stays there or falls."""
+    arguments = "--env cartpole --iterations 15 --eval-episodes 16 --threads 1 --quiet"
+    run(ppo, tmp_path, *arguments.split())
+    with (tmp_path / "progress.csv").open(newline="") as file:
+        returns = [float(row["return"]) for row in csv.DictReader(file)]
+    assert returns[0] < -1800 and returns[-1] > -1400
