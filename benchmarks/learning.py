@@ -1,34 +1,41 @@
-"""Learning curves: runs a learner on tasks and seeds, evaluates the final policies, and draws and tabulates all of it.
+"""Learning curves: runs learners on tasks and seeds, evaluates the final policies, and draws and tabulates all of it.
 
     python benchmarks/learning.py --env ant --seeds 1 2 3              train (finished runs are kept), evaluate, draw
+    python benchmarks/learning.py --experiment comparison              the paper's Figures 4 and 7, likewise
     python benchmarks/learning.py --collect-only                       only draw and tabulate what there is
     python benchmarks/learning.py --runs runs/short -- --iterations 50 what follows "--" goes to the learner
 
 Writes docs/results/{algorithm}_{env}.csv (about 100 points of each run), docs/results/{algorithm}_summary.csv,
-docs/results/{algorithm}.md and docs/{algorithm}.png. An interrupted run is resumed from its checkpoint.
+docs/results/{algorithm}.md and docs/{algorithm}.png; of experiments docs/{experiment}.png and the page of all of them,
+docs/results/experiments.md. An interrupted run is resumed from its checkpoint.
 """
 
 from __future__ import annotations
 
 import csv
 import dataclasses
+import importlib
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
-from typing import Annotated, Any, NoReturn
+from statistics import mean, median, pstdev
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 
 import matplotlib
 import numpy as np
+import torch
 import tyro
 
 import diffsim
+from diffsim import graph
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -48,12 +55,43 @@ THRESHOLDS = {
     "humanoid_mtu": (4246, 6964),
 }
 PUBLISHED = {"hopper": 4837, "ant": 7661, "humanoid": 8387, "humanoid_mtu": 6114}
+PUBLISHED_PPO = {"hopper": 4742, "ant": 6605, "humanoid": 7293}  # in the same place
+
+VARIANTS = {  # of a script: its flags
+    "shac_no_critic": ("shac", "--no-critic"),
+    "shac_general": ("shac", "--general-hyperparameters"),
+    "shac_deterministic": ("shac", "--deterministic-policy"),
+    **{f"shac_h{h}": ("shac", "--horizon", str(h), "--num-envs", str(2048 // h)) for h in (4, 8, 16, 64, 128)},
+}
+
+
+class Experiment(NamedTuple):
+    title: str
+    algorithms: tuple[str, ...]  # the first is what the others are compared with
+    tasks: tuple[str, ...] = tuple(diffsim.TASKS)
+
+
+EXPERIMENTS = {
+    "comparison": Experiment("Figures 4 and 7: the learners", ("shac", "ppo_baseline", "bptt", "shac_no_critic")),
+    "horizon": Experiment(
+        "Figure 6: short horizon length, 2,048 samples per iteration",
+        ("shac", "shac_h4", "shac_h8", "shac_h16", "shac_h64", "shac_h128"),
+        ("ant",),
+    ),
+    "general": Experiment("Figure 8: one setting for all tasks", ("shac", "shac_general")),
+    "deterministic": Experiment("Figure 9: deterministic policy", ("shac", "shac_deterministic")),
+}
+# Returns to which steps and seconds are compared, and the paper's Table 12: forward, backward, critic on a TITAN X.
+TARGETS = {"cartpole": -520, "hopper": 3000, "half_cheetah": 6000, "ant": 5000, "humanoid": 5000}
+TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}
 
 
 @dataclass
 class Args:
     algorithm: str = "shac"
-    """learner: the name of a script in the repository's root, without .py"""
+    """learner: a script in the repository's root, without .py, or a variant of one, e.g. shac_no_critic"""
+    experiment: Literal["comparison", "horizon", "general", "deterministic", "time"] | None = None
+    """several learners at once, drawn together: Figures 4 and 7, 6, 8 or 9 of the SHAC paper, or its Table 12"""
     env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
     """tasks"""
     seeds: tuple[int, ...] = (1, 2, 3)
@@ -75,7 +113,8 @@ class Args:
 
 
 def learner(args: Args, *arguments: object) -> list[str]:
-    command = [sys.executable, str(ROOT / f"{args.algorithm}.py"), *map(str, arguments)]
+    script, *_ = VARIANTS.get(args.algorithm, (args.algorithm,))
+    command = [sys.executable, str(ROOT / f"{script}.py"), *map(str, arguments)]
     if args.jobs > 1:
         command += ["--threads", str(max(1, len(os.sched_getaffinity(0)) // args.jobs))]
     return command
@@ -97,16 +136,19 @@ def train(args: Args, env: str, seed: int) -> None:
     """One run from where it stands to its evaluation; `evaluation.json` marks it as finished."""
     folder = run_dir(args, env, seed)
     if (folder / "evaluation.json").exists():
-        print(f"{env}, seed {seed}: finished before", flush=True)
+        print(f"{args.algorithm}, {env}, seed {seed}: finished before", flush=True)
         return
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / "checkpoint.pt"
-    start = ("--resume", checkpoint) if checkpoint.exists() else ("--env", env, "--seed", seed, "--run-dir", folder)
+    _, *flags = VARIANTS.get(args.algorithm, (args.algorithm,))
+    start = ["--env", env, "--seed", seed, "--run-dir", folder, *flags]
+    if checkpoint.exists():
+        start = ["--resume", checkpoint]
     if not trained(folder):
         with (folder / "output.txt").open("a") as output:
             command = learner(args, *start, "--quiet", *args.arguments)
             if subprocess.run(command, stdout=output, stderr=output).returncode != 0:
-                print(f"{env}, seed {seed}: failed or interrupted, see {output.name}", flush=True)
+                print(f"{args.algorithm}, {env}, seed {seed}: failed or interrupted, see {output.name}", flush=True)
                 return
     substeps = json.loads((folder / "args.json").read_text())["substeps"] or diffsim.TASKS[env].substeps
     returns = {}
@@ -119,7 +161,7 @@ def train(args: Args, env: str, seed: int) -> None:
         returns[key] = float(found[1])
     evaluation = {"substeps": substeps, "finer_substeps": args.finer * substeps, **returns}
     (folder / "evaluation.json").write_text(json.dumps(evaluation))
-    print(f"{env}, seed {seed}: {evaluation}", flush=True)
+    print(f"{args.algorithm}, {env}, seed {seed}: {evaluation}", flush=True)
 
 
 # Collecting -----------------------------------------------------------------------------------------------------------
@@ -144,10 +186,14 @@ def number(text: str) -> float:
     return float(text) if text else float("nan")
 
 
-def subsample(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """About POINTS rows, evenly spread, and every row that has an evaluation."""
+def subsample(rows: list[dict[str, str]], target: float) -> list[dict[str, str]]:
+    """About POINTS rows, evenly spread; every row that has an evaluation, the best one, and the first at the target."""
     keep = set(np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).round().astype(int))
-    return [row for k, row in enumerate(rows) if k in keep or row["eval_return"]]
+    returns = [number(row["return"]) for row in rows]
+    keep |= {k for k, row in enumerate(rows) if row["eval_return"]}
+    keep |= set([k for k, value in enumerate(returns) if value >= target][:1])
+    keep |= {k for k, value in enumerate(returns) if value == np.nanmax(returns)}
+    return [rows[k] for k in sorted(keep)]
 
 
 def collect(args: Args, env: str) -> dict[str, Any] | None:
@@ -159,7 +205,10 @@ def collect(args: Args, env: str) -> dict[str, Any] | None:
             continue
         seed, progress = folder.name.split("__")[1], read_csv(folder / "progress.csv")
         seeds.append(seed)
-        points += [{"seed": seed} | {c: short(row[c]) for c in COLUMNS} for row in subsample(progress)]
+        points += [
+            {"seed": seed} | {c: short(row[c]) for c in COLUMNS}
+            for row in subsample(progress, TARGETS.get(env, float("inf")))
+        ]
         evaluation = json.loads((folder / "evaluation.json").read_text())
         final.append(evaluation["own"])
         finer.append(evaluation["finer"])
@@ -199,11 +248,9 @@ def summarise(args: Args, rows: list[dict[str, Any]]) -> None:
     path = args.docs / "results" / f"{args.algorithm}_summary.csv"
     merged = {row["task"]: row for row in read_csv(path)} if path.is_file() else {}
     merged |= {row["task"]: row for row in rows}
-    table = [merged[env] for env in diffsim.TASKS if env in merged]
-    write_csv(path, table)
-    columns = list(table[0])
-    lines = [columns, ["---"] * len(columns), *([str(row[c]) for c in columns] for row in table)]
-    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    merged = [merged[env] for env in diffsim.TASKS if env in merged]
+    write_csv(path, merged)
+    text = markdown(merged)
     (args.docs / "results" / f"{args.algorithm}.md").write_text(text)
     print(text, end="")
 
@@ -253,6 +300,182 @@ def draw(args: Args) -> None:
     figure.savefig(args.docs / f"{args.algorithm}.png", dpi=110)
 
 
+# Experiments ----------------------------------------------------------------------------------------------------------
+
+
+def results(args: Args, algorithm: str, env: str) -> list[Curve]:
+    path = args.docs / "results" / f"{algorithm}_{env}.csv"
+    return curves(path) if path.is_file() else []
+
+
+def draw_experiment(args: Args, name: str, suffix: str = "", full: bool = False) -> None:
+    """Mean and standard deviation over seeds; on linear axes up to where the first learner ends, or all on log axes."""
+    experiment = EXPERIMENTS[name]
+    tasks = [env for env in experiment.tasks if any(results(args, a, env) for a in experiment.algorithms)]
+    figure, axes = plt.subplots(2, len(tasks), figsize=(3.4 * len(tasks), 5.6), squeeze=False, layout="constrained")
+    for column, env in enumerate(tasks):
+        for axis, x, label in zip(
+            axes[:, column], ("control_steps", "seconds"), ("control steps", "wall s"), strict=True
+        ):
+            limit = max((run[x][-1] for run in results(args, experiment.algorithms[0], env)), default=float("inf"))
+            for number_, algorithm in enumerate(experiment.algorithms):
+                if not (runs := results(args, algorithm, env)):
+                    continue
+                grid = np.geomspace(max(r[x][0] for r in runs), min(r[x][-1] for r in runs), 400)
+                values = np.array([np.interp(grid, r[x], r["return"]) for r in runs])
+                middle, spread = values.mean(0), values.std(0)
+                axis.plot(grid, middle, color=f"C{number_}", label=algorithm)
+                axis.fill_between(grid, middle - spread, middle + spread, color=f"C{number_}", alpha=0.2, linewidth=0)
+            if full:
+                axis.set_xscale("log")
+            elif limit < float("inf"):
+                axis.set_xlim(0, limit)
+            axis.set_xlabel(label)
+            axis.grid(alpha=0.3)
+            axis.spines[["top", "right"]].set_visible(False)
+        axes[0, column].set_title(env)
+    axes[0, 0].legend(fontsize=8)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("return of training episodes")
+    figure.savefig(args.docs / f"{name}{suffix}.png", dpi=110)
+    plt.close(figure)
+
+
+def draw_horizon(args: Args) -> None:
+    """Figure 6: best return and training time against the horizon."""
+    points = []
+    for algorithm in EXPERIMENTS["horizon"].algorithms:
+        if runs := results(args, algorithm, "ant"):
+            best = [np.max(run["return"]) for run in runs]
+            seconds = mean(run["seconds"][-1] for run in runs)
+            points.append((int(algorithm.partition("_h")[2] or 32), mean(best), pstdev(best), seconds))
+    h, best, spread, seconds = zip(*sorted(points), strict=True)
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
+    axes[0].errorbar(h, best, spread, marker="o", capsize=3)
+    axes[1].plot(h, seconds, marker="o")
+    for axis, label in zip(axes, ("best return", "training, wall s"), strict=True):
+        axis.set_xscale("log", base=2)
+        axis.set_xlabel("horizon h")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    figure.savefig(args.docs / "horizon.png", dpi=110)
+    plt.close(figure)
+
+
+def passing(runs: list[Curve], target: float) -> tuple[float, float]:
+    """Median over seeds of the control steps and the wall seconds at which the return first passes the target."""
+    first = [np.flatnonzero(run["return"] >= target) for run in runs]
+    return tuple(
+        median(run[x][k[0]] if len(k) else float("inf") for run, k in zip(runs, first, strict=True))
+        for x in ("control_steps", "seconds")
+    )
+
+
+def table(args: Args, experiment: Experiment) -> list[dict[str, Any]]:
+    rows = []
+    for env in experiment.tasks:
+        target, reference = TARGETS[env], None
+        for algorithm in experiment.algorithms:
+            if not (runs := results(args, algorithm, env)):
+                continue
+            best = [np.max(run["return"]) for run in runs]
+            final = [run["eval_return"][~np.isnan(run["eval_return"])][-1] for run in runs]
+            steps, seconds = passing(runs, target)
+            if algorithm == experiment.algorithms[0]:
+                reference = steps, seconds
+            ratio = ""
+            if reference and max(reference) < float("inf"):
+                ratio = " / ".join(f"{v / r:.3g}" for v, r in zip((steps, seconds), reference, strict=True))
+                ratio = "never" if steps == float("inf") else ratio
+            published = {"shac": PUBLISHED, "ppo_baseline": PUBLISHED_PPO}.get(algorithm, {})
+            rows.append(
+                {
+                    "task": env,
+                    "learner": algorithm,
+                    "seeds": len(runs),
+                    "best return of training": f"{mean(best):.0f} ± {pstdev(best):.0f}",
+                    "published": published.get(env, ""),
+                    "final policy, deterministic": f"{median(final):.0f}",
+                    "control steps": f"{median(run['control_steps'][-1] for run in runs):.3g}",
+                    "training, s": f"{median(run['seconds'][-1] for run in runs):.0f}",
+                    "return passed": target,
+                    "after control steps": f"{steps:.3g}" if steps < float("inf") else "never",
+                    "after s": f"{seconds:.0f}" if seconds < float("inf") else "never",
+                    f"times {experiment.algorithms[0]}'s steps / s": ratio,
+                }
+            )
+    return rows
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *([str(value) for value in row.values()] for row in rows)]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def time_breakdown(args: Args, env_name: str) -> dict[str, Any]:
+    """Table 12: the parts of one iteration of SHAC, each captured and timed alone."""
+    sys.path.insert(0, str(ROOT))
+    shac = importlib.import_module("shac")
+    settings, _ = shac.parse(["--env", env_name, *args.arguments])
+    horizon, num_envs, gamma = settings.horizon, settings.num_envs, settings.gamma
+    env = shac.make_env(settings, num_envs, horizon)
+    actor, normalise = shac.build(settings, env)
+    critic = shac.mlp(normalise.mean.numel(), settings.critic_hidden, 1, orthogonal=True).to(env.device)
+    actor_optimizer, critic_optimizer = (shac.ClippedAdam(module, settings) for module in (actor, critic))
+    obs = torch.randn(horizon * num_envs // settings.critic_minibatches, normalise.mean.numel(), device=env.device)
+
+    def forward() -> torch.Tensor:
+        window = shac.collect(env, actor, normalise, actor.sample_noise(horizon, num_envs))
+        return shac.actor_loss(window.reward, shac.next_values(critic, normalise, window), window.done, gamma)
+
+    def update_critic() -> None:
+        for _ in range(settings.critic_iterations * settings.critic_minibatches):
+            critic_optimizer.step(critic(obs).square().mean())
+
+    parts = [(lambda: forward().detach(), env), (lambda: actor_optimizer.step(forward()), env), (update_critic, None)]
+    first, both, fitting = (timed(graph.capture(part, env.device, of), env.device) for part, of in parts)
+    place = torch.cuda.get_device_name(env.device) if env.device.type == "cuda" else "cpu"
+    ours = {"forward": first, "backward": both - first, "critic": fitting}
+    published = dict(zip(ours, TABLE_12.get(env_name, ("",) * 3), strict=True))
+    row = {"task": env_name, "environments": num_envs, "device": place}
+    row |= {f"{part}, ms": f"{1000 * seconds:.3g}" for part, seconds in ours.items()}
+    return row | {f"published {part}, s (TITAN X)": published[part] for part in ours}
+
+
+def timed(function: Callable[[], Any], device: torch.device, warmup: int = 4, calls: int = 20) -> float:
+    """Seconds of one call, once warm."""
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    for k in range(warmup + calls):
+        if k == warmup:
+            wait()
+            begin = time.perf_counter()
+        function()
+    wait()
+    return (time.perf_counter() - begin) / calls
+
+
+def write_page(args: Args) -> None:
+    """docs/results/experiments.md and the pictures, from the csv files that there are."""
+    text = "Written by `python benchmarks/learning.py --experiment <name>` from the csv files beside it.\n"
+    for name, experiment in EXPERIMENTS.items():
+        if not (rows := table(args, experiment)):
+            continue
+        text += f"\n## {experiment.title}\n\n{markdown(rows)}\n"
+        if name == "horizon":
+            draw_horizon(args)
+        else:
+            draw_experiment(args, name)
+        text += f"![{experiment.title}](../{name}.png)\n"
+        if name == "comparison":
+            draw_experiment(args, name, "_full", full=True)
+            text += f"![{experiment.title}, to their ends](../{name}_full.png)\n"
+    if (args.docs / "results" / "time.csv").is_file():
+        rows = read_csv(args.docs / "results" / "time.csv")
+        text += f"\n## Table 12: parts of an iteration of SHAC\n\n{markdown(rows)}"
+    (args.docs / "results" / "experiments.md").write_text(text)
+    print(text, end="")
+
+
 def fail(message: str) -> NoReturn:
     print(f"learning.py: {message}", file=sys.stderr)
     sys.exit(2)
@@ -261,21 +484,38 @@ def fail(message: str) -> NoReturn:
 def main(args: Args) -> None:
     if unknown := [env for env in args.env if env not in diffsim.TASKS]:
         fail(f"unknown task {unknown[0]!r}: choose from {', '.join(diffsim.TASKS)}")
-    if not (ROOT / f"{args.algorithm}.py").is_file():
+    experiment = EXPERIMENTS.get(args.experiment)
+    algorithms = experiment.algorithms if experiment else (args.algorithm,)
+    if not experiment and not (ROOT / f"{VARIANTS.get(args.algorithm, (args.algorithm,))[0]}.py").is_file():
         fail(f"no script {args.algorithm}.py in {ROOT}")
+    if args.experiment == "time":
+        path = args.docs / "results" / "time.csv"
+        merged = {row["task"]: row for row in read_csv(path)} if path.is_file() else {}
+        merged |= {env: time_breakdown(args, env) for env in args.env}
+        write_csv(path, [merged[env] for env in diffsim.TASKS if env in merged])
+        write_page(args)
+        return
+    tasks = [env for env in args.env if not experiment or env in experiment.tasks]
+    parts = [dataclasses.replace(args, algorithm=algorithm) for algorithm in algorithms]
     if not args.collect_only:
         pool = ThreadPoolExecutor(args.jobs)
         try:
-            list(pool.map(lambda run: train(args, *run), [(env, seed) for seed in args.seeds for env in args.env]))
+            runs = [(part, env, seed) for seed in args.seeds for env in tasks for part in parts]
+            list(pool.map(lambda run: train(*run), runs))
         except KeyboardInterrupt:  # the learners got it too, and save
             pool.shutdown(cancel_futures=True)
             fail("interrupted; the same command goes on")
-    rows = [row for env in args.env if (row := collect(args, env))]
-    if not rows and not list((args.docs / "results").glob(f"{args.algorithm}_*.csv")):
-        fail(f"no finished run in {args.runs / args.algorithm}")
-    if rows:
-        summarise(args, rows)
-    draw(args)
+    for part in parts:
+        if rows := [row for env in tasks if (row := collect(part, env))]:
+            summarise(part, rows)
+        elif not list((args.docs / "results").glob(f"{part.algorithm}_*.csv")):
+            if not experiment:
+                fail(f"no finished run in {args.runs / part.algorithm}")
+            print(f"no finished run in {args.runs / part.algorithm}", file=sys.stderr)
+    if experiment:
+        write_page(args)
+    else:
+        draw(args)
 
 
 if __name__ == "__main__":
