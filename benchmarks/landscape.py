@@ -1,22 +1,27 @@
 """Loss landscapes and gradients of BPTT and SHAC: Figures 2, 11, 12 and 13 of the SHAC paper.
 
-    python benchmarks/landscape.py --env humanoid ant --device cuda     train, keep six policies on the way, draw all
+    python benchmarks/landscape.py --env humanoid ant           train, keep six policies on the way, measure, draw
+    python benchmarks/landscape.py --env ant --time-limit 500   stop training in time; the same command goes on
+    python benchmarks/landscape.py --draw-only                  only draw and tabulate what there is
     python benchmarks/landscape.py --env cartpole --iterations 4 8 --trajectories 4 --points 11 --side 5 --horizon 60
 
 A policy that SHAC has learned is changed along one weight, and along two random directions. BPTT's loss is minus the
 mean reward of an episode of --horizon steps up to its end (a fallen robot gains no more), SHAC's is Eq. 5 over a window
 of 32 steps from states that the policy visits. Every variation of the policy meets the same start states and the same
-noise, all at once in one batch. The second line is a short look.
+noise, all at once in one batch. The last line is a short look.
 
-Writes docs/results/landscape_*.csv, docs/landscape_*.png and the page docs/results/landscape.md.
+Writes docs/results/landscape_*.csv, docs/landscape_*.png and the page docs/results/landscape.md. A csv that exists is
+kept: delete it to measure it anew.
 """
 
 from __future__ import annotations
 
 import csv
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +35,14 @@ from torch import Tensor
 from torch.func import functional_call, vmap
 
 import diffsim
+from diffsim import distributed
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
+FILES = ("gradients", "weight", "surface")
+BEGIN = time.perf_counter()
 sys.path.insert(0, str(ROOT))
 import shac  # noqa: E402
 
@@ -43,8 +51,8 @@ import shac  # noqa: E402
 class Args:
     env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = ("humanoid", "ant")
     """tasks"""
-    device: str = "cpu"
-    """torch device"""
+    device: str | None = None
+    """torch device; None: the GPU if there is one"""
     seed: int = 1
     """seed of the training, of start states, noise and directions"""
     iterations: tuple[int, ...] = (50, 200, 500, 1000, 1500, 2000)
@@ -63,6 +71,10 @@ class Args:
     """control steps of the policy before SHAC's window begins"""
     batch: int = 8192
     """environments at a time"""
+    time_limit: float = float("inf")
+    """seconds after which no measurement begins and a training is stopped, to be resumed by the next call"""
+    draw_only: bool = False
+    """train and measure nothing: pictures and tables of the csv files at hand"""
     runs: Path = ROOT / "runs" / "landscape"
     """directory of the trainings"""
     docs: Path = ROOT / "docs"
@@ -76,26 +88,46 @@ class Snapshot(NamedTuple):
     target: Any  # critic
 
 
+class TimeUp(Exception):
+    """The time limit is reached; what is done so far is on the disk."""
+
+
+def remaining(args: Args) -> float | None:
+    """Seconds that are left, None without a limit."""
+    left = args.time_limit - time.perf_counter() + BEGIN
+    if left <= 0:
+        raise TimeUp
+    return left if left < float("inf") else None
+
+
 def snapshots(args: Args, env: str) -> list[Path]:
     """One training, stopped and resumed; its checkpoint after each of the given iterations."""
     folder = args.runs / f"{env}__{args.seed}"
     paths = [folder / f"iteration_{k}.pt" for k in args.iterations]
+    checkpoint = folder / "checkpoint.pt"
     for k, path in zip(args.iterations, paths, strict=True):
-        checkpoint = folder / "checkpoint.pt"
         if path.is_file():
             continue
-        start = ["--env", env, "--seed", args.seed, "--run-dir", folder, "--device", args.device, "--eval-every", 0]
-        start += ["--iterations", args.iterations[-1]]
-        if checkpoint.is_file():
-            start = ["--resume", checkpoint]
-        command = [sys.executable, ROOT / "shac.py", *start, "--stop-after", k, "--quiet"]
-        subprocess.run([str(word) for word in command], check=True, stdout=subprocess.DEVNULL)
+        if not checkpoint.is_file() or torch.load(checkpoint, weights_only=True)["iteration"] < k:
+            start = ["--env", env, "--seed", args.seed, "--run-dir", folder, "--iterations", args.iterations[-1]]
+            start = ["--resume", checkpoint] if checkpoint.is_file() else start
+            start += ["--device", args.device, "--eval-every", 0, "--stop-after", k, "--quiet"]
+            command = [str(word) for word in (sys.executable, ROOT / "shac.py", *start)]
+            training = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+            try:
+                training.wait(remaining(args))
+            except (subprocess.TimeoutExpired, TimeUp):
+                training.send_signal(signal.SIGTERM)
+                training.wait()
+                raise TimeUp from None
+            if training.returncode != 0:
+                raise RuntimeError(f"training failed: {' '.join(command)}")
         shutil.copy(checkpoint, path)
     return paths
 
 
 def load(args: Args, path: Path, env: Any) -> Snapshot:
-    checkpoint = shac.load_checkpoint(path)
+    checkpoint = shac.load_checkpoint(path, shac.FORMAT)
     settings = shac.Args(**checkpoint["args"] | {"device": args.device})
     actor, normalise = shac.build(settings, env)
     target = shac.mlp(normalise.mean.numel(), settings.critic_hidden, 1, orthogonal=True).to(env.device)
@@ -247,48 +279,60 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def measure(args: Args, task: str) -> None:
-    """Writes the csv files of a task."""
-    results, probe = args.docs / "results", make_env(args, task, 1, 1)
-    paths = snapshots(args, task)
-    quantiles, rows = (0.5, 0.9, 0.99, 1.0), []
-    for iteration, path in zip(args.iterations, paths, strict=True):
-        snapshot = load(args, path, probe)
-        first, visited = start_states(args, task, snapshot)
-        row: dict[str, Any] = {"iteration": iteration}
-        for name, loss, start, horizon in (
-            ("bptt", bptt_loss, first, args.horizon),
-            ("shac", shac_loss, visited, snapshot.settings.horizon),
-        ):
-            gradient = policy_gradient(args, task, snapshot, loss, start, horizon)
-            finite = gradient[gradient.isfinite()].double()
-            row[f"{name}_norm"] = f"{finite.norm():.4g}"
-            row |= {f"{name}_q{q:g}": f"{np.quantile(finite.abs(), q) if len(finite) else 0:.4g}" for q in quantiles}
-            row[f"{name}_nonfinite"] = len(gradient) - len(finite)
-        rows.append(row)
-        print(f"{task}, gradients: {row}", flush=True)
-    write_csv(results / f"landscape_{task}_gradients.csv", rows)
-
+    """Writes those csv files of a task that there are not."""
+    gradients, line, surface = (args.docs / "results" / f"landscape_{task}_{name}.csv" for name in FILES)
+    if gradients.is_file() and line.is_file() and surface.is_file():
+        return
+    probe, paths = make_env(args, task, 1, 1), snapshots(args, task)
+    snapshot = load(args, paths[-1], probe)
+    first, visited = start_states(args, task, snapshot)
     horizon = snapshot.settings.horizon
-    direction, weight = one_weight(snapshot, gradient)
-    steps = torch.linspace(-1, 1, args.points, device=args.device).unsqueeze(1)
-    bptt, _ = evaluate(args, task, snapshot, bptt_loss, first, args.horizon, direction, steps)
-    ours, slope = evaluate(args, task, snapshot, shac_loss, visited, horizon, direction, steps, gradient=True)
-    columns = {"step": steps[:, 0].cpu().numpy(), "bptt": bptt, "shac": ours, "shac_gradient": slope[:, 0]}
-    table = zip(*columns.values(), strict=True)
-    write_csv(
-        results / f"landscape_{task}_weight.csv", [dict(zip(columns, map(float, row), strict=True)) for row in table]
-    )
-    print(f"{task}, weight {weight}: done", flush=True)
 
-    axis = torch.linspace(-1, 1, args.side, device=args.device)
-    steps, directions = torch.cartesian_prod(axis, axis), random_directions(args, snapshot)
-    bptt, _ = evaluate(args, task, snapshot, bptt_loss, first, args.horizon, directions, steps)
-    ours, _ = evaluate(args, task, snapshot, shac_loss, visited, horizon, directions, steps)
-    columns = {"k1": steps[:, 0].cpu().numpy(), "k2": steps[:, 1].cpu().numpy(), "bptt": bptt, "shac": ours}
-    table = zip(*columns.values(), strict=True)
-    write_csv(
-        results / f"landscape_{task}_surface.csv", [dict(zip(columns, map(float, row), strict=True)) for row in table]
-    )
+    if not gradients.is_file():
+        rows = []
+        for iteration, path in zip(args.iterations, paths, strict=True):
+            remaining(args)
+            rows.append({"iteration": iteration} | gradient_sizes(args, task, load(args, path, probe)))
+            print(f"{task}, gradients: {rows[-1]}", flush=True)
+        write_csv(gradients, rows)
+
+    if not line.is_file():
+        remaining(args)
+        direction, weight = one_weight(snapshot, policy_gradient(args, task, snapshot, shac_loss, visited, horizon))
+        steps = torch.linspace(-1, 1, args.points, device=args.device).unsqueeze(1)
+        bptt, _ = evaluate(args, task, snapshot, bptt_loss, first, args.horizon, direction, steps)
+        ours, slope = evaluate(args, task, snapshot, shac_loss, visited, horizon, direction, steps, gradient=True)
+        write_columns(line, step=steps[:, 0].cpu().numpy(), bptt=bptt, shac=ours, shac_gradient=slope[:, 0])
+        print(f"{task}, weight {weight}: done", flush=True)
+
+    if not surface.is_file():
+        remaining(args)
+        axis = torch.linspace(-1, 1, args.side, device=args.device)
+        steps, directions = torch.cartesian_prod(axis, axis), random_directions(args, snapshot)
+        bptt, _ = evaluate(args, task, snapshot, bptt_loss, first, args.horizon, directions, steps)
+        ours, _ = evaluate(args, task, snapshot, shac_loss, visited, horizon, directions, steps)
+        write_columns(surface, **dict(zip(("k1", "k2"), steps.T.cpu().numpy(), strict=True)), bptt=bptt, shac=ours)
+
+
+def gradient_sizes(args: Args, task: str, snapshot: Snapshot) -> dict[str, Any]:
+    """Norm and quantiles of the sizes of the entries of BPTT's and SHAC's gradient."""
+    first, visited = start_states(args, task, snapshot)
+    sizes: dict[str, Any] = {}
+    for name, loss, start, horizon in (
+        ("bptt", bptt_loss, first, args.horizon),
+        ("shac", shac_loss, visited, snapshot.settings.horizon),
+    ):
+        gradient = policy_gradient(args, task, snapshot, loss, start, horizon)
+        finite = gradient[gradient.isfinite()].double()
+        sizes[f"{name}_norm"] = f"{finite.norm():.4g}"
+        for q in (0.5, 0.9, 0.99, 1.0):
+            sizes[f"{name}_q{q:g}"] = f"{np.quantile(finite.abs(), q) if len(finite) else 0:.4g}"
+        sizes[f"{name}_nonfinite"] = len(gradient) - len(finite)
+    return sizes
+
+
+def write_columns(path: Path, **columns: np.ndarray) -> None:
+    write_csv(path, [dict(zip(columns, map(float, row), strict=True)) for row in zip(*columns.values(), strict=True)])
 
 
 def roughness(values: np.ndarray) -> tuple[int, float]:
@@ -356,12 +400,17 @@ def main(args: Args) -> None:
     if unknown := [env for env in args.env if env not in diffsim.TASKS]:
         print(f"landscape.py: unknown task {unknown[0]!r}: choose from {', '.join(diffsim.TASKS)}", file=sys.stderr)
         sys.exit(2)
-    for task in args.env:
-        measure(args, task)
+    args.device = distributed.choose_device(args.device)
+    try:
+        for task in () if args.draw_only else args.env:
+            measure(args, task)
+    except TimeUp:
+        print("stopped by --time-limit: the same command goes on", flush=True)
     text = "Written by `python benchmarks/landscape.py` from the csv files beside it.\n"
     for task in diffsim.TASKS:
-        if (args.docs / "results" / f"landscape_{task}_surface.csv").is_file():
+        if all((args.docs / "results" / f"landscape_{task}_{name}.csv").is_file() for name in FILES):
             text += draw(args, task)
+    (args.docs / "results").mkdir(parents=True, exist_ok=True)
     (args.docs / "results" / "landscape.md").write_text(text)
     print(text)
 

@@ -2,12 +2,13 @@
 
     python benchmarks/learning.py --env ant --seeds 1 2 3              train (finished runs are kept), evaluate, draw
     python benchmarks/learning.py --experiment comparison              the paper's Figures 4 and 7, likewise
-    python benchmarks/learning.py --collect-only                       only draw and tabulate what there is
+    python benchmarks/learning.py --experiment horizon --time-limit 500    stop in time; the same command goes on
+    python benchmarks/learning.py --experiment horizon --draw-only     only draw and tabulate what there is
     python benchmarks/learning.py --runs runs/short -- --iterations 50 what follows "--" goes to the learner
 
 Writes docs/results/{algorithm}_{env}.csv (about 100 points of each run), docs/results/{algorithm}_summary.csv,
 docs/results/{algorithm}.md and docs/{algorithm}.png; of experiments docs/{experiment}.png and the page of all of them,
-docs/results/experiments.md. An interrupted run is resumed from its checkpoint.
+docs/results/experiments.md. An interrupted run is resumed from its checkpoint; its curve is drawn as far as it goes.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import importlib
 import json
 import os
 import re
-import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -96,8 +97,12 @@ class Args:
     """tasks"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """seeds of each task"""
+    device: str | None = None
+    """torch device of the learners; None: the GPU if there is one"""
     jobs: int = 1
-    """runs at a time; the CPU's cores are split among them, which slows each of them down"""
+    """runs at a time; they share the device, which slows each of them down"""
+    time_limit: float | None = None
+    """seconds after which the runs in progress are stopped, to be resumed by the next call; None: no limit"""
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()
     finer: int = 4
     """the final policies are evaluated a second time with this many times the substeps"""
@@ -105,8 +110,9 @@ class Args:
     """directory of the runs: {runs}/{algorithm}/{env}__{seed}"""
     docs: Path = ROOT / "docs"
     """directory of what is written"""
-    collect_only: bool = False
-    """train and evaluate nothing"""
+    draw_only: Annotated[bool, tyro.conf.arg(aliases=["--collect-only"])] = False
+    """train and evaluate nothing: csv files, pictures and tables of the runs at hand"""
+    stop_at: tyro.conf.Suppress[float] = float("inf")
 
 
 # Runs -----------------------------------------------------------------------------------------------------------------
@@ -115,6 +121,8 @@ class Args:
 def learner(args: Args, *arguments: object) -> list[str]:
     script, *_ = VARIANTS.get(args.algorithm, (args.algorithm,))
     command = [sys.executable, str(ROOT / f"{script}.py"), *map(str, arguments)]
+    if args.device:
+        command += ["--device", args.device]
     if args.jobs > 1:
         command += ["--threads", str(max(1, len(os.sched_getaffinity(0)) // args.jobs))]
     return command
@@ -132,41 +140,59 @@ def trained(folder: Path) -> bool:
     return int(done) >= json.loads((folder / "args.json").read_text())["iterations"]
 
 
+def call(args: Args, folder: Path, *arguments: object) -> str | None:
+    """What a learner prints, which output.txt keeps; None if it failed or if the time was up, which lets it save."""
+    with (folder / "output.txt").open("a+") as output:
+        before = output.seek(0, os.SEEK_END)
+        process = subprocess.Popen(learner(args, *arguments), stdout=output, stderr=output)
+        try:
+            process.wait(None if args.stop_at == float("inf") else max(0.0, args.stop_at - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGTERM)
+            process.wait()
+        output.seek(before)
+        return output.read() if process.returncode == 0 else None
+
+
 def train(args: Args, env: str, seed: int) -> None:
     """One run from where it stands to its evaluation; `evaluation.json` marks it as finished."""
-    folder = run_dir(args, env, seed)
+    folder, name = run_dir(args, env, seed), f"{args.algorithm}, {env}, seed {seed}"
+    checkpoint = folder / "checkpoint.pt"
     if (folder / "evaluation.json").exists():
-        print(f"{args.algorithm}, {env}, seed {seed}: finished before", flush=True)
+        print(f"{name}: finished before", flush=True)
+        return
+    if time.monotonic() >= args.stop_at:
         return
     folder.mkdir(parents=True, exist_ok=True)
-    checkpoint = folder / "checkpoint.pt"
     _, *flags = VARIANTS.get(args.algorithm, (args.algorithm,))
     start = ["--env", env, "--seed", seed, "--run-dir", folder, *flags]
     if checkpoint.exists():
         start = ["--resume", checkpoint]
-    if not trained(folder):
-        with (folder / "output.txt").open("a") as output:
-            command = learner(args, *start, "--quiet", *args.arguments)
-            if subprocess.run(command, stdout=output, stderr=output).returncode != 0:
-                print(f"{args.algorithm}, {env}, seed {seed}: failed or interrupted, see {output.name}", flush=True)
-                return
+    if not trained(folder) and call(args, folder, *start, "--quiet", *args.arguments) is None:
+        print(f"{name}: stopped or failed, see {folder / 'output.txt'}", flush=True)
+        return
     substeps = json.loads((folder / "args.json").read_text())["substeps"] or diffsim.TASKS[env].substeps
-    returns = {}
+    evaluation = {"substeps": substeps, "finer_substeps": args.finer * substeps}
     for key, count in (("own", substeps), ("finer", args.finer * substeps)):
-        command = learner(args, "--evaluate", checkpoint, "--substeps", count)
-        text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        if (text := call(args, folder, "--evaluate", checkpoint, "--substeps", count)) is None:
+            print(f"{name}: not evaluated, see {folder / 'output.txt'}", flush=True)
+            return
         found = re.search(r"return median (-?[\d.]+)", text)
         if not found:
-            raise RuntimeError(f"no 'return median <number>' in the output of {shlex.join(command)}: {text}")
-        returns[key] = float(found[1])
-    evaluation = {"substeps": substeps, "finer_substeps": args.finer * substeps, **returns}
+            raise RuntimeError(f"no 'return median <number>' in {folder / 'output.txt'}")
+        evaluation[key] = float(found[1])
     (folder / "evaluation.json").write_text(json.dumps(evaluation))
-    print(f"{args.algorithm}, {env}, seed {seed}: {evaluation}", flush=True)
+    print(f"{name}: {evaluation}", flush=True)
 
 
 # Collecting -----------------------------------------------------------------------------------------------------------
 
 Curve = dict[str, np.ndarray]
+
+
+def published_by(algorithm: str) -> tuple[str, dict[str, int]]:
+    """Whose published returns a learner is held against, and they."""
+    return ("PPO", PUBLISHED_PPO) if algorithm == "ppo_baseline" else ("SHAC", PUBLISHED)
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -197,39 +223,44 @@ def subsample(rows: list[dict[str, str]], target: float) -> list[dict[str, str]]
 
 
 def collect(args: Args, env: str) -> dict[str, Any] | None:
-    """Writes the task's csv and returns its row of the summary; None where there is no run."""
-    points, final, finer, passed, substeps = [], [], [], {t: [] for t in THRESHOLDS.get(env, ())}, ""
-    seeds = []
+    """Writes the task's csv, of all its runs, and returns its row of the summary, of those that have finished."""
+    points, seeds, final, finer, seconds, substeps = [], [], [], [], [], ""
+    passed: dict[float, list[float]] = {t: [] for t in THRESHOLDS.get(env, ())}
     for folder in sorted((args.runs / args.algorithm).glob(f"{env}__*"), key=lambda p: int(p.name.split("__")[1])):
-        if not (folder / "evaluation.json").exists():
+        seed, path = folder.name.split("__")[1], folder / "progress.csv"
+        progress = read_csv(path) if path.is_file() else []
+        if not any(row["return"] for row in progress):
             continue
-        seed, progress = folder.name.split("__")[1], read_csv(folder / "progress.csv")
-        seeds.append(seed)
         points += [
             {"seed": seed} | {c: short(row[c]) for c in COLUMNS}
             for row in subsample(progress, TARGETS.get(env, float("inf")))
         ]
+        if not (folder / "evaluation.json").exists():
+            continue
         evaluation = json.loads((folder / "evaluation.json").read_text())
+        seeds.append(seed)
         final.append(evaluation["own"])
         finer.append(evaluation["finer"])
+        seconds.append(float(progress[-1]["seconds"]))
         substeps = f"{evaluation['substeps']} / {evaluation['finer_substeps']}"
-        for threshold, seconds in passed.items():
-            times = [number(r["seconds"]) for r in progress if r["return"] and float(r["return"]) >= threshold]
-            seconds.append(times[0] if times else float("inf"))
-    if not points:
+        for threshold, times in passed.items():
+            at = (float(r["seconds"]) for r in progress if r["return"] and float(r["return"]) >= threshold)
+            times.append(next(at, float("inf")))
+    if points:
+        write_csv(args.docs / "results" / f"{args.algorithm}_{env}.csv", points)
+    if not seeds:
         return None
-    write_csv(args.docs / "results" / f"{args.algorithm}_{env}.csv", points)
-    last = {row["seed"]: row for row in points}.values()
     kept = median(finer) / median(final)
     if median(final) < 0:
         kept = 1 / kept
+    label, published = published_by(args.algorithm)
     return {
         "task": env,
         "seeds": " ".join(seeds),
         "return": f"{median(final):.0f}",
         "each seed": " ".join(f"{r:.0f}" for r in final),
-        "published SHAC": PUBLISHED.get(env, ""),
-        "training": f"{median(float(row['seconds']) for row in last):.0f} s",
+        f"published {label}": published.get(env, ""),
+        "training": f"{median(seconds):.0f} s",
         "return passes, median over seeds": "; ".join(
             f"{t} after {median(s):.0f} s" if median(s) < float("inf") else f"{t} not" for t, s in passed.items()
         ),
@@ -274,6 +305,7 @@ def median_curve(runs: list[Curve], x: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw(args: Args) -> None:
+    label, published = published_by(args.algorithm)
     paths = {env: args.docs / "results" / f"{args.algorithm}_{env}.csv" for env in diffsim.TASKS}
     tasks = {env: curves(path) for env, path in paths.items() if path.is_file()}
     figure, axes = plt.subplots(2, len(tasks), figsize=(3.4 * len(tasks), 5.2), squeeze=False, layout="constrained")
@@ -287,8 +319,8 @@ def draw(args: Args) -> None:
             if runs:
                 grid, middle = median_curve(runs, x)
                 axis.plot(scale * grid, middle, color="tab:blue", linewidth=2.2)
-            if env in PUBLISHED:
-                axis.axhline(PUBLISHED[env], color="0.3", linestyle="--", linewidth=1)
+            if env in published:
+                axis.axhline(published[env], color="0.3", linestyle="--", linewidth=1)
             axis.set_xlim(left=0)
             axis.set_xlabel(label)
             axis.grid(alpha=0.3)
@@ -296,7 +328,7 @@ def draw(args: Args) -> None:
         axes[0, column].set_title(env)
     for axis in axes[:, 0]:
         axis.set_ylabel("return of training episodes")
-    figure.suptitle(f"{args.algorithm}: each seed (thin), median (bold), published SHAC (dashed)", fontsize=10)
+    figure.suptitle(f"{args.algorithm}: each seed (thin), median (bold), published {label} (dashed)", fontsize=10)
     figure.savefig(args.docs / f"{args.algorithm}.png", dpi=110)
 
 
@@ -379,7 +411,8 @@ def table(args: Args, experiment: Experiment) -> list[dict[str, Any]]:
             if not (runs := results(args, algorithm, env)):
                 continue
             best = [np.max(run["return"]) for run in runs]
-            final = [run["eval_return"][~np.isnan(run["eval_return"])][-1] for run in runs]
+            evaluations = [run["eval_return"][~np.isnan(run["eval_return"])] for run in runs]
+            final = [values[-1] for values in evaluations if len(values)]
             steps, seconds = passing(runs, target)
             if algorithm == experiment.algorithms[0]:
                 reference = steps, seconds
@@ -387,7 +420,7 @@ def table(args: Args, experiment: Experiment) -> list[dict[str, Any]]:
             if reference and max(reference) < float("inf"):
                 ratio = " / ".join(f"{v / r:.3g}" for v, r in zip((steps, seconds), reference, strict=True))
                 ratio = "never" if steps == float("inf") else ratio
-            published = {"shac": PUBLISHED, "ppo_baseline": PUBLISHED_PPO}.get(algorithm, {})
+            published = published_by(algorithm)[1] if algorithm in ("shac", "ppo_baseline") else {}
             rows.append(
                 {
                     "task": env,
@@ -395,7 +428,7 @@ def table(args: Args, experiment: Experiment) -> list[dict[str, Any]]:
                     "seeds": len(runs),
                     "best return of training": f"{mean(best):.0f} ± {pstdev(best):.0f}",
                     "published": published.get(env, ""),
-                    "final policy, deterministic": f"{median(final):.0f}",
+                    "final policy, deterministic": f"{median(final):.0f}" if final else "",
                     "control steps": f"{median(run['control_steps'][-1] for run in runs):.3g}",
                     "training, s": f"{median(run['seconds'][-1] for run in runs):.0f}",
                     "return passed": target,
@@ -416,7 +449,7 @@ def time_breakdown(args: Args, env_name: str) -> dict[str, Any]:
     """Table 12: the parts of one iteration of SHAC, each captured and timed alone."""
     sys.path.insert(0, str(ROOT))
     shac = importlib.import_module("shac")
-    settings, _ = shac.parse(["--env", env_name, *args.arguments])
+    settings, _ = shac.parse(["--env", env_name, *(["--device", args.device] if args.device else []), *args.arguments])
     horizon, num_envs, gamma = settings.horizon, settings.num_envs, settings.gamma
     env = shac.make_env(settings, num_envs, horizon)
     actor, normalise = shac.build(settings, env)
@@ -458,7 +491,8 @@ def write_page(args: Args) -> None:
     """docs/results/experiments.md and the pictures, from the csv files that there are."""
     text = "Written by `python benchmarks/learning.py --experiment <name>` from the csv files beside it.\n"
     for name, experiment in EXPERIMENTS.items():
-        if not (rows := table(args, experiment)):
+        rows = table(args, experiment)
+        if len({row["learner"] for row in rows}) < 2:
             continue
         text += f"\n## {experiment.title}\n\n{markdown(rows)}\n"
         if name == "horizon":
@@ -496,8 +530,10 @@ def main(args: Args) -> None:
         write_page(args)
         return
     tasks = [env for env in args.env if not experiment or env in experiment.tasks]
+    if args.time_limit is not None:
+        args = dataclasses.replace(args, stop_at=time.monotonic() + args.time_limit)
     parts = [dataclasses.replace(args, algorithm=algorithm) for algorithm in algorithms]
-    if not args.collect_only:
+    if not args.draw_only:
         pool = ThreadPoolExecutor(args.jobs)
         try:
             runs = [(part, env, seed) for seed in args.seeds for env in tasks for part in parts]
@@ -509,9 +545,9 @@ def main(args: Args) -> None:
         if rows := [row for env in tasks if (row := collect(part, env))]:
             summarise(part, rows)
         elif not list((args.docs / "results").glob(f"{part.algorithm}_*.csv")):
+            print(f"no episode finished yet in {args.runs / part.algorithm}", file=sys.stderr)
             if not experiment:
-                fail(f"no finished run in {args.runs / part.algorithm}")
-            print(f"no finished run in {args.runs / part.algorithm}", file=sys.stderr)
+                sys.exit(0 if time.monotonic() >= part.stop_at else 2)
     if experiment:
         write_page(args)
     else:
