@@ -21,7 +21,7 @@ import shac  # noqa: E402
 @pytest.fixture
 def snapshot() -> landscape.Snapshot:
     torch.manual_seed(0)
-    settings = shac.Args(actor_hidden=(16,), critic_hidden=(16,))
+    settings = shac.Args(device="cpu", actor_hidden=(16,), critic_hidden=(16,))
     env = diffsim.make("ant", num_envs=3, seed=0)
     actor, normalise = shac.build(settings, env)
     normalise.update(torch.randn(100, 37) + 1.0)
@@ -29,7 +29,7 @@ def snapshot() -> landscape.Snapshot:
 
 
 def test_losses_and_gradients_of_variations(snapshot: landscape.Snapshot, tmp_path: Path) -> None:
-    args = landscape.Args(env=("ant",), trajectories=3, warmup=2, batch=6, runs=tmp_path, docs=tmp_path)
+    args = landscape.Args(env=("ant",), device="cpu", trajectories=3, warmup=2, batch=6, runs=tmp_path, docs=tmp_path)
     _, start = landscape.start_states(args, "ant", snapshot)
     directions, horizon = landscape.random_directions(args, snapshot), 8
     assert all(
