@@ -10,8 +10,8 @@ mean reward of an episode of --horizon steps up to its end (a fallen robot gains
 of 32 steps from states that the policy visits. Every variation of the policy meets the same start states and the same
 noise, all at once in one batch. The last line is a short look.
 
-Writes docs/results/landscape_*.csv, docs/landscape_*.png and the page docs/results/landscape.md. A csv that exists is
-kept: delete it to measure it anew.
+Writes docs/results/landscape_*.csv, docs/landscape_*.png and their part of the page docs/experiments.md. A csv that
+exists is kept: delete it to measure it anew.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = ("gradients", "weight", "surface")
 BEGIN = time.perf_counter()
 sys.path.insert(0, str(ROOT))
+from learning import fill, write_csv  # noqa: E402
+
 import shac  # noqa: E402
 
 
@@ -264,14 +266,6 @@ def random_directions(args: Args, snapshot: Snapshot) -> dict[str, Tensor]:
 # Figures --------------------------------------------------------------------------------------------------------------
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def read_csv(path: Path) -> dict[str, np.ndarray]:
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -382,18 +376,18 @@ def draw(args: Args, task: str) -> str:
     figure.savefig(args.docs / f"landscape_{task}_gradients.png", dpi=110)
     plt.close(figure)
 
-    text = f"\n## {task}\n\n| | local extrema along one weight | way up and down / range |\n|---|---|---|\n"
+    text = f"### {task}\n\n| | local extrema along one weight | way up and down / range |\n|---|---|---|\n"
     for name in ("bptt", "shac"):
         count, way = roughness(line[name])
         text += f"| {name} | {count} of {len(line['step']) - 2} | {way:.2f} |\n"
     correlation = np.corrcoef(difference[1:-1], line["shac_gradient"][1:-1])[0, 1]
     text += f"\nAnalytic against finite-difference gradient of SHAC along the weight: correlation {correlation:.3f}.\n"
-    text += f"\n![one weight](../landscape_{task}_weight.png)\n![surface](../landscape_{task}_surface.png)\n"
+    text += f"\n![one weight](landscape_{task}_weight.png)\n![surface](landscape_{task}_surface.png)\n"
     text += "\n| iteration | " + " | ".join(name for name in gradients if name != "iteration") + " |\n"
     text += "|---" * len(gradients) + "|\n"
     for row in zip(*gradients.values(), strict=True):
         text += "| " + " | ".join(f"{value:.4g}" for value in row) + " |\n"
-    return text + f"\nq: quantiles of the entries' sizes.\n\n![gradients](../landscape_{task}_gradients.png)\n"
+    return text + f"\nq: quantiles of the entries' sizes.\n\n![gradients](landscape_{task}_gradients.png)\n\n"
 
 
 def main(args: Args) -> None:
@@ -406,13 +400,9 @@ def main(args: Args) -> None:
             measure(args, task)
     except TimeUp:
         print("stopped by --time-limit: the same command goes on", flush=True)
-    text = "Written by `python benchmarks/landscape.py` from the csv files beside it.\n"
-    for task in diffsim.TASKS:
-        if all((args.docs / "results" / f"landscape_{task}_{name}.csv").is_file() for name in FILES):
-            text += draw(args, task)
-    (args.docs / "results").mkdir(parents=True, exist_ok=True)
-    (args.docs / "results" / "landscape.md").write_text(text)
-    print(text)
+    files = {task: [args.docs / "results" / f"landscape_{task}_{name}.csv" for name in FILES] for task in diffsim.TASKS}
+    if text := "".join(draw(args, task) for task, paths in files.items() if all(path.is_file() for path in paths)):
+        fill(args.docs / "experiments.md", "landscape", text)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,8 @@
     python benchmarks/learning.py --runs runs/short -- --iterations 50 what follows "--" goes to the learner
 
 Writes docs/results/{algorithm}_{env}.csv (about 100 points of each run), docs/results/{algorithm}_summary.csv,
-docs/results/{algorithm}.md and docs/{algorithm}.png; of experiments docs/{experiment}.png and the page of all of them,
-docs/results/experiments.md. An interrupted run is resumed from its checkpoint; its curve is drawn as far as it goes.
+docs/results/{algorithm}.md and docs/{algorithm}.png; of experiments docs/{experiment}.png and their parts of the page
+docs/experiments.md. An interrupted run is resumed from its checkpoint; its curve is drawn as far as it goes.
 """
 
 from __future__ import annotations
@@ -62,6 +62,9 @@ VARIANTS = {  # of a script: its flags
     "shac_no_critic": ("shac", "--no-critic"),
     "shac_general": ("shac", "--general-hyperparameters"),
     "shac_deterministic": ("shac", "--deterministic-policy"),
+    "shac_1024": ("shac", "--num-envs", "1024"),
+    "ppo_256": ("ppo_baseline", "--num-envs", "256", "--minibatch-size", "2048"),
+    "ppo_4096": ("ppo_baseline", "--num-envs", "4096", "--minibatch-size", "32768"),
     **{f"shac_h{h}": ("shac", "--horizon", str(h), "--num-envs", str(2048 // h)) for h in (4, 8, 16, 64, 128)},
 }
 
@@ -74,6 +77,11 @@ class Experiment(NamedTuple):
 
 EXPERIMENTS = {
     "comparison": Experiment("Figures 4 and 7: the learners", ("shac", "ppo_baseline", "bptt", "shac_no_critic")),
+    "environments": Experiment(
+        "SHAC and PPO at several numbers of environments",
+        ("shac", "shac_1024", "ppo_256", "ppo_baseline", "ppo_4096"),
+        ("ant", "humanoid"),
+    ),
     "horizon": Experiment(
         "Figure 6: short horizon length, 2,048 samples per iteration",
         ("shac", "shac_h4", "shac_h8", "shac_h16", "shac_h64", "shac_h128"),
@@ -91,8 +99,9 @@ TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid
 class Args:
     algorithm: str = "shac"
     """learner: a script in the repository's root, without .py, or a variant of one, e.g. shac_no_critic"""
-    experiment: Literal["comparison", "horizon", "general", "deterministic", "time"] | None = None
-    """several learners at once, drawn together: Figures 4 and 7, 6, 8 or 9 of the SHAC paper, or its Table 12"""
+    experiment: Literal["comparison", "environments", "horizon", "general", "deterministic", "time"] | None = None
+    """several learners at once, drawn together: Figures 4 and 7 of the SHAC paper, more of the same, its Figures 6, 8
+    and 9, or its Table 12"""
     env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
     """tasks"""
     seeds: tuple[int, ...] = (1, 2, 3)
@@ -283,6 +292,9 @@ def summarise(args: Args, rows: list[dict[str, Any]]) -> None:
     write_csv(path, merged)
     text = markdown(merged)
     (args.docs / "results" / f"{args.algorithm}.md").write_text(text)
+    page = args.docs / f"{args.algorithm.removesuffix('_baseline')}.md"
+    if page.is_file() and "<!-- results -->" in page.read_text():
+        fill(page, "results", text)
     print(text, end="")
 
 
@@ -431,6 +443,7 @@ def table(args: Args, experiment: Experiment) -> list[dict[str, Any]]:
                     "final policy, deterministic": f"{median(final):.0f}" if final else "",
                     "control steps": f"{median(run['control_steps'][-1] for run in runs):.3g}",
                     "training, s": f"{median(run['seconds'][-1] for run in runs):.0f}",
+                    "control steps / s": f"{median(run['control_steps'][-1] / run['seconds'][-1] for run in runs):.3g}",
                     "return passed": target,
                     "after control steps": f"{steps:.3g}" if steps < float("inf") else "never",
                     "after s": f"{seconds:.0f}" if seconds < float("inf") else "never",
@@ -487,27 +500,35 @@ def timed(function: Callable[[], Any], device: torch.device, warmup: int = 4, ca
     return (time.perf_counter() - begin) / calls
 
 
+def fill(page: Path, name: str, text: str) -> None:
+    """Puts text between the page's comments <!-- name --> and <!-- /name -->, at its end if it does not have them."""
+    begin, end = f"<!-- {name} -->\n", f"<!-- /{name} -->\n"
+    before = page.read_text() if page.is_file() else ""
+    if begin not in before:
+        before += begin + end
+    head, _, tail = before.partition(begin)
+    page.write_text(f"{head}{begin}{text}{end}{tail.partition(end)[2]}")
+    print(text)
+
+
 def write_page(args: Args) -> None:
-    """docs/results/experiments.md and the pictures, from the csv files that there are."""
-    text = "Written by `python benchmarks/learning.py --experiment <name>` from the csv files beside it.\n"
+    """The pictures and tables of docs/experiments.md, of the csv files that there are."""
+    page = args.docs / "experiments.md"
     for name, experiment in EXPERIMENTS.items():
         rows = table(args, experiment)
         if len({row["learner"] for row in rows}) < 2:
             continue
-        text += f"\n## {experiment.title}\n\n{markdown(rows)}\n"
+        text = f"{markdown(rows)}\n![{experiment.title}]({name}.png)\n"
         if name == "horizon":
             draw_horizon(args)
         else:
             draw_experiment(args, name)
-        text += f"![{experiment.title}](../{name}.png)\n"
         if name == "comparison":
             draw_experiment(args, name, "_full", full=True)
-            text += f"![{experiment.title}, to their ends](../{name}_full.png)\n"
+            text += f"\n![{experiment.title}, to their ends]({name}_full.png)\n"
+        fill(page, name, text)
     if (args.docs / "results" / "time.csv").is_file():
-        rows = read_csv(args.docs / "results" / "time.csv")
-        text += f"\n## Table 12: parts of an iteration of SHAC\n\n{markdown(rows)}"
-    (args.docs / "results" / "experiments.md").write_text(text)
-    print(text, end="")
+        fill(page, "time", markdown(read_csv(args.docs / "results" / "time.csv")))
 
 
 def fail(message: str) -> NoReturn:

@@ -49,10 +49,19 @@ def test_page_compares_steps_and_seconds(tmp_path: Path) -> None:
     assert steps == pytest.approx(2501 * 10 / 501, rel=1e-2) and seconds == pytest.approx(0.1 * 2501 / 501, rel=1e-2)
     assert rows["bptt"][ratio] == "never" and rows["bptt"]["final policy, deterministic"] == ""
     assert rows["ppo_baseline"]["best return of training"] == "5998 ± 0" and rows["ppo_baseline"]["published"] == 6605
-    assert "| ppo_baseline | 2 | 5998 ± 0 |" in (docs / "results" / "experiments.md").read_text()
+    assert "| ppo_baseline | 2 | 5998 ± 0 |" in (docs / "experiments.md").read_text()
     for name in ("comparison.png", "comparison_full.png", "results/bptt_ant.csv", "results/ppo_baseline.md"):
         assert (docs / name).stat().st_size > 0
     assert not (docs / "results" / "bptt.md").exists()  # a summary is of finished runs
+
+
+def test_only_its_own_part_of_a_page_is_filled(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- a -->\nold\n<!-- /a -->\nbetween\n<!-- b -->\n<!-- /b -->\nafter\n")
+    for name, text in (("a", "new\n"), ("b", "b\n"), ("a", "newer\n"), ("c", "c\n")):
+        learning.fill(page, name, text)
+    parts = "before\n<!-- a -->\nnewer\n<!-- /a -->\nbetween\n<!-- b -->\nb\n<!-- /b -->\nafter\n"
+    assert page.read_text() == parts + "<!-- c -->\nc\n<!-- /c -->\n"
 
 
 def test_a_stopped_call_goes_on_where_it_was(tmp_path: Path) -> None:
