@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 import torch
+from learners import ROOT, assert_same
 
-ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import shac  # noqa: E402
 
@@ -47,6 +47,17 @@ torch.save(actors[0].state_dict(), f"{sys.argv[1]}_{distributed.rank()}.pt")
 """
 # Eight windows of cartpole: the last one holds time-outs and resets.
 SETTING = "--env cartpole --num-envs 4 --iterations 8 --eval-every 0 --eval-episodes 1 --quiet --threads 1 --device cpu"
+
+
+# Saves on every rank.
+SAVER = """
+import importlib, sys, torch
+from diffsim import distributed
+from diffsim.run import Run
+
+Run.save = lambda run, checkpoint: torch.save(checkpoint, run.directory / f"rank{distributed.rank()}.pt")
+importlib.import_module(sys.argv[1]).main(sys.argv[2:])
+"""
 
 
 def train(size: int, directory: Path, *arguments: object) -> dict[str, Any]:
@@ -90,6 +101,22 @@ def test_weights_stay_equal_across_ranks(directory: Path, two_ranks: dict[str, A
     for name, value in two_ranks["actor"].items():
         assert torch.equal(first[name], value) and torch.equal(second[name], value)
     starts = [rank["env"]["qpos"] for rank in two_ranks["ranks"]]
+    assert len(starts) == 2 and not torch.equal(*starts)
+
+
+@pytest.mark.parametrize("learner", ["bptt", "ppo_baseline"])
+def test_ranks_of_other_learners_share_weights_and_statistics(learner: str, tmp_path: Path) -> None:
+    (tmp_path / "saver.py").write_text(SAVER)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    command += [str(tmp_path / "saver.py"), learner, *SETTING.split(), "--horizon", "32", "--run-dir", str(tmp_path)]
+    subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, timeout=300)
+    first, second = load(tmp_path / "rank0.pt"), load(tmp_path / "rank1.pt")
+    shared = {"bptt": ("actor", "optimizer"), "ppo_baseline": ("policy", "normalise", "normalise_return", "optimizer")}
+    for part in shared[learner]:
+        assert_same(first[part], second[part])
+    assert_same(first["episodes"], second["episodes"])
+    assert first["episodes"][0][0] == 4  # two of each rank
+    starts = [rank["env"]["qpos"] for rank in first["ranks"]]
     assert len(starts) == 2 and not torch.equal(*starts)
 
 
