@@ -66,8 +66,8 @@ class Args:
     """discount factor"""
     gae_lambda: float = 0.95
     """lambda of the advantage estimation"""
-    epochs: int = 5
-    """passes over a rollout's samples"""
+    epochs: int | None = None
+    """passes over a rollout's samples; None: per task"""
     minibatch_size: int | None = None
     """samples of a minibatch; None: per task and device"""
     clip: float = 0.2
@@ -103,15 +103,16 @@ class Args:
 
 # Table 2 of the SHAC paper; networks, iterations, hopper and half_cheetah: its authors' released settings.
 # fmt: off
-COLUMNS = ("hidden", "num_envs", "horizon", "minibatch_size", "iterations")
+COLUMNS = ("hidden", "num_envs", "horizon", "minibatch_size", "epochs", "iterations")
 PER_TASK = {
-    "cartpole":     ((64, 64),         32, 240,  1920,  500),
-    "hopper":       ((128, 64, 32),  1024,  32,  8192, 5000),
-    "half_cheetah": ((128, 64, 32),  1024,  32,  8192, 5000),
-    "ant":          ((128, 64, 32),  2048,  32, 16384, 5000),
-    "humanoid":     ((256, 128, 64), 1024,  32,  8192, 5000),
+    "cartpole":     ((64, 64),         32, 240,  1920, 5,   500),
+    "hopper":       ((128, 64, 32),  1024,  32,  8192, 5,  5000),
+    "half_cheetah": ((128, 64, 32),  1024,  32,  8192, 5,  5000),
+    "ant":          ((128, 64, 32),  2048,  32, 16384, 5,  5000),
+    "humanoid":     ((256, 128, 64), 1024,  32,  8192, 5,  5000),
+    "humanoid_mtu": ((512, 512, 256), 1024, 32,  8192, 6, 20000),
 }
-GENERAL =           ((256, 128, 64), 1024,  32,  8192, 5000)  # of a task that is not in the table
+GENERAL =           ((256, 128, 64), 1024,  32,  8192, 5,  5000)  # of a task that is not in the table
 
 PROGRESS = {  # scalar of tensorboard: column of progress.csv, beside iteration, control_steps and seconds (of training)
     "charts/episodic_return": "return", "charts/episodic_length": "length",
@@ -170,8 +171,8 @@ class Normaliser(nn.Module):
         x = x.reshape(-1, *self.mean.shape)
         var, mean = moments(x)
         total, delta = self.count + len(x) * distributed.size(), mean - self.mean
-        old = (self.count / total).to(x.dtype)
-        new = 1 - old
+        share = self.count / total
+        old, new = share.to(x.dtype), (1 - share).to(x.dtype)
         self.var.copy_(old * self.var + new * var + old * new * delta**2)
         self.mean.add_(new * delta)
         self.count.copy_(total)
