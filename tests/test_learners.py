@@ -9,6 +9,7 @@ import json
 import signal
 import subprocess
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,6 +18,7 @@ import pytest
 import torch
 from learners import ROOT, assert_same, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils._python_dispatch import TorchDispatchMode
 
 sys.path.insert(0, str(ROOT))
 
@@ -137,6 +139,43 @@ def test_files_of_a_run(learner: ModuleType, trained: Path) -> None:
     assert expected <= set(events.Tags()["scalars"])
     assert [event.step for event in events.Scalars("grad/norm")] == [3 * 32 * k for k in range(1, 11)]
     assert not list(trained.glob("*.tmp"))
+
+
+class Waits(TorchDispatchMode):
+    """Notes where in the project a value is asked for on the host: a GPU would be waited for, a capture would fail."""
+
+    asking = {torch.ops.aten._local_scalar_dense, torch.ops.aten.nonzero, torch.ops.aten.equal}
+
+    def __init__(self, places: list[str]) -> None:
+        super().__init__()
+        self.places = places
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function.overloadpacket in self.asking:
+            stack = [frame for frame in traceback.extract_stack()[:-1] if frame.filename.startswith(str(ROOT))]
+            self.places.append(f"{Path(stack[-1].filename).name}: {stack[-1].line}")
+        return function(*args, **(kwargs or {}))
+
+
+def test_nothing_captured_waits_for_the_device(
+    learner: ModuleType, small: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captured, places = [], []
+
+    def capture(function: Any, device: Any, env: Any = None) -> Any:
+        captured.append(function)
+
+        def call() -> Any:
+            with Waits(places):
+                return function()
+
+        return call
+
+    monkeypatch.setattr(learner.graph, "capture", capture)
+    run(learner, tmp_path, *small, "--stop-after", 3)
+    assert len(captured) == {"bptt": 1, "ppo_baseline": 2}[learner.__name__]
+    only_on_the_cpu = 'if self.device.type == "cpu" and bool(torch.isnan(action.detach()).any()):'
+    assert set(places) == {f"env.py: {only_on_the_cpu}"}  # seen, so the rest would be seen
 
 
 def test_evaluate(learner: ModuleType, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
