@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import dataclasses
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -65,17 +66,17 @@ def test_only_its_own_part_of_a_page_is_filled(tmp_path: Path) -> None:
 
 
 def test_a_stopped_call_goes_on_where_it_was(tmp_path: Path) -> None:
-    arguments = [sys.executable, str(ROOT / "benchmarks" / "learning.py"), "--algorithm", "bptt", "--env", "cartpole"]
-    arguments += ["--seeds", "1", "--device", "cpu", "--runs", str(tmp_path), "--docs", str(tmp_path / "docs")]
-    learner = ["--", "--num-envs", "2", "--horizon", "8", "--eval-every", "0", "--eval-episodes", "1"]
-    limited = [*arguments, "--time-limit", "12", *learner, "--iterations", "100000"]
-    subprocess.run(limited, check=True, timeout=60, capture_output=True)
+    args = learning.Args(algorithm="bptt", env=("cartpole",), seeds=(1,), device="cpu", runs=tmp_path, docs=tmp_path)
+    learner = "--num-envs", "2", "--horizon", "8", "--eval-every", "0", "--eval-episodes", "1", "--iterations"
+    with contextlib.suppress(SystemExit):  # where not one episode was finished in time
+        learning.main(dataclasses.replace(args, time_limit=12, arguments=(*learner, "100000")))
     folder = tmp_path / "bptt" / "cartpole__1"
     with (folder / "progress.csv").open() as file:
         done = len(list(csv.DictReader(file)))
     assert 0 < done < 100000 and not (folder / "evaluation.json").exists()
-    subprocess.run([*arguments, *learner, "--iterations", str(done + 3)], check=True, timeout=60, capture_output=True)
+    learning.main(dataclasses.replace(args, arguments=(*learner, str(done + 30))))
     with (folder / "progress.csv").open() as file:
-        assert [int(row["iteration"]) for row in csv.DictReader(file)] == list(range(1, done + 4))
+        assert [int(row["iteration"]) for row in csv.DictReader(file)] == list(range(1, done + 31))
     evaluation = json.loads((folder / "evaluation.json").read_text())
     assert evaluation["substeps"] == 4 and evaluation["finer_substeps"] == 16 and evaluation["own"] < 0
+    assert len(learning.read_csv(tmp_path / "results" / "bptt_summary.csv")) == 1
