@@ -31,7 +31,7 @@ from diffsim.run import EpisodeStatistics, Mark, Run, fail, flag, load_checkpoin
 @dataclass
 class Args:
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
-    """task: cartpole, hopper, half_cheetah, ant or humanoid"""
+    """task: cartpole, hopper, half_cheetah, ant, humanoid or humanoid_mtu"""
     seed: int = 1
     """seed of the networks, the policy's noise and the environments' resets"""
     device: str | None = None
