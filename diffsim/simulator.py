@@ -14,6 +14,7 @@ import warp as wp
 from diffsim.bridge import ControlStep
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
+from diffsim.kernels.lanes import divide
 from diffsim.kernels.model import model_of, shape_of
 from diffsim.scene import Scene
 
@@ -22,6 +23,9 @@ WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
 # Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
 # thread (about 1 ms) it saves nothing. A whole iteration of 64 ants takes 0.22 s with two threads, 0.26 s with one.
 MIN_WORK_PER_THREAD = 4_000
+# Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
+MAX_THREADS = 65_536
+MUSCLE_SHARERS = 4
 
 
 class Simulator:
@@ -42,6 +46,8 @@ class Simulator:
         device: "cpu" or a CUDA device.
         dtype: torch.float32 or torch.float64.
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
+        lanes: GPU threads per environment, and how many of them have the same limbs (kernels/lanes.py), powers of two,
+            at most 16; default as measured to be fastest.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
@@ -65,6 +71,7 @@ class Simulator:
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         threads: int | None = None,
+        lanes: tuple[int, int] | None = None,
     ) -> None:
         for name, value in (("num_envs", num_envs), ("substeps", substeps), ("horizon", horizon), ("threads", threads)):
             if value is not None and (not isinstance(value, int) or value < 1):
@@ -85,9 +92,10 @@ class Simulator:
         self.seconds = {"forward": 0.0, "backward": 0.0}
 
         real, cuda = WARP_DTYPE[dtype], self.device.type == "cuda"
-        shape = shape_of(scene, real, integrator == "implicit", env_last=cuda)
+        lanes, sharers = (lanes or default_lanes(scene, num_envs)) if cuda else (1, 1)
+        shape = shape_of(scene, real, integrator == "implicit", env_last=cuda, lanes=lanes, sharers=sharers)
         self._kernels = {"forward": forward_kernel(shape), "backward": backward_kernel(shape)}
-        self._model = model_of(scene, real, str(self.device))
+        self._model = model_of(scene, real, str(self.device), lanes, sharers)
         self._commands: dict[tuple[str, int, int], wp.Launch] = {}
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
         self._block_dim = 8 if num_envs <= 256 else 32
@@ -208,7 +216,7 @@ class Simulator:
             first, count = self._chunks[chunk]
             self._commands[key] = wp.launch(
                 self._kernels[kernel],
-                dim=count,
+                dim=count * self._shape.lanes,
                 inputs=self._arguments(kernel, slot, first),
                 device=str(self.device),
                 block_dim=self._block_dim,
@@ -237,6 +245,13 @@ class Simulator:
         n, widths = self.num_envs, (self.nq, self.nv, self.nv, self._shape.nfactor)
         sizes = [(count, k, n) if self._shape.env_last else (count, n, k) for k in widths]
         return [wp.zeros(size, dtype=WARP_DTYPE[self.dtype], device=str(self.device)) for size in sizes]
+
+
+def default_lanes(scene: Scene, num_envs: int) -> tuple[int, int]:
+    """GPU threads per environment, and how many of them share limbs: as measured in docs/performance.md."""
+    groups = min((1, 2, 4), key=lambda lanes: (divide(scene, lanes).slots, lanes))
+    sharers = MUSCLE_SHARERS if "muscle" in scene.features else 1
+    return (groups * sharers, sharers) if groups * sharers * num_envs <= MAX_THREADS else (1, 1)
 
 
 def available_cores() -> int:

@@ -16,7 +16,7 @@ from diffsim import graph
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.model import shape_of
-from diffsim.simulator import Simulator
+from diffsim.simulator import Simulator, default_lanes
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import bptt  # noqa: E402
@@ -31,7 +31,7 @@ HORIZON = 32
 def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> None:
     """And they hold no code for what the scene lacks."""
     scene = task_scene(name)
-    shape = shape_of(scene, wp.float32, implicit=False, env_last=True)
+    shape = shape_of(scene, wp.float32, False, True, *default_lanes(scene, 64))
     functions = {"add_pull": "muscle", "measure": "hill", "place_balls": "ball", "sphere_state": "contact"}
     for kernel in (forward_kernel(shape), backward_kernel(shape)):
         directory = tmp_path / kernel.key
@@ -43,7 +43,7 @@ def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> Non
             assert (function in code) == (feature in scene.features), function
 
 
-def episode(name: str, device: str) -> dict[str, torch.Tensor]:
+def episode(name: str, device: str, lanes: tuple[int, int] | None = None) -> dict[str, torch.Tensor]:
     """The state after 32 control steps of random actions, and the gradients of a random function of it."""
     n, kwargs = 8, dict(dtype=torch.float64)
     start = diffsim.make(name, num_envs=n, seed=0, **kwargs)
@@ -51,7 +51,9 @@ def episode(name: str, device: str) -> dict[str, torch.Tensor]:
     actions = torch.rand(HORIZON, n, start.scene.nu, generator=generator, **kwargs) * 2 - 1
     weights = [torch.randn(n, width, generator=generator, **kwargs) for width in (start.scene.nq, start.scene.nv)]
     inputs = [x.to(device).detach().requires_grad_() for x in (start.qpos, start.qvel, actions)]
-    sim = Simulator(start.scene, n, start.control_dt, start.task.substeps, HORIZON, device=device, **kwargs)
+    sim = Simulator(
+        start.scene, n, start.control_dt, start.task.substeps, HORIZON, device=device, lanes=lanes, **kwargs
+    )
     qpos, qvel, steps = inputs
     for action in steps:
         qpos, qvel = sim.step(qpos, qvel, action)
@@ -67,10 +69,12 @@ def episode(name: str, device: str) -> dict[str, torch.Tensor]:
 @cuda
 @pytest.mark.parametrize("name", diffsim.TASKS)
 def test_gpu_agrees_with_cpu(name: str) -> None:
-    ours, reference = episode(name, "cuda"), episode(name, "cpu")
-    for key, tolerance in (("qpos", 1e-9), ("qvel", 1e-9), ("d0", 1e-8), ("d1", 1e-8), ("d2", 1e-8)):
-        error = (ours[key] - reference[key]).norm() / reference[key].norm()
-        assert error < tolerance, (key, error)
+    reference = episode(name, "cpu")
+    for lanes in [(1, 1), (2, 1), (4, 1), (8, 4)]:
+        ours = episode(name, "cuda", lanes)
+        for key, tolerance in (("qpos", 1e-9), ("qvel", 1e-9), ("d0", 1e-8), ("d1", 1e-8), ("d2", 1e-8)):
+            error = (ours[key] - reference[key]).norm() / reference[key].norm()
+            assert error < tolerance, (lanes, key, error)
 
 
 def windows(name: str, captured: bool, poison: int | None = None) -> list[torch.Tensor]:

@@ -17,12 +17,14 @@ The adjoint of a rotation lives in the body's tangent space; quaternions appear 
 """
 
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.lanes import lane_sums
 from diffsim.kernels.model import Shape, module_options, types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
@@ -32,9 +34,10 @@ from diffsim.kernels.spatial import spatial
 def backward_kernel(shape: Shape) -> wp.Kernel:
     t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
     T, vec3, vec6, mat3, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
+    vec6s = wp.array(dtype=vec6)
     join, force_at, point_velocity, momentum = sp.join, sp.force_at, sp.point_velocity, sp.momentum
     exp_quat, to_tangent, from_tangent = sp.exp_quat, sp.to_tangent, sp.from_tangent
-    load, place_links, sphere_state = kin.load, kin.place_links, kin.sphere_state
+    load, link_of, place_links, sphere_state = kin.load, kin.link_of, kin.place_links, kin.sphere_state
     qpos_adr, load_quat, load_quat_row, place_balls = kin.qpos_adr, kin.load_quat, kin.load_quat_row, kin.place_balls
     contact = contact_law(T)
     touches, contact_force = contact.touches, contact.contact_force
@@ -43,11 +46,13 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     measure, hill, add_pull_adjoint = muscle.measure, muscle.hill, muscle.add_pull_adjoint
     uses = shape.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
-    NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
+    NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
     MUSCLE, HILL = "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1
     VADR, NBALL, BALL_SPRING = shape.dof0 - 1, shape.nball, shape.nball > 0 and "stiffness" in uses
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
+    LANES, SHARERS, TRUNK, SLOTS = shape.lanes, shape.sharers, shape.trunk, shape.slots
+    sums = lane_sums(T, LANES, SHARERS)
 
     @wp.func
     def exp_adjoint(r: vec3, g: vec3):
@@ -96,19 +101,19 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         return v + h * vec3(load(ck_a, row, k, e), load(ck_a, row, k + 1, e), load(ck_a, row, k + 2, e))
 
     @wp.func
-    def link_adjoint(m: Model, i: int, R: mat3, x: vec3, V: vec6, A: vec6, W: vec6, height: T, h: T, theta: T):
+    def link_adjoint(m: Model, k: int, R: mat3, x: vec3, V: vec6, A: vec6, W: vec6, height: T, h: T, theta: T):
         """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position."""
-        com = x + R * m.com[i]
-        inertia = R * m.inertia[i] * wp.transpose(R)
-        Iv = momentum(m.mass[i], com, inertia, V)
-        adj_a = momentum(m.mass[i], com, inertia, W)
-        adj_w = momentum(m.mass[i], com, inertia, A) + wp.spatial_cross_dual(V, Iv)
-        adj_v = momentum(m.mass[i], com, inertia, wp.spatial_cross(W, V))
+        com = x + R * m.com[k]
+        inertia = R * m.inertia[k] * wp.transpose(R)
+        Iv = momentum(m.mass[k], com, inertia, V)
+        adj_a = momentum(m.mass[k], com, inertia, W)
+        adj_w = momentum(m.mass[k], com, inertia, A) + wp.spatial_cross_dual(V, Iv)
+        adj_v = momentum(m.mass[k], com, inertia, wp.spatial_cross(W, V))
         adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
         adj_p = vec6()
         if wp.static(CONTACT):
-            for k in range(m.contact_begin[i], m.contact_begin[i + 1]):
-                p, v, depth = sphere_state(m, k, R, x, V, height, h, theta)
+            for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+                p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)
                 if touches(m, depth, v):
                     fc = contact_force(m, depth, v)
                     f = vec3(fc[0], fc[1], fc[2])
@@ -136,10 +141,23 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                     adj_w = adj_w - wrench
                     adj_v = adj_v + G
                     # The lowest point follows the sphere's centre, not the body's material.
-                    centre = p + vec3(T(0.0), T(0.0), m.contact_radius[k])
+                    centre = p + vec3(T(0.0), T(0.0), m.contact_radius[c])
                     adj_p = adj_p + force_at(centre, g_p)
                     adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
         return adj_a, adj_v, adj_w, adj_p
+
+    def summed(over: SimpleNamespace, last: int) -> wp.Function:
+        add_vec6 = over.add_vec6
+
+        @wp.func
+        def add_up(a: vec6s):
+            begin = int(0)
+            for i in range(begin, last + 1):
+                a[i] = add_vec6(a[i])
+
+        return add_up
+
+    add_sharers, add_limbs, add = summed(sums.sharers, SLOTS - 1), summed(sums.limbs, TRUNK), sums.all.add
 
     @wp.kernel(module="unique", module_options=module_options(shape))
     def backward(
@@ -168,31 +186,39 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         g_ctrl: t.array2,
         nonfinite_gradients: wp.array(dtype=int),
     ):
-        e = first + wp.tid()
-        R = wp.zeros(shape=NL, dtype=mat3)
-        x = wp.zeros(shape=NL, dtype=vec3)
-        S = wp.zeros(shape=NL, dtype=vec6)
-        V = wp.zeros(shape=NL, dtype=vec6)
-        A = wp.zeros(shape=NL, dtype=vec6)
-        W = wp.zeros(shape=NL, dtype=vec6)
-        adj_a = wp.zeros(shape=NL, dtype=vec6)
-        adj_v = wp.zeros(shape=NL, dtype=vec6)
-        adj_w = wp.zeros(shape=NL, dtype=vec6)
-        adj_p = wp.zeros(shape=NL, dtype=vec6)
-        q = wp.zeros(shape=NL, dtype=T)
-        qd = wp.zeros(shape=NL, dtype=T)
-        gq = wp.zeros(shape=NL, dtype=T)
-        gqd = wp.zeros(shape=NL, dtype=T)
-        gtau = wp.zeros(shape=NL, dtype=T)
-        lam = wp.zeros(shape=NL, dtype=T)
-        u = wp.zeros(shape=NL, dtype=T)
-        for i in range(1, NL):
-            gq[i] = g_qpos_out[e, qpos_adr(m, i)]
-            gqd[i] = g_qvel_out[e, VADR + i]
+        tid = wp.tid()
+        e = first + tid / LANES
+        lane = tid % LANES
+        slots = int(SLOTS)
+        n = int(SLOTS)
+        at = lane * SLOTS
+        if wp.static(LANES > 1):
+            n = m.count[lane]
+        R = wp.zeros(shape=SLOTS, dtype=mat3)
+        x = wp.zeros(shape=SLOTS, dtype=vec3)
+        S = wp.zeros(shape=SLOTS, dtype=vec6)
+        V = wp.zeros(shape=SLOTS, dtype=vec6)
+        A = wp.zeros(shape=SLOTS, dtype=vec6)
+        W = wp.zeros(shape=SLOTS, dtype=vec6)
+        adj_a = wp.zeros(shape=SLOTS, dtype=vec6)
+        adj_v = wp.zeros(shape=SLOTS, dtype=vec6)
+        adj_w = wp.zeros(shape=SLOTS, dtype=vec6)
+        adj_p = wp.zeros(shape=SLOTS, dtype=vec6)
+        q = wp.zeros(shape=SLOTS, dtype=T)
+        qd = wp.zeros(shape=SLOTS, dtype=T)
+        gq = wp.zeros(shape=SLOTS, dtype=T)
+        gqd = wp.zeros(shape=SLOTS, dtype=T)
+        gtau = wp.zeros(shape=SLOTS, dtype=T)
+        lam = wp.zeros(shape=SLOTS, dtype=T)
+        u = wp.zeros(shape=SLOTS, dtype=T)
+        for i in range(1, n):
+            gq[i] = g_qpos_out[e, qpos_adr(m, at + i)]
+            gqd[i] = g_qvel_out[e, VADR + link_of(m, at + i)]
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
             g_pull = wp.zeros(shape=NU, dtype=T)
-            for k in range(NU):
+            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                k = m.muscle[entry]
                 pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
             tension = pull
             by_length = pull
@@ -207,11 +233,12 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         end = row0 + substeps - 1
         if wp.static(NBALL > 0):
             turn = wp.zeros(shape=NBALL, dtype=quat)
-            for b in range(NBALL):
-                i = m.ball_link[b]
+            for b in range(m.ball_count[lane]):
+                i = m.ball_slot[lane * NBALL + b]
+                adr = qpos_adr(m, at + i)
                 wb = next_rate(ck_v, ck_a, end, VADR + i, e, h)
-                rot_b = wp.normalize(load_quat_row(ck_q, end, qpos_adr(m, i), e) * exp_quat(h * wb))
-                gb = to_tangent(rot_b, load_quat(g_qpos_out, e, qpos_adr(m, i)))
+                rot_b = wp.normalize(load_quat_row(ck_q, end, adr, e) * exp_quat(h * wb))
+                gb = to_tangent(rot_b, load_quat(g_qpos_out, e, adr))
                 for k in range(3):
                     gq[i + k] = gb[k]
         if wp.static(FLOATING):
@@ -229,20 +256,20 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             # 1. the state of this substep, and the adjoint of the integrator
             height = m.carrier_height
             A[0] = join(vec3(), -m.gravity)
-            for i in range(1, NL):
-                q[i] = load(ck_q, row, qpos_adr(m, i), e)
-                qd[i] = load(ck_v, row, VADR + i, e)
+            for i in range(1, n):
+                q[i] = load(ck_q, row, qpos_adr(m, at + i), e)
+                qd[i] = load(ck_v, row, VADR + link_of(m, at + i), e)
                 gqd[i] = gqd[i] + h * gq[i]
             if wp.static(NBALL > 0):
-                for b in range(NBALL):
-                    i = m.ball_link[b]
-                    turn[b] = load_quat_row(ck_q, row, qpos_adr(m, i), e)
+                for b in range(m.ball_count[lane]):
+                    i = m.ball_slot[lane * NBALL + b]
+                    turn[b] = load_quat_row(ck_q, row, qpos_adr(m, at + i), e)
                     gb = vec3(gq[i], gq[i + 1], gq[i + 2])
                     gb_turn, gb_start = exp_adjoint(h * next_rate(ck_v, ck_a, row, VADR + i, e, h), gb)
                     for k in range(3):
                         gqd[i + k] = gqd[i + k] + h * (gb_turn[k] - gb[k])
                         gq[i + k] = gb_start[k]
-                place_balls(m, turn, R, q)
+                place_balls(m, lane, turn, R, q)
             if wp.static(FLOATING):
                 rot = quat(load(ck_q, row, 4, e), load(ck_q, row, 5, e), load(ck_q, row, 6, e), load(ck_q, row, 3, e))
                 v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
@@ -257,92 +284,114 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
                 A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v))
-            height = place_links(m, q, R, x, S, height)
-            for i in range(1, NL):
-                p = m.parent[i]
+            height = place_links(m, at, n, q, R, x, S, height)
+            for i in range(1, n):
+                k = at + i
+                p = m.parent[k]
                 V[i] = V[p] + S[i] * qd[i]
-                n = i
+                turning = i
                 if wp.static(NBALL > 0):
-                    n = m.inboard[i]
-                A[i] = A[p] + S[i] * load(ck_a, row, VADR + i, e) + wp.spatial_cross(V[n], S[i] * qd[i])
+                    turning = m.inboard[k]
+                qdd = load(ck_a, row, VADR + link_of(m, k), e)
+                A[i] = A[p] + S[i] * qdd + wp.spatial_cross(V[turning], S[i] * qd[i])
                 W[i] = vec6()
             # 2. lambda = -M^-1 g; on the way in, W holds the articulated bias force
             W[0] = vec6()
-            for j in range(1, NL):
-                i = NL - j
-                p = m.parent[i]
-                ui = -h * gqd[i] - wp.dot(S[i], W[i])
-                u[i] = ui
-                if wp.static(FLOATING) or p > 0:
-                    Ui = vec6()
-                    for k in range(6):
-                        Ui[k] = load(ck_f, row, 7 * (i - 1) + k, e)
-                    W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, row, 7 * (i - 1) + 6, e))
+            for j in range(1, slots + 1):
+                i = slots - j
+                if wp.static(LANES > SHARERS):
+                    if i == TRUNK:
+                        add_limbs(W)
+                if i > 0 and i < n:
+                    p = m.parent[at + i]
+                    ui = -h * gqd[i] - wp.dot(S[i], W[i])
+                    u[i] = ui
+                    if wp.static(FLOATING) or p > 0:
+                        f0 = 7 * (link_of(m, at + i) - 1)
+                        Ui = vec6()
+                        for r in range(6):
+                            Ui[r] = load(ck_f, row, f0 + r, e)
+                        W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, row, f0 + 6, e))
             if wp.static(FLOATING):
                 W[0] = solve_base(ck_f, row, e, join(R[0] * gw, gv) * (-h) - W[0])
-            for i in range(1, NL):
-                p = m.parent[i]
+            for i in range(1, n):
+                p = m.parent[at + i]
+                f0 = 7 * (link_of(m, at + i) - 1)
                 UW = T(0.0)
-                for k in range(6):
-                    UW = UW + load(ck_f, row, 7 * (i - 1) + k, e) * W[p][k]
-                lam[i] = (u[i] - UW) * load(ck_f, row, 7 * (i - 1) + 6, e)
+                for r in range(6):
+                    UW = UW + load(ck_f, row, f0 + r, e) * W[p][r]
+                lam[i] = (u[i] - UW) * load(ck_f, row, f0 + 6, e)
                 W[i] = W[p] + S[i] * lam[i]
             # 3. the partial derivatives of phi, link by link
-            for i in range(FIRST, NL):
-                la, lv, lw, lp = link_adjoint(m, i, R[i], x[i], V[i], A[i], W[i], height, h, theta)
+            for i in range(FIRST, n):
+                la, lv, lw, lp = link_adjoint(m, at + i, R[i], x[i], V[i], A[i], W[i], height, h, theta)
                 adj_a[i] = la
                 adj_v[i] = lv
                 adj_w[i] = lw
                 adj_p[i] = lp
             if wp.static(HILL):
-                measure(m, R, x, V, W, path, by_rate, power)
-                for k in range(NU):
+                measure(m, lane, R, x, V, W, path, by_rate, power)
+                for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                    k = m.muscle[entry]
                     law = hill(m, k, pull[k], path[k], by_rate[k])
                     tension[k] = law[0]
                     g_pull[k] = g_pull[k] + power[k] * law[1]
                     by_length[k] = power[k] * law[2]
                     by_rate[k] = power[k] * law[3]
             if wp.static(MUSCLE):
-                add_pull_adjoint(m, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, g_pull)
+                add_pull_adjoint(m, lane, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, g_pull)
             # 4. inward: sum over subtrees, project on the joints
-            for j in range(1, NL):
-                i = NL - j
-                p = m.parent[i]
-                n = i
-                if wp.static(NBALL > 0):
-                    p = m.inboard[i]
-                    n = m.outboard[i]
-                qi = q[i]
-                if wp.static(IMPLICIT):
-                    qi = qi + theta * h * qd[i]
-                gain = passive_gain(m, i, qi)
-                kv = gain[1]
-                if wp.static(IMPLICIT):
-                    kv = kv + theta * h * gain[0]
-                xv = adj_v[i] - wp.spatial_cross_dual(V[p], adj_a[i])
-                gq[i] = (
-                    gq[i]
-                    + wp.dot(adj_p[i], S[i])
-                    - wp.dot(xv, wp.spatial_cross(S[i], V[p]))
-                    - wp.dot(adj_w[i], wp.spatial_cross(S[i], W[p]))
-                    - wp.dot(adj_a[i], wp.spatial_cross(S[i], A[p]))
-                    - lam[i] * gain[0]
-                )
-                gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[n], adj_a[i]), S[i]) - lam[i] * kv
-                gtau[i] = gtau[i] - lam[i]
-                if wp.static(NBALL > 0):
-                    p = m.parent[i]
-                if wp.static(FLOATING) or p > 0:
-                    adj_a[p] = adj_a[p] + adj_a[i]
-                    adj_v[p] = adj_v[p] + adj_v[i]
-                    adj_w[p] = adj_w[p] + adj_w[i]
-                    adj_p[p] = adj_p[p] + adj_p[i]
+            if wp.static(SHARERS > 1):
+                add_sharers(adj_a)
+                add_sharers(adj_v)
+                add_sharers(adj_w)
+                add_sharers(adj_p)
+            for j in range(1, slots + 1):
+                i = slots - j
+                if wp.static(LANES > SHARERS):
+                    if i == TRUNK:
+                        add_limbs(adj_a)
+                        add_limbs(adj_v)
+                        add_limbs(adj_w)
+                        add_limbs(adj_p)
+                if i > 0 and i < n:
+                    k = at + i
+                    p = m.parent[k]
+                    turned = i
+                    if wp.static(NBALL > 0):
+                        p = m.inboard[k]
+                        turned = m.outboard[k]
+                    qi = q[i]
+                    if wp.static(IMPLICIT):
+                        qi = qi + theta * h * qd[i]
+                    gain = passive_gain(m, k, qi)
+                    kv = gain[1]
+                    if wp.static(IMPLICIT):
+                        kv = kv + theta * h * gain[0]
+                    xv = adj_v[i] - wp.spatial_cross_dual(V[p], adj_a[i])
+                    gq[i] = (
+                        gq[i]
+                        + wp.dot(adj_p[i], S[i])
+                        - wp.dot(xv, wp.spatial_cross(S[i], V[p]))
+                        - wp.dot(adj_w[i], wp.spatial_cross(S[i], W[p]))
+                        - wp.dot(adj_a[i], wp.spatial_cross(S[i], A[p]))
+                        - lam[i] * gain[0]
+                    )
+                    gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[turned], adj_a[i]), S[i]) - lam[i] * kv
+                    gtau[i] = gtau[i] - lam[i]
+                    if wp.static(NBALL > 0):
+                        p = m.parent[k]
+                    if wp.static(FLOATING) or p > 0:
+                        adj_a[p] = adj_a[p] + adj_a[i]
+                        adj_v[p] = adj_v[p] + adj_v[i]
+                        adj_w[p] = adj_w[p] + adj_w[i]
+                        adj_p[p] = adj_p[p] + adj_p[i]
             if wp.static(BALL_SPRING):
                 # The spring sees the rotation vector, whose derivative in the tangent space is not the identity.
-                for b in range(NBALL):
-                    i = m.ball_link[b]
+                for b in range(m.ball_count[lane]):
+                    i = m.ball_slot[lane * NBALL + b]
                     lb = vec3(lam[i], lam[i + 1], lam[i + 2])
-                    lb = m.stiffness[i] * (log_adjoint(vec3(q[i], q[i + 1], q[i + 2]), lb) - lb)
+                    lb = m.stiffness[at + i] * (log_adjoint(vec3(q[i], q[i + 1], q[i + 2]), lb) - lb)
                     for k in range(3):
                         gq[i + k] = gq[i + k] + lb[k]
             if wp.static(FLOATING):
@@ -360,32 +409,39 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 gw = gw + wp.transpose(R[0]) * wp.spatial_top(tw)
 
         # A gradient that left the finite numbers, or of a contained step, is zero.
-        finite = bool(True)
-        for i in range(1, NL):
-            finite = finite and wp.isfinite(gq[i]) and wp.isfinite(gqd[i]) and wp.isfinite(gtau[i])
+        broken = T(0.0)
+        for i in range(1, n):
+            if not (wp.isfinite(gq[i]) and wp.isfinite(gqd[i]) and wp.isfinite(gtau[i])):
+                broken = T(1.0)
         if wp.static(FLOATING):
             for k in range(3):
-                finite = (
-                    finite and wp.isfinite(gp[k]) and wp.isfinite(gr[k]) and wp.isfinite(gv[k]) and wp.isfinite(gw[k])
-                )
+                if not (wp.isfinite(gp[k]) and wp.isfinite(gr[k]) and wp.isfinite(gv[k]) and wp.isfinite(gw[k])):
+                    broken = T(1.0)
         if wp.static(MUSCLE):
-            for k in range(NU):
-                finite = finite and wp.isfinite(g_pull[k])
+            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                k = m.muscle[entry]
+                if not wp.isfinite(g_pull[k]):
+                    broken = T(1.0)
+        if wp.static(LANES > 1):
+            broken = add(broken)
+        finite = broken == T(0.0)
         contained = nonfinite[e]
-        if not finite and not contained:
+        if lane == 0 and not finite and not contained:
             nonfinite_gradients[e] = nonfinite_gradients[e] + 1
         keep = finite and not contained
         for k in range(NU):
-            g_ctrl[e, k] = wp.where(keep, gtau[m.motor_link[k]] * m.gear[k], T(0.0))
-            if wp.static(MUSCLE):
-                g_ctrl[e, k] = wp.where(keep, (gtau[m.motor_link[k]] + g_pull[k]) * m.gear[k], T(0.0))
-        for i in range(1, NL):
-            g_qpos[e, qpos_adr(m, i)] = wp.where(keep, gq[i], T(0.0))
-            g_qvel[e, VADR + i] = wp.where(keep, gqd[i], T(0.0))
+            if m.motor_lane[k] == lane:
+                g = gtau[m.motor_slot[lane * NU + k]]
+                if wp.static(MUSCLE):
+                    g = g + g_pull[k]
+                g_ctrl[e, k] = wp.where(keep, g * m.gear[k], T(0.0))
+        for i in range(1, n):
+            g_qpos[e, qpos_adr(m, at + i)] = wp.where(keep, gq[i], T(0.0))
+            g_qvel[e, VADR + link_of(m, at + i)] = wp.where(keep, gqd[i], T(0.0))
         if wp.static(NBALL > 0):
-            for b in range(NBALL):
-                i = m.ball_link[b]
-                adr = qpos_adr(m, i)
+            for b in range(m.ball_count[lane]):
+                i = m.ball_slot[lane * NBALL + b]
+                adr = qpos_adr(m, at + i)
                 gb4 = from_tangent(load_quat(qpos, e, adr), vec3(gq[i], gq[i + 1], gq[i + 2]))
                 g_qpos[e, adr] = wp.where(keep, gb4[3], T(0.0))
                 for k in range(3):

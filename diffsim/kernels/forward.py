@@ -6,12 +6,14 @@ base's Cholesky factor) is what the paper caches as the factored mass matrix; th
 """
 
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.lanes import lane_sums
 from diffsim.kernels.model import Shape, module_options, types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
@@ -21,9 +23,10 @@ from diffsim.kernels.spatial import spatial
 def forward_kernel(shape: Shape) -> wp.Kernel:
     t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
     T, vec3, vec6, mat3, mat6, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model
+    mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
     join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
     store, place_links, sphere_state = kin.store, kin.place_links, kin.sphere_state
-    qpos_adr, load_quat, place_balls = kin.qpos_adr, kin.load_quat, kin.place_balls
+    link_of, qpos_adr, load_quat, place_balls = kin.link_of, kin.qpos_adr, kin.load_quat, kin.place_balls
     contact = contact_law(T)
     touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
     uses = shape.features
@@ -31,25 +34,27 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     passive_force, passive_gain = joint.passive_force, joint.passive_gain
     muscle = muscle_law(shape, adjoint=False)
     add_pull, measure, hill = muscle.add_pull, muscle.measure, muscle.hill
-    NL, NU, FLOATING, CONTACT, IMPLICIT = shape.nlink, shape.nu, shape.floating, "contact" in uses, shape.implicit
+    NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
     MUSCLE, HILL = "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1  # the first link with inertia
+    BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
     VADR = shape.dof0 - 1  # link i's joint in qvel is VADR + i
-    NQ, NV, NBALL = shape.nq, shape.nv, shape.nball
+    NBALL, LANES, SHARERS, TRUNK, SLOTS = shape.nball, shape.lanes, shape.sharers, shape.trunk, shape.slots
+    sums = lane_sums(T, LANES, SHARERS)
 
     @wp.func
-    def link_inertia(m: Model, i: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
+    def link_inertia(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
         """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
-        com = x + R * m.com[i]
-        inertia = R * m.inertia[i] * wp.transpose(R)
-        mass = m.mass[i]
+        com = x + R * m.com[k]
+        inertia = R * m.inertia[k] * wp.transpose(R)
+        mass = m.mass[k]
         Ib = mass * wp.skew(com)
         Ia = inertia - Ib * wp.skew(com)
         Id = wp.diag(vec3(mass, mass, mass))
         F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
         if wp.static(CONTACT):
-            for k in range(m.contact_begin[i], m.contact_begin[i + 1]):
-                p, v, depth = sphere_state(m, k, R, x, V, height, h, theta)
+            for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+                p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)
                 if touches(m, depth, v):
                     fc = contact_force(m, depth, v)
                     f = vec3(fc[0], fc[1], fc[2])
@@ -95,6 +100,22 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
             a[r] = y * L[r, r]
         return L, a
 
+    def summed(over: SimpleNamespace, last: int) -> wp.Function:
+        add_vec6, add_mat3, first = over.add_vec6, over.add_mat3, FIRST
+
+        @wp.func
+        def add_up(Ia: mat3s, Ib: mat3s, Id: mat3s, P: vec6s):
+            begin = int(first)
+            for i in range(begin, last + 1):
+                Ia[i] = add_mat3(Ia[i])
+                Ib[i] = add_mat3(Ib[i])
+                Id[i] = add_mat3(Id[i])
+                P[i] = add_vec6(P[i])
+
+        return add_up
+
+    add_sharers, add_limbs, add = summed(sums.sharers, SLOTS - 1), summed(sums.limbs, TRUNK), sums.all.add
+
     @wp.kernel(module="unique", module_options=module_options(shape))
     def forward(
         # model
@@ -119,26 +140,35 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
         qvel_out: t.array2,
         nonfinite: wp.array(dtype=wp.bool),
     ):
-        e = first + wp.tid()
-        R = wp.zeros(shape=NL, dtype=mat3)
-        x = wp.zeros(shape=NL, dtype=vec3)
-        S = wp.zeros(shape=NL, dtype=vec6)
-        V = wp.zeros(shape=NL, dtype=vec6)
-        C = wp.zeros(shape=NL, dtype=vec6)
-        A = wp.zeros(shape=NL, dtype=vec6)
-        P = wp.zeros(shape=NL, dtype=vec6)
-        U = wp.zeros(shape=NL, dtype=vec6)
-        Ia = wp.zeros(shape=NL, dtype=mat3)
-        Ib = wp.zeros(shape=NL, dtype=mat3)
-        Id = wp.zeros(shape=NL, dtype=mat3)
-        dinv = wp.zeros(shape=NL, dtype=T)
-        u = wp.zeros(shape=NL, dtype=T)
-        q = wp.zeros(shape=NL, dtype=T)
-        qd = wp.zeros(shape=NL, dtype=T)
-        motor = wp.zeros(shape=NL, dtype=T)
+        tid = wp.tid()
+        e = first + tid / LANES
+        lane = tid % LANES
+        # Variables, not constants: Warp would unroll the loops over links, and their code outgrow a GPU's cache.
+        slots = int(SLOTS)
+        n = int(SLOTS)
+        at = lane * SLOTS
+        if wp.static(LANES > 1):
+            n = m.count[lane]
+        R = wp.zeros(shape=SLOTS, dtype=mat3)
+        x = wp.zeros(shape=SLOTS, dtype=vec3)
+        S = wp.zeros(shape=SLOTS, dtype=vec6)
+        V = wp.zeros(shape=SLOTS, dtype=vec6)
+        C = wp.zeros(shape=SLOTS, dtype=vec6)
+        A = wp.zeros(shape=SLOTS, dtype=vec6)
+        P = wp.zeros(shape=SLOTS, dtype=vec6)
+        U = wp.zeros(shape=SLOTS, dtype=vec6)
+        Ia = wp.zeros(shape=SLOTS, dtype=mat3)
+        Ib = wp.zeros(shape=SLOTS, dtype=mat3)
+        Id = wp.zeros(shape=SLOTS, dtype=mat3)
+        dinv = wp.zeros(shape=SLOTS, dtype=T)
+        u = wp.zeros(shape=SLOTS, dtype=T)
+        q = wp.zeros(shape=SLOTS, dtype=T)
+        qd = wp.zeros(shape=SLOTS, dtype=T)
+        motor = wp.zeros(shape=SLOTS, dtype=T)
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
-            for k in range(NU):
+            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                k = m.muscle[entry]
                 pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
             tension = pull
         if wp.static(HILL):
@@ -146,14 +176,15 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
             lengths = wp.zeros(shape=NU, dtype=T)
             rates = wp.zeros(shape=NU, dtype=T)
         for k in range(NU):
-            motor[m.motor_link[k]] = motor[m.motor_link[k]] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
-        for i in range(1, NL):
-            q[i] = qpos[e, qpos_adr(m, i)]
-            qd[i] = qvel[e, VADR + i]
+            i = m.motor_slot[lane * NU + k]
+            motor[i] = motor[i] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+        for i in range(1, n):
+            q[i] = qpos[e, qpos_adr(m, at + i)]
+            qd[i] = qvel[e, VADR + link_of(m, at + i)]
         if wp.static(NBALL > 0):
             turn = wp.zeros(shape=NBALL, dtype=quat)
-            for b in range(NBALL):
-                turn[b] = wp.normalize(load_quat(qpos, e, qpos_adr(m, m.ball_link[b])))
+            for b in range(m.ball_count[lane]):
+                turn[b] = wp.normalize(load_quat(qpos, e, qpos_adr(m, at + m.ball_slot[lane * NBALL + b])))
         R[0] = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
             pos = vec3(qpos[e, 0], qpos[e, 1], qpos[e, 2])
@@ -177,70 +208,80 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                     store(ck_q, row, 3, e, rot[3])
             # 1. outward: poses, velocities, velocity products, inertias and bias forces
             if wp.static(NBALL > 0):
-                place_balls(m, turn, R, q)
-            height = place_links(m, q, R, x, S, height)
-            for i in range(1, NL):
-                V[i] = V[m.parent[i]] + S[i] * qd[i]
-                n = i
+                place_balls(m, lane, turn, R, q)
+            height = place_links(m, at, n, q, R, x, S, height)
+            for i in range(1, n):
+                k = at + i
+                V[i] = V[m.parent[k]] + S[i] * qd[i]
+                turning = i
                 if wp.static(NBALL > 0):
-                    n = m.inboard[i]
-                C[i] = wp.spatial_cross(V[n], S[i] * qd[i])
+                    turning = m.inboard[k]
+                C[i] = wp.spatial_cross(V[turning], S[i] * qd[i])
                 if record == 1:
-                    store(ck_q, row, qpos_adr(m, i), e, q[i])
-                    store(ck_v, row, VADR + i, e, qd[i])
+                    store(ck_q, row, qpos_adr(m, k), e, q[i])
+                    store(ck_v, row, VADR + link_of(m, k), e, qd[i])
             if wp.static(NBALL > 0):
-                for b in range(NBALL):
+                for b in range(m.ball_count[lane]):
                     if record == 1:
-                        adr = qpos_adr(m, m.ball_link[b])
+                        adr = qpos_adr(m, at + m.ball_slot[lane * NBALL + b])
                         store(ck_q, row, adr, e, turn[b][3])
                         for k in range(3):
                             store(ck_q, row, adr + 1 + k, e, turn[b][k])
-            for i in range(FIRST, NL):
-                ia, ib, id, force = link_inertia(m, i, R[i], x[i], V[i], height, h, theta)
+            for i in range(FIRST, n):
+                ia, ib, id, force = link_inertia(m, at + i, R[i], x[i], V[i], height, h, theta)
                 Ia[i] = ia
                 Ib[i] = ib
                 Id[i] = id
                 P[i] = force
             if wp.static(HILL):
-                measure(m, R, x, V, V, lengths, rates, rates)
-                for k in range(NU):
+                measure(m, lane, R, x, V, V, lengths, rates, rates)
+                for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                    k = m.muscle[entry]
                     tension[k] = hill(m, k, pull[k], lengths[k], rates[k])[0]
             if wp.static(MUSCLE):
-                add_pull(m, tension, R, x, P)
+                add_pull(m, lane, tension, R, x, P)
             # 2. inward: articulated inertias
-            for j in range(1, NL):
-                i = NL - j
-                p = m.parent[i]
-                sa = wp.spatial_top(S[i])
-                sl = wp.spatial_bottom(S[i])
-                Ua = Ia[i] * sa + Ib[i] * sl
-                Ul = sa * Ib[i] + Id[i] * sl
-                Ui = join(Ua, Ul)
-                d = wp.dot(S[i], Ui) + m.armature[i]
-                qi = q[i]
-                if wp.static(IMPLICIT):
-                    qi = qi + theta * h * qd[i]
-                    gain = passive_gain(m, i, qi)
-                    d = d - theta * h * h * gain[0] - h * gain[1]
-                di = T(1.0) / d
-                ui = motor[i] + passive_force(m, i, qi, qd[i]) - wp.dot(S[i], P[i])
-                if wp.static(FLOATING) or p > 0:
-                    va = Ua * di
-                    vl = Ul * di
-                    ca = wp.spatial_top(C[i])
-                    cl = wp.spatial_bottom(C[i])
-                    bias = join(Ia[i] * ca + Ib[i] * cl, ca * Ib[i] + Id[i] * cl)
-                    P[p] = P[p] + P[i] + bias + join(va, vl) * (ui - wp.dot(Ui, C[i]))
-                    Ia[p] = Ia[p] + Ia[i] - wp.outer(Ua, va)
-                    Ib[p] = Ib[p] + Ib[i] - wp.outer(Ua, vl)
-                    Id[p] = Id[p] + Id[i] - wp.outer(Ul, vl)
-                U[i] = Ui
-                dinv[i] = di
-                u[i] = ui
-                if record == 1:
-                    for k in range(6):
-                        store(ck_f, row, 7 * (i - 1) + k, e, Ui[k])
-                    store(ck_f, row, 7 * (i - 1) + 6, e, di)
+            if wp.static(SHARERS > 1):
+                add_sharers(Ia, Ib, Id, P)
+            for j in range(1, slots + 1):
+                i = slots - j
+                if wp.static(LANES > SHARERS):
+                    if i == TRUNK:
+                        add_limbs(Ia, Ib, Id, P)
+                if i > 0 and i < n:
+                    k = at + i
+                    p = m.parent[k]
+                    sa = wp.spatial_top(S[i])
+                    sl = wp.spatial_bottom(S[i])
+                    Ua = Ia[i] * sa + Ib[i] * sl
+                    Ul = sa * Ib[i] + Id[i] * sl
+                    Ui = join(Ua, Ul)
+                    d = wp.dot(S[i], Ui) + m.armature[k]
+                    qi = q[i]
+                    if wp.static(IMPLICIT):
+                        qi = qi + theta * h * qd[i]
+                        gain = passive_gain(m, k, qi)
+                        d = d - theta * h * h * gain[0] - h * gain[1]
+                    di = T(1.0) / d
+                    ui = motor[i] + passive_force(m, k, qi, qd[i]) - wp.dot(S[i], P[i])
+                    if wp.static(FLOATING) or p > 0:
+                        va = Ua * di
+                        vl = Ul * di
+                        ca = wp.spatial_top(C[i])
+                        cl = wp.spatial_bottom(C[i])
+                        bias = join(Ia[i] * ca + Ib[i] * cl, ca * Ib[i] + Id[i] * cl)
+                        P[p] = P[p] + P[i] + bias + join(va, vl) * (ui - wp.dot(Ui, C[i]))
+                        Ia[p] = Ia[p] + Ia[i] - wp.outer(Ua, va)
+                        Ib[p] = Ib[p] + Ib[i] - wp.outer(Ua, vl)
+                        Id[p] = Id[p] + Id[i] - wp.outer(Ul, vl)
+                    U[i] = Ui
+                    dinv[i] = di
+                    u[i] = ui
+                    if record == 1:
+                        f0 = 7 * (link_of(m, k) - 1)
+                        for r in range(6):
+                            store(ck_f, row, f0 + r, e, Ui[r])
+                        store(ck_f, row, f0 + 6, e, di)
             # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base) and the new state
             A[0] = join(vec3(), -m.gravity)
             if wp.static(FLOATING):
@@ -249,11 +290,11 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                 wdot = wp.transpose(R[0]) * wp.spatial_top(a0)
                 vdot = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + m.gravity
                 if record == 1:
-                    n = int(7 * (NL - 1))
+                    f0 = int(BASE)
                     for r in range(6):
                         for c in range(r + 1):
-                            store(ck_f, row, n, e, L[r, c])
-                            n = n + 1
+                            store(ck_f, row, f0, e, L[r, c])
+                            f0 = f0 + 1
                     for k in range(3):
                         store(ck_a, row, k, e, vdot[k])
                         store(ck_a, row, 3 + k, e, wdot[k])
@@ -261,47 +302,53 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                 w = w + h * wdot
                 pos = pos + h * v
                 rot = wp.normalize(rot * exp_quat(h * w))
-            for i in range(1, NL):
-                ai = A[m.parent[i]] + C[i]
+            for i in range(1, n):
+                ai = A[m.parent[at + i]] + C[i]
                 qdd = (u[i] - wp.dot(U[i], ai)) * dinv[i]
                 A[i] = ai + S[i] * qdd
                 qd[i] = qd[i] + h * qdd
                 q[i] = q[i] + h * qd[i]
                 if record == 1:
-                    store(ck_a, row, VADR + i, e, qdd)
+                    store(ck_a, row, VADR + link_of(m, at + i), e, qdd)
             if wp.static(NBALL > 0):
-                for b in range(NBALL):
-                    i = m.ball_link[b]
+                for b in range(m.ball_count[lane]):
+                    i = m.ball_slot[lane * NBALL + b]
                     turn[b] = wp.normalize(turn[b] * exp_quat(h * vec3(qd[i], qd[i + 1], qd[i + 2])))
 
         # An environment that left the finite numbers is handed back as it came.
-        finite = bool(True)
+        broken = T(0.0)
         if wp.static(FLOATING):
             for k in range(3):
-                finite = (
-                    finite and wp.isfinite(pos[k]) and wp.isfinite(v[k]) and wp.isfinite(w[k]) and wp.isfinite(rot[k])
-                )
-                qpos_out[e, k] = pos[k]
-                qpos_out[e, 4 + k] = rot[k]
-                qvel_out[e, k] = v[k]
-                qvel_out[e, 3 + k] = w[k]
-            qpos_out[e, 3] = rot[3]
-        for i in range(1, NL):
-            finite = finite and wp.isfinite(q[i]) and wp.isfinite(qd[i])
-            qpos_out[e, qpos_adr(m, i)] = q[i]
-            qvel_out[e, VADR + i] = qd[i]
+                if not (wp.isfinite(pos[k]) and wp.isfinite(v[k]) and wp.isfinite(w[k]) and wp.isfinite(rot[k])):
+                    broken = T(1.0)
+        for i in range(1, n):
+            if not (wp.isfinite(q[i]) and wp.isfinite(qd[i])):
+                broken = T(1.0)
         if wp.static(NBALL > 0):
-            for b in range(NBALL):
-                adr = qpos_adr(m, m.ball_link[b])
-                qpos_out[e, adr] = turn[b][3]
-                for k in range(3):
-                    finite = finite and wp.isfinite(turn[b][k])
-                    qpos_out[e, adr + 1 + k] = turn[b][k]
+            for b in range(m.ball_count[lane]):
+                if not wp.isfinite(turn[b]):
+                    broken = T(1.0)
+        if wp.static(LANES > 1):
+            broken = add(broken)
+        finite = broken == T(0.0)
         nonfinite[e] = not finite
-        if not finite:
-            for k in range(NQ):
-                qpos_out[e, k] = qpos[e, k]
-            for k in range(NV):
-                qvel_out[e, k] = qvel[e, k]
+        if wp.static(FLOATING):
+            for k in range(3):
+                qpos_out[e, k] = wp.where(finite, pos[k], qpos[e, k])
+                qpos_out[e, 4 + k] = wp.where(finite, rot[k], qpos[e, 4 + k])
+                qvel_out[e, k] = wp.where(finite, v[k], qvel[e, k])
+                qvel_out[e, 3 + k] = wp.where(finite, w[k], qvel[e, 3 + k])
+            qpos_out[e, 3] = wp.where(finite, rot[3], qpos[e, 3])
+        for i in range(1, n):
+            adr = qpos_adr(m, at + i)
+            dof = VADR + link_of(m, at + i)
+            qpos_out[e, adr] = wp.where(finite, q[i], qpos[e, adr])
+            qvel_out[e, dof] = wp.where(finite, qd[i], qvel[e, dof])
+        if wp.static(NBALL > 0):
+            for b in range(m.ball_count[lane]):
+                adr = qpos_adr(m, at + m.ball_slot[lane * NBALL + b])
+                qpos_out[e, adr] = wp.where(finite, turn[b][3], qpos[e, adr])
+                for k in range(3):
+                    qpos_out[e, adr + 1 + k] = wp.where(finite, turn[b][k], qpos[e, adr + 1 + k])
 
     return forward

@@ -16,10 +16,10 @@ def kinematics(shape: Shape) -> SimpleNamespace:
     sp = spatial(T)
     join, point_velocity, log_quat, quat_of = sp.join, sp.point_velocity, sp.log_quat, sp.quat_of
     mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
-    NL, NBALL, CARRIER, QADR = shape.nlink, shape.nball, shape.carrier, shape.dof0 - 1 + int(shape.floating)
+    NBALL, CARRIER, QADR = shape.nball, shape.carrier, shape.dof0 - 1 + int(shape.floating)
     BALL, STIFFNESS = "ball" in shape.features, "stiffness" in shape.features
     HINGE, SLIDE = "hinge" in shape.features, "slide" in shape.features
-    IMPLICIT, ENV_LAST = shape.implicit, shape.env_last
+    IMPLICIT, ENV_LAST, LANES = shape.implicit, shape.env_last, shape.lanes
 
     @wp.func
     def load(a: t.array3, row: int, k: int, e: int):
@@ -35,10 +35,16 @@ def kinematics(shape: Shape) -> SimpleNamespace:
             a[row, e, k] = value
 
     @wp.func
-    def qpos_adr(m: Model, i: int):
+    def link_of(m: Model, k: int):
+        if wp.static(LANES > 1):
+            return m.link[k]
+        return k
+
+    @wp.func
+    def qpos_adr(m: Model, k: int):
         if wp.static(BALL):
-            return m.qpos_adr[i]
-        return QADR + i
+            return m.qpos_adr[k]
+        return QADR + link_of(m, k)
 
     @wp.func
     def load_quat(a: t.array2, e: int, k: int):
@@ -49,10 +55,10 @@ def kinematics(shape: Shape) -> SimpleNamespace:
         return quat_of(load(a, row, k, e), load(a, row, k + 1, e), load(a, row, k + 2, e), load(a, row, k + 3, e))
 
     @wp.func
-    def place_balls(m: Model, turn: quats, R: mat3s, q: array):
+    def place_balls(m: Model, lane: int, turn: quats, R: mat3s, q: array):
         """Into the first link's R the turn of each ball joint, and into q, for the spring, its rotation vector."""
-        for b in range(NBALL):
-            i = m.ball_link[b]
+        for b in range(m.ball_count[lane]):
+            i = m.ball_slot[lane * NBALL + b]
             R[i] = wp.quat_to_matrix(turn[b])
             if wp.static(STIFFNESS):
                 r = log_quat(turn[b])
@@ -61,28 +67,29 @@ def kinematics(shape: Shape) -> SimpleNamespace:
                 q[i + 2] = r[2]
 
     @wp.func
-    def place_links(m: Model, q: array, R: mat3s, x: vec3s, S: vec6s, height: T):
+    def place_links(m: Model, at: int, n: int, q: array, R: mat3s, x: vec3s, S: vec6s, height: T):
         """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's height.
 
         R[i] of a ball joint's first link comes with the joint's own turn.
         """
-        for i in range(1, NL):
+        for i in range(1, n):
+            k = at + i
             if wp.static(BALL):
                 turn = R[i]
-            p = m.parent[i]
-            a = R[p] * m.axis[i]
+            p = m.parent[k]
+            a = R[p] * m.axis[k]
             if wp.static(HINGE):
-                R[i] = R[p] * (m.turn0[i] + wp.sin(q[i]) * m.turn1[i] + wp.cos(q[i]) * m.turn2[i])
+                R[i] = R[p] * (m.turn0[k] + wp.sin(q[i]) * m.turn1[k] + wp.cos(q[i]) * m.turn2[k])
             else:
-                R[i] = R[p] * m.turn0[i]
+                R[i] = R[p] * m.turn0[k]
             if wp.static(BALL):
-                if m.outboard[i] == i + 2:
+                if m.outboard[k] == i + 2:
                     R[i] = R[i] * turn
                     a = vec3(R[i][0, 0], R[i][1, 0], R[i][2, 0])
-            xi = x[p] + R[p] * m.position[i]
+            xi = x[p] + R[p] * m.position[k]
             Si = join(a, wp.cross(xi, a))
             if wp.static(SLIDE):
-                if m.slide[i] == 1:
+                if m.slide[k] == 1:
                     xi = xi + a * q[i]
                     Si = join(vec3(), a)
             if wp.static(CARRIER > 0):
@@ -108,6 +115,7 @@ def kinematics(shape: Shape) -> SimpleNamespace:
     return SimpleNamespace(
         load=load,
         store=store,
+        link_of=link_of,
         qpos_adr=qpos_adr,
         load_quat=load_quat,
         load_quat_row=load_quat_row,

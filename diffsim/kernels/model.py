@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from diffsim.kernels.lanes import divide
 from diffsim.scene import Scene
 
 
@@ -23,6 +24,11 @@ class Shape:
     dtype: type
     implicit: bool
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, environment, component]
+    # how threads share an environment (lanes.py); slots: the most links that one of them has
+    lanes: int
+    sharers: int
+    trunk: int
+    slots: int
 
     @property
     def floating(self) -> bool:
@@ -47,8 +53,10 @@ class Shape:
         return 7 * (self.nlink - 1) + (21 if self.floating else 0)
 
 
-def shape_of(scene: Scene, dtype: type, implicit: bool, env_last: bool) -> Shape:
-    return Shape(scene.nlink, scene.nu, scene.carrier, scene.nball, scene.features, dtype, implicit, env_last)
+def shape_of(scene: Scene, dtype: type, implicit: bool, env_last: bool, lanes: int = 1, sharers: int = 1) -> Shape:
+    d = divide(scene, lanes, sharers)
+    base = (scene.nlink, scene.nu, scene.carrier, scene.nball, scene.features)
+    return Shape(*base, dtype, implicit, env_last, lanes, sharers, d.trunk, d.slots)
 
 
 def module_options(shape: Shape) -> dict[str, Any]:
@@ -63,6 +71,9 @@ def types(dtype: type) -> SimpleNamespace:
 
     @wp.struct
     class Model:
+        # of each lane's each link: entry lane * slots + slot; parent, inboard and outboard are slots
+        count: wp.array(dtype=int)  # links of each lane
+        link: wp.array(dtype=int)  # its number in the scene, which says where its joint is in qvel
         parent: wp.array(dtype=int)
         slide: wp.array(dtype=int)
         # R = R_parent (turn0 + sin q turn1 + cos q turn2); axis and position in the parent's frame
@@ -73,7 +84,8 @@ def types(dtype: type) -> SimpleNamespace:
         axis: wp.array(dtype=vec3)
         # read in scenes with ball joints only: the first link of each ball joint; of each link its place in qpos, the
         # link that its joint hangs on, and the link that its joint turns
-        ball_link: wp.array(dtype=int)
+        ball_count: wp.array(dtype=int)
+        ball_slot: wp.array(dtype=int)
         qpos_adr: wp.array(dtype=int)
         inboard: wp.array(dtype=int)
         outboard: wp.array(dtype=int)
@@ -86,18 +98,23 @@ def types(dtype: type) -> SimpleNamespace:
         spring_ref: wp.array(dtype=dtype)
         lower: wp.array(dtype=dtype)
         upper: wp.array(dtype=dtype)
-        motor_link: wp.array(dtype=int)
+        motor_slot: wp.array(dtype=int)  # of each lane's each motor, 0 where another lane has its link
+        motor_lane: wp.array(dtype=int)  # the lane that writes its gradient
         gear: wp.array(dtype=dtype)
         motor_bias: wp.array(dtype=dtype)
         # segments of muscles, from a in the frame of pair_link[2 k] to b in that of pair_link[2 k + 1]
-        npair: int
+        muscle_begin: wp.array(
+            dtype=int
+        )  # a lane's muscles are entries muscle_begin[lane] .. muscle_begin[lane + 1] of
+        muscle: wp.array(dtype=int)
+        lane_begin: wp.array(dtype=int)  # its pairs of links are lane_begin[lane] .. lane_begin[lane + 1]
         pair_link: wp.array(dtype=int)
         pair_begin: wp.array(dtype=int)  # the segments of pair k are pair_begin[k] .. pair_begin[k + 1]
         segment_a: wp.array(dtype=vec3)
         segment_b: wp.array(dtype=vec3)
         segment_muscle: wp.array(dtype=int)
         hill: wp.array(dtype=vec9)
-        contact_begin: wp.array(dtype=int)  # spheres of link i are contact_begin[i] .. contact_begin[i + 1]
+        contact_begin: wp.array(dtype=int)  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
         gravity: vec3
@@ -125,7 +142,7 @@ def types(dtype: type) -> SimpleNamespace:
     )
 
 
-def model_of(scene: Scene, dtype: type, device: str) -> Any:
+def model_of(scene: Scene, dtype: type, device: str, lanes: int = 1, sharers: int = 1) -> Any:
     """The scene's numbers as a Warp struct on a device."""
     t = types(dtype)
     model = t.Model()
@@ -135,34 +152,75 @@ def model_of(scene: Scene, dtype: type, device: str) -> Any:
         # Warp gives an empty array no address; one unread element keeps the struct uniform.
         return wp.array(values if len(values) else np.zeros((1, *values.shape[1:])), dtype=kind, device=device)
 
+    d = divide(scene, lanes, sharers)
+    links = np.array([row + [0] * (d.slots - len(row)) for row in d.links]).flatten()
+    slot = np.zeros((lanes, scene.nlink), np.int32)
+    for lane, row in enumerate(d.links):
+        slot[lane, row] = np.arange(len(row))
+    lane_of = np.repeat(np.arange(lanes), d.slots)
+
+    def put_links(values: Any, kind: type) -> wp.array:
+        return put(values[links], kind)
+
     skew = np.cross(np.eye(3)[None], scene.axis[:, None])  # skew(a) b = a x b
     hinge = np.where(scene.slide | (scene.ball >= 0), 0.0, 1.0)[:, None, None]
     r, square = scene.rotation, skew @ skew
     cos, sin = np.cos(scene.joint_ref)[:, None, None], np.sin(scene.joint_ref)[:, None, None]
     axis = np.einsum("nij,nj->ni", r, scene.axis)
     # Rodrigues for the angle q - ref, expanded by the sum formulas: the kernels then need no reference.
-    model.turn0 = put(r @ (np.eye(3) + hinge * square), t.mat3)
-    model.turn1 = put(hinge * (r @ (skew * cos - square * sin)), t.mat3)
-    model.turn2 = put(-hinge * (r @ (square * cos + skew * sin)), t.mat3)
+    model.turn0 = put_links(r @ (np.eye(3) + hinge * square), t.mat3)
+    model.turn1 = put_links(hinge * (r @ (skew * cos - square * sin)), t.mat3)
+    model.turn2 = put_links(-hinge * (r @ (square * cos + skew * sin)), t.mat3)
     position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * axis
-    model.position, model.axis = put(position, t.vec3), put(axis, t.vec3)
-    model.parent, model.slide = put(scene.parent, int), put(scene.slide.astype(np.int32), int)
+    model.position, model.axis = put_links(position, t.vec3), put_links(axis, t.vec3)
+    model.count, model.link = (
+        put(np.array([len(row) for row in d.links], np.int32), int),
+        put(links.astype(np.int32), int),
+    )
+    model.parent = put(slot[lane_of, scene.parent[links]], int)
+    model.slide = put_links(scene.slide.astype(np.int32), int)
     first, last = (np.arange(scene.nlink) + np.where(scene.ball < 0, 0, k - scene.ball) for k in (0, 2))
-    model.ball_link = put(np.flatnonzero(scene.ball == 0).astype(np.int32), int)
-    model.qpos_adr, model.inboard = put(scene.qpos_adr, int), put(scene.parent[first], int)
-    model.outboard = put(last.astype(np.int32), int)
-    model.com, model.inertia = put(scene.com, t.vec3), put(scene.inertia, t.mat3)
-    for name in ("mass", "armature", "damping", "stiffness", "spring_ref", "lower", "upper", "gear", "motor_bias"):
-        setattr(model, name, put(getattr(scene, name), dtype))
-    model.motor_link = put(scene.motor_link, int)
-    pairs, start = np.unique(scene.segment_link, axis=0, return_index=True)
-    model.npair, model.pair_link = len(pairs), put(pairs.flatten(), int)
-    model.pair_begin = put(np.append(start, len(scene.segment_link)).astype(np.int32), int)
-    model.segment_a, model.segment_b = (put(scene.segment_position[:, end], t.vec3) for end in (0, 1))
-    model.segment_muscle, model.hill = put(scene.segment_muscle, int), put(np.nan_to_num(scene.hill), t.vec9)
-    begin = np.searchsorted(scene.contact_link, np.arange(scene.nlink + 1)).astype(np.int32)
-    model.contact_begin = put(begin, int)
-    model.contact_position, model.contact_radius = put(scene.contact_position, t.vec3), put(scene.contact_radius, dtype)
+    balls = np.array(
+        [
+            row + [0] * (scene.nball - len(row))
+            for row in ([k for k, i in enumerate(links) if scene.ball[i] == 0] for links in d.links)
+        ]
+    )
+    model.ball_count = put(np.array([(scene.ball[row] == 0).sum() for row in d.links], np.int32), int)
+    model.ball_slot = put(balls.astype(np.int32).flatten(), int)
+    model.qpos_adr, model.inboard = put_links(scene.qpos_adr, int), put(slot[lane_of, scene.parent[first][links]], int)
+    model.outboard = put(slot[lane_of, last[links]], int)
+    carried = np.array([link in d.weighs[lane] for lane, link in zip(lane_of, links, strict=True)], float)
+    model.com, model.mass = put_links(scene.com, t.vec3), put(scene.mass[links] * carried, dtype)
+    model.inertia = put(scene.inertia[links] * carried[:, None, None], t.mat3)
+    for name in ("armature", "damping", "stiffness", "spring_ref", "lower", "upper"):
+        setattr(model, name, put_links(getattr(scene, name), dtype))
+    model.gear, model.motor_bias = put(scene.gear, dtype), put(scene.motor_bias, dtype)
+    model.motor_slot = put(slot[:, scene.motor_link].flatten(), int)
+    writer = (slot[:, scene.motor_link] > 0).argmax(0)
+    for lane, hand in enumerate(d.muscles):
+        writer[hand] = lane
+    model.motor_lane = put(writer.astype(np.int32), int)
+    # Segments by lane, then by the pair of links that they join.
+    lane_of_segment = writer[scene.segment_muscle] if len(scene.segment_muscle) else np.zeros(0, int)
+    key = np.column_stack([lane_of_segment, scene.segment_link])
+    order = np.lexsort(key.T[::-1])
+    pairs, start = np.unique(key[order], axis=0, return_index=True)
+    model.muscle_begin = put(np.cumsum([0, *map(len, d.muscles)]).astype(np.int32), int)
+    model.muscle = put(np.array(sum(d.muscles, []), np.int32), int)
+    model.lane_begin = put(np.searchsorted(pairs[:, 0], np.arange(lanes + 1)).astype(np.int32), int)
+    model.pair_link = put(slot[pairs[:, :1], pairs[:, 1:]].flatten(), int)
+    model.pair_begin = put(np.append(start, len(order)).astype(np.int32), int)
+    model.segment_a, model.segment_b = (put(scene.segment_position[order, end], t.vec3) for end in (0, 1))
+    model.segment_muscle, model.hill = put(scene.segment_muscle[order], int), put(np.nan_to_num(scene.hill), t.vec9)
+    # Contact spheres by lane, then by slot.
+    rows = [
+        (lane * d.slots + slot[lane, scene.contact_link[k]], k) for lane, hand in enumerate(d.spheres) for k in hand
+    ]
+    entry, sphere = np.array(sorted(rows), int).reshape(-1, 2).T
+    model.contact_begin = put(np.searchsorted(entry, np.arange(len(links) + 1)).astype(np.int32), int)
+    model.contact_position = put(scene.contact_position[sphere], t.vec3)
+    model.contact_radius = put(scene.contact_radius[sphere], dtype)
     model.gravity = t.vec3(*scene.gravity)
     # Along the chain of slides that ends at the carrier nothing turns, so the offsets add up as they are.
     frame, height = np.eye(3), 0.0

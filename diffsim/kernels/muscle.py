@@ -32,7 +32,7 @@ def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
     T, vec3, vec4, vec6, Model, array = shape.dtype, t.vec3, t.vec4, t.vec6, t.Model, t.array
     join, point_velocity = sp.join, sp.point_velocity
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
-    NU, HILL = shape.nu, "hill" in shape.features
+    HILL = "hill" in shape.features
 
     @wp.func
     def outward(R: t.mat3, x: vec3, torque: vec3, force: vec3):
@@ -46,9 +46,9 @@ def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
         return join(wp.transpose(R) * wp.spatial_top(v), wp.transpose(R) * point_velocity(v, x))
 
     @wp.func
-    def add_pull(m: Model, tension: array, R: mat3s, x: vec3s, P: vec6s):
+    def add_pull(m: Model, lane: int, tension: array, R: mat3s, x: vec3s, P: vec6s):
         """Adds the muscles to the links' bias forces P."""
-        for pair in range(m.npair):
+        for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
             i = m.pair_link[2 * pair]
             j = m.pair_link[2 * pair + 1]
             turn = wp.transpose(R[i]) * R[j]
@@ -68,14 +68,17 @@ def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
             P[j] = P[j] + wrench
 
     @wp.func
-    def measure(m: Model, R: mat3s, x: vec3s, V: vec6s, W: vec6s, lengths: array, rates: array, powers: array):
+    def measure(
+        m: Model, lane: int, R: mat3s, x: vec3s, V: vec6s, W: vec6s, lengths: array, rates: array, powers: array
+    ):
         """Length of each muscle's path, and its rates under the twists V and, in the adjoint, W."""
-        for k in range(NU):
+        for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+            k = m.muscle[entry]
             lengths[k] = m.hill[k][0]
             rates[k] = T(0.0)
             if wp.static(adjoint):
                 powers[k] = T(0.0)
-        for pair in range(m.npair):
+        for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
             i = m.pair_link[2 * pair]
             j = m.pair_link[2 * pair + 1]
             turn = wp.transpose(R[i]) * R[j]
@@ -144,6 +147,7 @@ def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
     @wp.func
     def add_pull_adjoint(
         m: Model,
+        lane: int,
         tension: array,
         g_length: array,  # L dT/dl and
         g_rate: array,  # L dT/dl' of each muscle: read by hill only
@@ -157,7 +161,7 @@ def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
         g_pull: array,  # the adjoint of u: written by linear only
     ):
         """Adds the muscles' part of phi to the links' adjoints."""
-        for pair in range(m.npair):
+        for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
             i = m.pair_link[2 * pair]
             j = m.pair_link[2 * pair + 1]
             turn = wp.transpose(R[i]) * R[j]

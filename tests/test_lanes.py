@@ -1,0 +1,76 @@
+"""How threads divide an environment: everything is dealt once, and each lane has what its share needs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from scenes import task_scene
+
+import diffsim
+from diffsim.kernels.lanes import divide
+from diffsim.kernels.model import model_of
+
+LANES = [(1, 1), (2, 1), (4, 1), (2, 2), (8, 4)]
+
+
+@pytest.mark.parametrize("lanes", LANES)
+@pytest.mark.parametrize("name", diffsim.TASKS)
+def test_everything_is_dealt_once(name: str, lanes: tuple[int, int]) -> None:
+    scene = task_scene(name)
+    d = divide(scene, *lanes)
+    muscles = range(scene.nu) if "muscle" in scene.features else []
+    for hands, things in (
+        (d.weighs, range(scene.nlink)),
+        (d.spheres, range(len(scene.contact_link))),
+        (d.muscles, muscles),
+    ):
+        assert sorted(k for hand in hands for k in hand) == list(things)
+    trunk = d.links[0][: d.trunk + 1]
+    for lane, links in enumerate(d.links):
+        has = set(links)
+        assert links[: d.trunk + 1] == trunk and links[d.trunk + 1 :] == sorted(has - set(trunk))
+        assert all(scene.parent[i] in has for i in links)
+        assert has >= set(d.weighs[lane]) | {scene.contact_link[k] for k in d.spheres[lane]}
+        for k in d.muscles[lane]:
+            assert has >= set(scene.segment_link[scene.segment_muscle == k].flatten())
+        # A limb belongs to the sharers of one group alone.
+        for other, theirs in enumerate(d.links):
+            assert (has & set(theirs) == set(trunk)) or other // lanes[1] == lane // lanes[1] or has == set(trunk)
+
+
+@pytest.mark.parametrize(
+    ("name", "lanes", "slots"), [("ant", (4, 1), 3), ("humanoid", (4, 1), 10), ("humanoid_mtu", (8, 4), 10)]
+)
+def test_limbs_make_short_routes(name: str, lanes: tuple[int, int], slots: int) -> None:
+    assert divide(task_scene(name), *lanes).slots == slots
+
+
+@pytest.mark.parametrize("name", ["half_cheetah", "humanoid_mtu"])
+def test_the_lanes_models_add_up(name: str) -> None:
+    """Entry by entry against the scene: masses, spheres, segments, and parents as slots."""
+    scene = task_scene(name)
+    d = divide(scene, 8, 4)
+    model = model_of(scene, wp.float64, "cpu", 8, 4)
+    link, mass, parent = (getattr(model, k).numpy().reshape(8, d.slots) for k in ("link", "mass", "parent"))
+    count, begin = model.count.numpy(), model.contact_begin.numpy()
+    total, spheres = np.zeros(scene.nlink), np.zeros(scene.nlink)
+    for lane in range(8):
+        for slot in range(count[lane]):
+            total[link[lane, slot]] += mass[lane, slot]
+            entry = lane * d.slots + slot
+            spheres[link[lane, slot]] += begin[entry + 1] - begin[entry]
+            assert link[lane, parent[lane, slot]] == scene.parent[link[lane, slot]]
+    np.testing.assert_array_equal(total, scene.mass)
+    np.testing.assert_array_equal(spheres, np.bincount(scene.contact_link, minlength=scene.nlink))
+    if not len(scene.segment_muscle):
+        return
+    pairs = model.pair_link.numpy().reshape(-1, 2)
+    lane_begin, pair_begin = model.lane_begin.numpy(), model.pair_begin.numpy()
+    seen = []
+    for lane in range(8):
+        for pair in range(lane_begin[lane], lane_begin[lane + 1]):
+            for s in range(pair_begin[pair], pair_begin[pair + 1]):
+                seen.append((model.segment_muscle.numpy()[s], *link[lane, pairs[pair]]))
+                assert seen[-1][0] in d.muscles[lane]
+    assert sorted(seen) == sorted(zip(scene.segment_muscle, *scene.segment_link.T, strict=True))
