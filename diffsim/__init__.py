@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -10,9 +13,9 @@ import torch
 import warp as wp
 
 from diffsim.env import DiffEnv, NumpyEnv
-from diffsim.scene import Scene, SceneError, load_scene
+from diffsim.scene import PENALTY_DEFAULTS, Scene, SceneError, load_scene
 from diffsim.simulator import Simulator, check_device
-from diffsim.tasks import TASKS
+from diffsim.tasks import TASKS, Accuracy
 
 __all__ = ["TASKS", "DiffEnv", "Scene", "SceneError", "Simulator", "load_scene", "make"]
 
@@ -26,8 +29,10 @@ def make(
     seed: int | None = None,
     horizon: int = 32,
     substeps: int | None = None,
-    integrator: str = "semi_implicit",
-    theta: float = 0.0,
+    integrator: str | None = None,
+    theta: float | None = None,
+    accuracy: Accuracy = "default",
+    penalty: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float32,
     stochastic_init: bool = True,
     early_termination: bool = True,
@@ -37,7 +42,10 @@ def make(
 
     Args:
         name: one of diffsim.TASKS.
-        substeps: integration steps in a control step; default the task's.
+        accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
+            docs/accuracy.md has what each costs and how much it errs.
+        substeps, integrator, theta: each in place of the preset's, if given.
+        penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
@@ -47,15 +55,23 @@ def make(
     device = check_device(device)
     task = TASKS[name](device, dtype)
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
+    changes: dict[str, Any] = dict(penalty or {})
+    for key, value in changes.items():
+        if key not in PENALTY_DEFAULTS:
+            raise ValueError(f"unknown penalty constant {key!r}; choose from {', '.join(PENALTY_DEFAULTS)}")
+        if not 0 <= value < math.inf:
+            raise ValueError(f"penalty constant {key} is {value!r}, must be finite and not negative")
+    scene = dataclasses.replace(scene, **changes)
+    preset = task.integration(accuracy)
     return DiffEnv(
         task,
         scene,
         num_envs,
         seed=seed,
         horizon=horizon,
-        substeps=substeps,
-        integrator=integrator,
-        theta=theta,
+        substeps=preset.substeps if substeps is None else substeps,
+        integrator=preset.integrator if integrator is None else integrator,
+        theta=preset.theta if theta is None else theta,
         device=device,
         dtype=dtype,
         stochastic_init=stochastic_init,

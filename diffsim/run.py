@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -46,6 +46,14 @@ def load_checkpoint(path: Path, kind: str) -> dict[str, Any]:
     except Exception:  # torch.load raises whatever broken bytes lead it to
         pass
     fail(f"{path} is not a whole checkpoint of {kind.partition('-')[0]}.py")
+
+
+def constants(items: Sequence[str]) -> dict[str, float]:
+    """Of the flag --penalty k_n=1e5 k_d=1e4: {"k_n": 1e5, "k_d": 1e4}; anything else ends the script."""
+    try:
+        return {name: float(value) for name, _, value in (item.partition("=") for item in items)}
+    except ValueError:
+        fail(f"--penalty takes pairs like k_n=1e5, not {' '.join(items)!r}")
 
 
 class Mark:

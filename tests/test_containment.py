@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import PENDULUM, acting_states, parse, task_scene
+from scenes import BALL, PENDULUM, acting_states, parse, task_scene
 
 import diffsim
-from diffsim.simulator import Simulator
+from diffsim.simulator import INTEGRATORS, Simulator
 
 BAD, GOOD = 2, [0, 1, 3, 4]
 
@@ -26,11 +26,12 @@ def step_and_gradients(sim, states):
 
 @pytest.mark.parametrize("name", ["hopper", "ant"])
 @pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("where, value", [(0, np.nan), (1, 1e30), (1, -np.inf), (2, np.nan)])
-def test_simulator_contains_what_is_not_finite(name, threads, where, value, rng):
+def test_simulator_contains_what_is_not_finite(name, threads, integrator, where, value, rng):
     scene = task_scene(name)
     states = acting_states(scene, 5, rng)
-    sim = Simulator(scene, 5, threads=threads)
+    sim = Simulator(scene, 5, threads=threads, integrator=integrator)
     outputs, gradients = step_and_gradients(sim, states)
     assert not sim.nonfinite.any()
     states[where][BAD, -1] = value
@@ -45,6 +46,28 @@ def test_simulator_contains_what_is_not_finite(name, threads, where, value, rng)
     assert sim.nonfinite_gradients.sum() == 0
     assert not step_and_gradients(sim, states := acting_states(scene, 5, rng))[0][0].isnan().any()
     assert not sim.nonfinite.any()
+
+
+def test_a_speed_that_nothing_has_is_contained():
+    """Finite, but its square is not far from the end of float32: a task or a network would make inf and NaN of it."""
+    scene = parse(BALL)
+    sim = Simulator(scene, 3)
+    qpos, qvel = torch.tensor([[0.0, 0, 5, 1, 0, 0, 0]]).repeat(3, 1), torch.zeros(3, 6)
+    qvel[1:, 0] = torch.tensor([0.99e5, 1.01e5])
+    sim.step(qpos, qvel, torch.zeros(3, 0))
+    assert sim.nonfinite.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("name", diffsim.TASKS)
+def test_what_is_not_contained_has_finite_observations_and_rewards(name):
+    env = diffsim.make(name, num_envs=1, horizon=1)
+    qpos, qvel = env.qpos.clone().requires_grad_(), torch.full_like(env.qvel, 1e5).requires_grad_()
+    action = torch.ones(1, env.scene.nu, requires_grad=True)
+    obs = env.task.observe(qpos, qvel, action)
+    reward = env.task.reward(obs, action)
+    assert obs.isfinite().all() and reward.isfinite().all()
+    gradients = torch.autograd.grad(obs.sum() + reward.sum(), [qpos, qvel, action], materialize_grads=True)
+    assert all(gradient.isfinite().all() for gradient in gradients)
 
 
 @pytest.mark.parametrize("name", ["hopper", "ant"])
@@ -125,6 +148,7 @@ def test_blow_up_ends_the_episode_without_early_termination_too():
         ({"substeps": 0}, "substeps.*0"),
         ({"threads": 0}, "threads.*0"),
         ({"integrator": "rk4"}, "rk4.*semi_implicit, implicit"),
+        ({"substeps": 7, "integrator": "extrapolated"}, "substeps is 7, must be even"),
         ({"theta": 1.5, "integrator": "implicit"}, "theta.*1.5"),
         ({"dtype": torch.float16}, "float16.*float32.*float64"),
         ({"device": "tpu"}, "tpu.*cpu"),

@@ -265,6 +265,25 @@ def test_evaluate(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (trained / "checkpoint.pt").read_bytes() == before
 
 
+def test_accuracy_and_penalty_are_stored_and_can_be_replaced(tmp_path: Path) -> None:
+    fast, accurate = (diffsim.TASKS["cartpole"].integration(name) for name in ("fast", "accurate"))
+    checkpoint = run(tmp_path, *SMALL, "--accuracy", "fast", "--penalty", "k_limit=50", "mu=0.5", "--stop-after", 1)
+    saved = checkpoint["args"]
+    assert (saved["accuracy"], saved["integrator"], saved["substeps"]) == ("fast", fast.integrator, fast.substeps)
+
+    def simulator(*arguments: str) -> diffsim.Simulator:
+        args, _ = shac.parse(["--evaluate", str(tmp_path / "checkpoint.pt"), *arguments])
+        return shac.make_env(args, 1, 1).sim
+
+    sim = simulator()
+    assert (sim.integrator, sim.theta, sim.substeps) == fast
+    assert (sim.scene.k_limit, sim.scene.mu) == (50.0, 0.5)
+    sim = simulator("--accuracy", "accurate")
+    assert (sim.integrator, sim.theta, sim.substeps) == accurate
+    sim = simulator("--substeps", "16", "--integrator", "semi_implicit", "--penalty", "k_limit=100")
+    assert (sim.integrator, sim.theta, sim.substeps, sim.scene.k_limit) == ("semi_implicit", 0.0, 16, 100.0)
+
+
 def test_evaluation_counts_first_episodes_only() -> None:
     """Against a loop over each environment's own rewards, for ants that fall at different times."""
     torch.manual_seed(0)
@@ -348,6 +367,7 @@ def test_help_names_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
         "env env-id seed device iterations num-envs horizon substeps integrator eval-every save-every run-dir resume"
     )
     flags += " evaluate capture-video track quiet deterministic-policy general-hyperparameters threads actor-lr gamma"
+    flags += " accuracy penalty"
     for flag in flags.split():
         assert f"--{flag}" in out
 
@@ -359,6 +379,8 @@ def test_help_names_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
         ("--num-envs 0", "num_envs"),
         ("--horizon 0", "horizon"),
         ("--substeps 0", "substeps"),
+        ("--penalty k_n", "--penalty takes pairs like k_n=1e5, not 'k_n'"),
+        ("--penalty kn=1e5", "unknown penalty constant 'kn'"),
         ("--iterations 0", "--iterations must be at least 1, not 0"),
         ("--device nonsense", "nonsense"),
         ("--run-dir {file}", "cannot write to run directory {file}: Not a directory"),

@@ -14,7 +14,7 @@ from diffsim.kernels.contact import contact_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
-from diffsim.kernels.model import Shape, module_options, types
+from diffsim.kernels.model import MAX_SPEED, Shape, module_options, types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 
@@ -40,7 +40,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
     VADR = shape.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LANES, SHARERS, TRUNK, SLOTS = shape.nball, shape.lanes, shape.sharers, shape.trunk, shape.slots
-    sums = lane_sums(T, LANES, SHARERS)
+    LIMIT, sums = MAX_SPEED, lane_sums(T, LANES, SHARERS)
 
     @wp.func
     def link_inertia(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
@@ -315,14 +315,16 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                     i = m.ball_slot[lane * NBALL + b]
                     turn[b] = wp.normalize(turn[b] * exp_quat(h * vec3(qd[i], qd[i + 1], qd[i + 2])))
 
-        # An environment that left the finite numbers is handed back as it came.
+        # An environment that left the finite numbers, or any imaginable speed, is handed back as it came.
         broken = T(0.0)
         if wp.static(FLOATING):
             for k in range(3):
-                if not (wp.isfinite(pos[k]) and wp.isfinite(v[k]) and wp.isfinite(w[k]) and wp.isfinite(rot[k])):
+                if not (wp.isfinite(pos[k]) and wp.isfinite(rot[k])):
+                    broken = T(1.0)
+                if not (wp.abs(v[k]) < T(LIMIT) and wp.abs(w[k]) < T(LIMIT)):
                     broken = T(1.0)
         for i in range(1, n):
-            if not (wp.isfinite(q[i]) and wp.isfinite(qd[i])):
+            if not (wp.isfinite(q[i]) and wp.abs(qd[i]) < T(LIMIT)):
                 broken = T(1.0)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[lane]):

@@ -11,6 +11,8 @@ import warp as wp
 from diffsim.kernels.lanes import divide
 from diffsim.scene import Scene
 
+MAX_SPEED = 1e5  # m/s and rad/s; what is faster has blown up, and its squares would soon leave float32
+
 
 @dataclasses.dataclass(frozen=True)
 class Shape:

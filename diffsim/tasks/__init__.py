@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .ant import Ant
-from .base import Task
+from .base import Accuracy, Integration, Task
 from .cartpole import CartPole
 from .half_cheetah import HalfCheetah
 from .hopper import Hopper
@@ -12,4 +12,4 @@ from .humanoid_mtu import HumanoidMTU
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU)}
 
-__all__ = ["TASKS", "Task"]
+__all__ = ["TASKS", "Accuracy", "Integration", "Task"]

@@ -7,10 +7,20 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
+
+Accuracy = Literal["fast", "default", "accurate"]
+
+
+class Integration(NamedTuple):
+    """How the simulator takes a control step; see Simulator."""
+
+    integrator: str
+    theta: float
+    substeps: int
 
 
 class Task:
@@ -21,7 +31,9 @@ class Task:
 
     name: ClassVar[str]
     asset: ClassVar[str]  # MJCF file in diffsim/assets
-    substeps: ClassVar[int]  # simulation steps per control step
+    substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy, semi-implicit Euler
+    fast: ClassVar[Integration]  # the other two, chosen by measurement: docs/accuracy.md
+    accurate: ClassVar[Integration]
     obs_dim: ClassVar[int]
     num_random: ClassVar[int]  # random numbers per reset
     episode_length: ClassVar[int] = 1000  # control steps
@@ -33,6 +45,21 @@ class Task:
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         self._start = torch.tensor(self.start, device=device, dtype=dtype)
         self._spread = torch.tensor(self.spread, device=device, dtype=dtype)
+
+    @classmethod
+    def integration(cls, accuracy: str) -> Integration:
+        """The preset "fast", "default" (the paper's) or "accurate".
+
+        Raises:
+            ValueError: another name, or a preset that the task has not.
+        """
+        if accuracy not in get_args(Accuracy):
+            raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
+        if accuracy == "default":
+            return Integration("semi_implicit", 0.0, cls.substeps)
+        if not hasattr(cls, accuracy):
+            raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
+        return getattr(cls, accuracy)
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """Start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from .base import Task
+from .base import Integration, Task
 
 
 class CartPole(Task):
@@ -16,6 +16,8 @@ class CartPole(Task):
     name = "cartpole"
     asset = "cartpole.xml"
     substeps = 4
+    fast = Integration("implicit", 0.0, 1)
+    accurate = Integration("extrapolated", 0.0, 4)
     episode_length = 240
     obs_dim = 5
     num_random = 4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .base import height_reward
+from .base import Integration, height_reward
 from .locomotion import Locomotion
 
 
@@ -14,6 +14,8 @@ class Humanoid(Locomotion):
     name = "humanoid"
     asset = "humanoid.xml"
     substeps = 48
+    fast = Integration("implicit", 0.0, 16)
+    accurate = Integration("extrapolated", 0.0, 96)
     obs_dim = 76
     num_random = 55
     min_height = 0.74

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .base import height_reward
+from .base import Integration, height_reward
 from .locomotion import Locomotion
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # of a ball joint, wxyz
@@ -17,6 +17,8 @@ class HumanoidMTU(Locomotion):
     name = "humanoid_mtu"
     asset = "humanoid_mtu.xml"
     substeps = 48
+    fast = Integration("implicit", 0.0, 16)  # the humanoid's, and not measured here
+    accurate = Integration("extrapolated", 0.0, 96)
     obs_dim = 53
     num_random = 53
     min_height = 0.46

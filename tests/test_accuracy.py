@@ -1,0 +1,370 @@
+"""Presets of accuracy, orders of convergence, extremes, and what the generated kernels leave out."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scenes import BALL, HINGE, acting_states, parse, run, task_scene
+
+import diffsim
+from diffsim.kernels.backward import backward_kernel
+from diffsim.kernels.forward import forward_kernel
+from diffsim.kernels.model import shape_of
+from diffsim.simulator import INTEGRATORS, Simulator
+from diffsim.tasks import TASKS
+from diffsim.tasks.base import Integration
+
+SETTINGS = [  # and the order of each
+    ("semi_implicit", 0.0, 1),
+    ("implicit", 0.0, 1),
+    ("implicit", 0.5, 1),
+    ("implicit", 1.0, 1),
+    ("extrapolated", 0.0, 2),
+]
+
+
+# Presets
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_presets_of_every_task_are_used(name):
+    task = TASKS[name]
+    assert task.integration("default") == Integration("semi_implicit", 0.0, task.substeps)
+    works = {}
+    for accuracy in ("fast", "default", "accurate"):
+        preset = task.integration(accuracy)
+        sim = diffsim.make(name, num_envs=1, horizon=1, accuracy=accuracy).sim
+        assert (sim.integrator, sim.theta, sim.substeps) == preset
+        works[accuracy] = preset.substeps * (1.5 if preset.integrator == "extrapolated" else 1)
+    assert works["fast"] <= works["default"] / 2 and works["default"] < works["accurate"]
+    default = diffsim.make(name, num_envs=1, horizon=1).sim
+    assert (default.integrator, default.theta, default.substeps) == task.integration("default")
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_accurate_presets_are(name, rng):
+    """Error after a control step, median over states in contact: a fifth of the default's, fast at most five times."""
+    scene, states = task_scene(name), acting_states(task_scene(name), 16, rng)
+    leaves = [torch.tensor(x) for x in states]
+
+    def end(integrator, theta, substeps):
+        options = dict(substeps=substeps, integrator=integrator, theta=theta, dtype=torch.float64)
+        return torch.cat(Simulator(scene, 16, **options).step(*leaves), 1)
+
+    task = TASKS[name]
+    exact = end("semi_implicit", 0.0, 64 * task.substeps)
+    error = {a: (end(*task.integration(a)) - exact).norm(dim=1).median() for a in ("fast", "default", "accurate")}
+    assert error["accurate"] < 0.2 * error["default"] and error["fast"] < 5 * error["default"]
+
+
+def test_arguments_override_the_preset():
+    sim = diffsim.make("humanoid", 1, horizon=1, accuracy="fast", substeps=7).sim
+    assert (sim.substeps, sim.integrator) == (7, TASKS["humanoid"].fast.integrator)
+    sim = diffsim.make("humanoid", 1, horizon=1, accuracy="fast", integrator="implicit", theta=0.25).sim
+    assert (sim.substeps, sim.integrator, sim.theta) == (TASKS["humanoid"].fast.substeps, "implicit", 0.25)
+    sim = diffsim.make("humanoid", 1, horizon=1, accuracy="fast", integrator="semi_implicit").sim
+    assert (sim.integrator, sim.theta) == ("semi_implicit", 0.0)
+
+
+def test_presets_that_are_not_there_are_named(monkeypatch):
+    with pytest.raises(ValueError, match="'faster'.*fast, default, accurate"):
+        diffsim.make("hopper", accuracy="faster")
+
+    class Bare(diffsim.tasks.Task):
+        name, substeps = "bare", 8
+
+    assert Bare.integration("default") == ("semi_implicit", 0.0, 8)
+    with pytest.raises(ValueError, match="'bare' has no preset 'fast'"):
+        Bare.integration("fast")
+
+
+def test_penalty_constants_replace_the_files():
+    soft = diffsim.make("hopper", 1, penalty={"k_n": 1e5, "k_d": 1e4}).scene
+    file = task_scene("hopper")
+    assert (soft.k_n, soft.k_d, soft.k_t, soft.mu) == (1e5, 1e4, file.k_t, file.mu)
+    with pytest.raises(ValueError, match="'kn'.*k_n, k_d, k_t, mu, k_limit, d_limit"):
+        diffsim.make("hopper", 1, penalty={"kn": 1e5})
+    for bad in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="k_n is"):
+            diffsim.make("hopper", 1, penalty={"k_n": bad})
+
+
+# Order of convergence
+
+
+OSCILLATOR = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint axis="0 0 1" stiffness="20" damping="1"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="0.5 0.5 0.5"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("integrator, theta, order", SETTINGS)
+def test_order_of_a_damped_oscillator(integrator, theta, order):
+    """Angle, rate and the gradient of the angle, against the closed form."""
+    scene, t, start = parse(OSCILLATOR), 0.5, (0.7, -2.0)
+    decay, omega = 1.0, np.sqrt(40.0 - 1.0)
+    wave = np.exp(-decay * t) * np.array([np.cos(omega * t), np.sin(omega * t) / omega])
+    slopes = [wave[0] + decay * wave[1], wave[1]]  # of the angle in the initial angle and rate
+    exact = np.array(
+        [np.dot(slopes, start), -40 * wave[1] * start[0] + (wave[0] - decay * wave[1]) * start[1], *slopes]
+    )
+
+    def simulated(substeps):
+        leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in start]
+        options = dict(substeps=substeps, dtype=torch.float64, integrator=integrator, theta=theta)
+        q, v = Simulator(scene, 1, t, **options).step(*leaves, torch.zeros(1, 0, dtype=torch.float64))
+        return np.array([q.item(), v.item(), *(g.item() for g in torch.autograd.grad(q, leaves))])
+
+    errors = [abs(simulated(n) - exact) for n in (256, 512, 1024)]
+    np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), order, atol=0.1)
+
+
+@pytest.mark.parametrize("integrator, theta, order", SETTINGS)
+def test_order_of_contact_and_friction(integrator, theta, order):
+    """A ball that rolls and slips in the ground, touching all the time: from the changes as the step is halved."""
+    scene = parse(BALL)
+    depth = scene.mass[0] * 9.81 / scene.k_n
+    qpos = np.array([[0.0, 0.0, 0.1 - 1.2 * depth, 1.0, 0.0, 0.0, 0.0]])
+    qvel = np.array([[0.02, -0.01, 0.0, 0.3, 0.1, -0.2]])
+    options = dict(control_dt=0.05, integrator=integrator, theta=theta)
+    ends = [
+        np.concatenate(run(scene, qpos, qvel, np.zeros((1, 0)), substeps=n, **options), 1)[0]
+        for n in (256, 512, 1024, 2048)
+    ]
+    changes = [np.linalg.norm(a - b) for a, b in zip(ends, ends[1:], strict=False)]
+    np.testing.assert_allclose(np.log2(np.array(changes[:-1]) / changes[1:]), order, atol=0.1)
+
+
+# Extremes
+
+
+def extreme(scene, qpos, qvel, kind):
+    """The scene and states, one thing driven to an extreme."""
+    height = 2 if scene.floating else 1
+    if kind == "stiff":
+        scene = dataclasses.replace(scene, k_n=1e3 * scene.k_n, k_d=1e2 * scene.k_d)
+    elif kind == "slippery":
+        scene = dataclasses.replace(scene, mu=0.0, k_d=0.0)
+    elif kind == "sticky":
+        scene = dataclasses.replace(scene, mu=10.0, k_t=1e6)
+    elif kind in ("light", "heavy"):
+        mass, inertia = scene.mass.copy(), scene.inertia.copy()
+        mass[-1], inertia[-1] = (x[-1] * (1e-4 if kind == "light" else 1e4) for x in (mass, inertia))
+        scene = dataclasses.replace(scene, mass=mass, inertia=inertia)
+    elif kind == "fast":
+        qvel[:, 0] = 1e3
+    elif kind == "spinning":
+        qvel[:, -2:] = 1e3
+    elif kind == "buried":
+        qpos[:, height] -= 1.0
+    elif kind == "falling":
+        qvel[:, height] = -44.0  # after 100 m
+    elif kind == "far":
+        qpos[:, 0] = 1e6
+    return scene, qpos, qvel
+
+
+KINDS = ("stiff", "slippery", "sticky", "light", "heavy", "fast", "spinning", "buried", "falling", "far")
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+def test_extremes_stay_finite_or_contained(name, integrator, rng):
+    """Under motors that flip at every control step. What is not contained moved and kept its energy within reason."""
+    for kind in KINDS:
+        qpos, qvel, _ = acting_states(task_scene(name), 4, rng)
+        scene, qpos, qvel = extreme(task_scene(name), qpos, qvel, kind)
+        substeps = 32 if integrator == "extrapolated" else 16  # it is as stable as its coarser step
+        sim = Simulator(scene, 4, substeps=substeps, horizon=12, integrator=integrator)
+        leaves = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (qpos, qvel)]
+        ctrl = torch.ones(4, scene.nu, requires_grad=True)
+        (q, v), contained = leaves, torch.zeros(4, dtype=torch.bool)
+        for k in range(12):
+            q, v = sim.step(q, v, ctrl * (-1) ** k)
+            contained |= sim.nonfinite
+            assert q.isfinite().all() and v.isfinite().all(), kind
+        gradients = torch.autograd.grad(q.sum() + v.sum(), [*leaves, ctrl])
+        assert all(g.isfinite().all() for g in gradients), kind
+        # A joint that turns at 1,000 rad/s passes its limit by a radian in a substep, and what a step does not resolve
+        # cannot be extrapolated from it: only there may the numbers end.
+        assert not contained.any() or kind == "spinning" or (kind, integrator) == ("stiff", "extrapolated"), kind
+        if not contained.any():
+            assert all((g != 0).any() for g in gradients), kind
+            assert sim.nonfinite_gradients.sum() == 0, kind
+
+
+def test_actions_beyond_the_range_are_those_at_its_end():
+    ends = []
+    for size in (1.0, 1e6, float("inf")):
+        env = diffsim.make("ant", num_envs=2, seed=0, horizon=4)
+        actions = [torch.full((2, 8), size * (-1) ** k, requires_grad=True) for k in range(4)]
+        total = sum(env.step(action)[1].sum() for action in actions)
+        gradients = torch.autograd.grad(total, actions)
+        assert all(g.isfinite().all() and (size == 1 or (g == 0).all()) for g in gradients)
+        ends.append(env.qpos.detach())
+    assert torch.equal(ends[0], ends[1]) and torch.equal(ends[0], ends[2])
+
+
+# Corners
+
+
+def one_sided(scene, states, weights, k, sign, eps=1e-6, **options):
+    """Derivative of a weighted sum of the state after a control step in input number k, from one side."""
+    flat, sizes = np.concatenate(states, 1), np.cumsum([x.shape[1] for x in states])[:-1]
+    rows = np.repeat(flat, 3, 0)
+    rows[:, k] += sign * eps * np.arange(3)
+    q, v = run(scene, *np.split(rows, sizes, 1), **options)
+    values = np.concatenate([q, v], 1) @ weights
+    return sign * (-1.5 * values[0] + 2 * values[1] - 0.5 * values[2]) / eps
+
+
+def gradient(scene, states, weights, **options):
+    leaves = [torch.tensor(x, requires_grad=True) for x in states]
+    q, v = Simulator(scene, 1, dtype=torch.float64, **options).step(*leaves)
+    total = torch.cat([q, v], 1) @ torch.tensor(weights)
+    return np.concatenate([g[0].numpy() for g in torch.autograd.grad(total.sum(), leaves)])
+
+
+def check_one_sided(scene, states, weights, skip=(), **options):
+    """Every entry of the gradient is the derivative from one side or the other."""
+    value = gradient(scene, states, weights, **options)
+    assert np.isfinite(value).all() and (value != 0).any()
+    corners = 0
+    for k in set(range(len(value))) - set(skip):
+        sides = [one_sided(scene, states, weights, k, sign, **options) for sign in (1, -1)]
+        scale = 1e-5 * (1 + abs(value).max())
+        assert min(abs(value[k] - side) for side in sides) < scale, k
+        corners += abs(sides[0] - sides[1]) > 10 * scale
+    return corners
+
+
+CORNERS = [("semi_implicit", 0.0), ("implicit", 0.0)]
+QUATERNION = range(3, 7)  # its length is not a coordinate; test_gradient.py has differences along and across it
+
+
+@pytest.mark.parametrize("integrator, theta", CORNERS)
+def test_corners_of_contact_have_one_sided_gradients(integrator, theta):
+    """Exact touch with and without approach, exactly no slip, and exactly where friction saturates."""
+    scene, weights = parse(BALL), np.cos(np.arange(13.0))
+    options = dict(substeps=1, integrator=integrator, theta=theta)
+
+    def ball(depth, *velocity):
+        return [
+            np.array([[0.0, 0.0, 0.1 - depth, 1, 0, 0, 0]]),
+            np.array([[*velocity, 0.0, 0.0, 0.0]]),
+            np.zeros((1, 0)),
+        ]
+
+    depth = 1e-3
+    saturated = scene.mu * scene.k_n * depth / scene.k_t
+    assert check_one_sided(scene, ball(0.0, 0.0, 0.0, -1.0), weights, QUATERNION, **options) > 0
+    check_one_sided(scene, ball(0.0, 0.0, 0.0, 0.0), weights, QUATERNION, **options)
+    check_one_sided(scene, ball(depth, 0.0, 0.0, 0.0), weights, QUATERNION, **options)
+    assert check_one_sided(scene, ball(depth, saturated, 0.0, 0.0), weights, QUATERNION, **options) > 0
+
+
+@pytest.mark.parametrize("integrator, theta", CORNERS)
+def test_limit_exactly_met_has_a_one_sided_gradient(integrator, theta):
+    scene = parse(HINGE)
+    for bound in (scene.lower[1], scene.upper[1]):
+        states = [np.array([[x]]) for x in (bound, 0.0, 0.0)]
+        options = dict(substeps=1, integrator=integrator, theta=theta)
+        assert check_one_sided(scene, states, np.array([1.0, 2.0]), **options) > 0
+
+
+@pytest.mark.parametrize("name", ["ant", "humanoid"])
+@pytest.mark.parametrize("integrator", ["semi_implicit", "extrapolated"])
+@pytest.mark.parametrize("turn", [(1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0)])
+def test_upright_and_upside_down(name, turn, integrator):
+    scene = task_scene(name)
+    qpos = np.zeros((1, scene.nq))
+    qpos[0, 2], qpos[0, 3:7] = 5.0, turn
+    qpos[0, 7:] = np.clip(0.0, scene.lower[1:] + 0.1, scene.upper[1:] - 0.1)
+    weights = np.sin(np.arange(float(scene.nq + scene.nv)))
+    states = [qpos, 0.1 * np.ones((1, scene.nv)), 0.1 * np.ones((1, scene.nu))]
+    assert check_one_sided(scene, states, weights, QUATERNION, substeps=4, integrator=integrator) == 0
+
+
+def test_cartpole_upright_and_hanging():
+    """The task too, whose angle is wrapped at pi: finite, and the slope of one side."""
+    for angle in (0.0, np.pi, -np.pi):
+        env = diffsim.make("cartpole", num_envs=1, dtype=torch.float64)
+        qpos = torch.tensor([[0.3, angle]], dtype=torch.float64, requires_grad=True)
+        env.set_state(qpos, torch.zeros(1, 2, dtype=torch.float64))
+        _, reward, *_ = env.step(torch.zeros(1, 1, dtype=torch.float64))
+        (slope,) = torch.autograd.grad(reward.sum(), qpos)
+        assert slope.isfinite().all()
+        assert abs(slope[0, 1]) < 0.1 if angle == 0 else 5 < abs(slope[0, 1]) < 7  # 2 pi, next to the jump
+
+
+# Only what a scene requires
+
+
+def source(scene):
+    """Warp's C++ of the scene's forward and backward kernel."""
+    shape, text = shape_of(scene, wp.float64, implicit=False, env_last=False), ""
+    for build in (forward_kernel, backward_kernel):
+        module = build(shape).module
+        module.load("cpu")
+        (path,) = (Path(wp.config.kernel_cache_dir) / module.get_module_identifier()).glob("*.cpp")
+        text += path.read_text()
+    return re.sub(r"//.*", "", text)  # comments quote the Python source, branches that are not taken included
+
+
+CODE = {  # what the code of a feature, and of no other, does: it reads fields of the model, or calls functions
+    "contact": r"\(var_m\)\.(k_n|k_d|k_t|mu|contact_\w+)\b",
+    "limit": r"\(var_m\)\.(k_limit|d_limit|lower|upper)\b",
+    "stiffness": r"\(var_m\)\.(stiffness|spring_ref)\b",
+    "damping": r"\(var_m\)\.damping\b",
+    "slide": r"\(var_m\)\.slide\b",
+    "hinge": r"\bsin\(",
+    "motor": r"\(var_m\)\.motor_link\b",
+    "ball": r"\(var_m\)\.(ball_link|qpos_adr|inboard|outboard)\b",
+    "muscle": r"\(var_m\)\.(npair|pair_\w+|segment_\w+)\b",
+    "hill": r"\(var_m\)\.hill\b",
+    "floating": r"\bquat",  # or a ball; every ball here is on a floating base
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_kernels_hold_the_code_of_the_features_and_no_other(name):
+    scene = task_scene(name)
+    text = source(scene)
+    for feature, pattern in CODE.items():
+        assert bool(re.search(pattern, text)) == (feature in scene.features), feature
+
+
+def test_kernels_without_features_hold_nothing_of_them():
+    text = source(task_scene("hopper").without("contact", "limit", "damping"))
+    assert not re.search(
+        "|".join(CODE[f] for f in ("contact", "limit", "stiffness", "damping", "muscle", "floating")), text
+    )
+    assert re.search(CODE["slide"], text) and len(text) < 0.9 * len(source(task_scene("hopper")))
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_feature_that_is_left_out_changes_nothing_where_it_did_nothing(integrator, rng):
+    """A hopper in the air, within its limits, undamped: the smaller kernels give the same values and gradients."""
+    full = dataclasses.replace(task_scene("hopper"), damping=1e-300 * task_scene("hopper").damping)
+    bare = full.without("contact", "limit", "damping")
+    qpos, qvel, ctrl = acting_states(full, 4, rng)
+    qpos[:, 1], qpos[:, 3:] = 100.0, (full.lower[4:] + full.upper[4:]) / 2
+    results = []
+    for scene in (full, bare):
+        sim = Simulator(scene, 4, dtype=torch.float64, integrator=integrator)
+        leaves = [torch.tensor(x, requires_grad=True) for x in (qpos, 0.1 * qvel, 0.01 * ctrl)]
+        q, v = sim.step(*leaves)
+        results.append([q.detach(), v.detach(), *torch.autograd.grad(q.sum() + v.square().sum(), leaves)])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
