@@ -25,7 +25,7 @@ from torch import Tensor, nn
 import diffsim
 from diffsim import distributed, graph
 from diffsim.evaluation import Evaluation, evaluate, write_video
-from diffsim.run import EpisodeStatistics, Mark, Run, fail, flag, load_checkpoint
+from diffsim.run import EpisodeStatistics, Mark, Run, constants, fail, flag, load_checkpoint
 
 
 @dataclass
@@ -48,9 +48,13 @@ class Args:
     horizon: int | None = None
     """control steps of a rollout (1/60 s each); None: per task"""
     substeps: int | None = None
-    """simulation steps per control step; None: per task"""
-    integrator: Literal["semi_implicit", "implicit"] = "semi_implicit"
-    """time integration of the simulator"""
+    """simulation steps per control step; None: per --accuracy"""
+    integrator: Literal["semi_implicit", "implicit", "extrapolated"] | None = None
+    """time integration of the simulator; None: per --accuracy"""
+    accuracy: Literal["fast", "default", "accurate"] | None = None
+    """the task's preset of integrator and substeps (docs/accuracy.md); None: default, the paper's"""
+    penalty: tuple[str, ...] = ()
+    """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
 
     hidden: tuple[int, ...] | None = None
     """units of the hidden layers that policy and value share; None: per task"""
@@ -324,6 +328,8 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
         saved = Args(**checkpoint["args"])
         if args.evaluate:
             saved.device = None  # wherever it was trained
+        if args.accuracy:  # a preset on the command line replaces the saved numbers, its own or given one by one
+            saved.substeps = saved.integrator = None
         args = tyro.cli(Args, args=argv, description=__doc__, default=saved)
         for name in FIXED:
             if getattr(args, name) != getattr(saved, name):
@@ -350,7 +356,8 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
 
 
 def make_env(args: Args, num_envs: int, horizon: int, seed: int = 0) -> Any:
-    options = dict(substeps=args.substeps, integrator=args.integrator, threads=args.threads)
+    options: dict[str, Any] = dict(substeps=args.substeps, integrator=args.integrator, threads=args.threads)
+    options |= dict(accuracy=args.accuracy or "default", penalty=constants(args.penalty))
     try:
         return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options)
     except ValueError as error:
@@ -387,7 +394,7 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
     env = make_env(args, num_envs, args.horizon, args.seed + rank * 1_000_003)
     eval_env = make_env(args, args.eval_episodes, horizon=1)
     distributed.join(env.device)
-    args.substeps = args.substeps or env.task.substeps
+    args.accuracy, args.substeps, args.integrator = args.accuracy or "default", env.sim.substeps, env.sim.integrator
     torch.manual_seed(args.seed)
     policy, normalise = build(args, env)
     normalise_return, optimizer = Normaliser().to(env.device), ClippedAdam(policy, args)

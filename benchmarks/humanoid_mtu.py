@@ -92,7 +92,7 @@ def read_run(args: Args, folder: Path) -> tuple[dict[str, Any], list[dict[str, A
     normalise.load_state_dict(checkpoint["normalise"])
     evaluation = evaluate(env, lambda obs: actor(normalise(obs)))
     saved = json.loads((folder / "args.json").read_text())
-    substeps = f"{options.substeps}{', implicit' if options.integrator == 'implicit' else ''}"
+    substeps = f"{options.substeps}{'' if options.integrator == 'semi_implicit' else f', {options.integrator}'}"
     key = {"environments": options.num_envs, "substeps": substeps, "device": saved["device"].partition(":")[0]}
     key |= {"seed": options.seed}
     seconds = np.diff([float(row["seconds"]) for row in progress])

@@ -114,7 +114,7 @@ class Args:
     """seconds after which the runs in progress are stopped, to be resumed by the next call; None: no limit"""
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()
     finer: int = 4
-    """the final policies are evaluated a second time with this many times the substeps"""
+    """the final policies are evaluated a second time, explicitly, with this many times the substeps"""
     runs: Path = ROOT / "runs" / "learning"
     """directory of the runs: {runs}/{algorithm}/{env}__{seed}"""
     docs: Path = ROOT / "docs"
@@ -182,8 +182,9 @@ def train(args: Args, env: str, seed: int) -> None:
         return
     substeps = json.loads((folder / "args.json").read_text())["substeps"] or diffsim.TASKS[env].substeps
     evaluation = {"substeps": substeps, "finer_substeps": args.finer * substeps}
-    for key, count in (("own", substeps), ("finer", args.finer * substeps)):
-        if (text := call(args, folder, "--evaluate", checkpoint, "--substeps", count)) is None:
+    finer = ("--substeps", args.finer * substeps, "--integrator", "semi_implicit")
+    for key, setting in (("own", ()), ("finer", finer)):
+        if (text := call(args, folder, "--evaluate", checkpoint, *setting)) is None:
             print(f"{name}: not evaluated, see {folder / 'output.txt'}", flush=True)
             return
         found = re.search(r"return median (-?[\d.]+)", text)
