@@ -27,6 +27,7 @@ MIN_WORK_PER_THREAD = 4_000
 # Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
+LANES = [(lanes, sharers) for lanes in (1, 2, 4, 8, 16) for sharers in (1, 2, 4, 8, 16) if sharers <= lanes]
 
 
 class Simulator:
@@ -48,8 +49,8 @@ class Simulator:
         device: "cpu" or a CUDA device.
         dtype: torch.float32 or torch.float64.
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
-        lanes: GPU threads per environment, and how many of them have the same limbs (kernels/lanes.py), powers of two,
-            at most 16; default as measured to be fastest.
+        lanes: GPU threads per environment, and how many of them have the same limbs (kernels/lanes.py): powers of two
+            up to 16; default as measured to be fastest.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
@@ -86,6 +87,8 @@ class Simulator:
             raise ValueError(f"substeps is {substeps}, must be even for the extrapolated integrator")
         if not 0 <= theta <= 1:
             raise ValueError(f"theta is {theta!r}, must lie in [0, 1]")
+        if lanes not in (None, *LANES):
+            raise ValueError(f"lanes is {lanes!r}, must be one of {', '.join(map(str, LANES))}")
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
         self.device = check_device(device)
@@ -96,13 +99,13 @@ class Simulator:
         self.seconds = {"forward": 0.0, "backward": 0.0}
 
         real, cuda = WARP_DTYPE[dtype], self.device.type == "cuda"
-        lanes, sharers = (lanes or default_lanes(scene, num_envs)) if cuda else (1, 1)
-        shape = shape_of(scene, real, integrator == "implicit", env_last=cuda, lanes=lanes, sharers=sharers)
+        team = (lanes or default_lanes(scene, num_envs)) if cuda else (1, 1)
+        shape = shape_of(scene, real, integrator == "implicit", cuda, *team)
         self._kernels = {"forward": forward_kernel(shape), "backward": backward_kernel(shape)}
-        self._model = model_of(scene, real, str(self.device), lanes, sharers)
+        self._model = model_of(scene, real, str(self.device), *team)
         self._commands: dict[tuple[str, int, int], wp.Launch] = {}
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
-        self._block_dim = 8 if num_envs <= 256 else 32
+        self._block_dim = max(8 if num_envs <= 256 else 32, shape.lanes)
         self._chunks = self._split(threads, shape.nlink)
         self._pool = ThreadPoolExecutor(len(self._chunks) - 1) if len(self._chunks) > 1 else None
 
@@ -123,7 +126,9 @@ class Simulator:
         self._coarse: Simulator | None = None
         if integrator == "extrapolated":
             half = substeps // 2
-            self._coarse = Simulator(scene, n, control_dt, half, horizon, device=device, dtype=dtype, threads=threads)
+            self._coarse = Simulator(
+                scene, n, control_dt, half, horizon, device=device, dtype=dtype, threads=threads, lanes=lanes
+            )
             self._coarse.nonfinite_gradients, self._coarse.seconds = self.nonfinite_gradients, self.seconds
             first = [*scene.qpos_adr[scene.ball == 0], *([3] if scene.floating else [])]
             self._quaternions = torch.tensor([range(k, k + 4) for k in first], device=self.device)
