@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import gc
 import importlib.util
 import itertools
 import json
@@ -343,11 +344,22 @@ def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[
     """Seconds of a window of control steps, without gradients, differentiably, and with its backward; peak memory."""
     device = "cuda" if "cuda" in technique else "cpu"
     if device == "cuda":
+        gc.collect()  # the graphs of the setting before
         torch.cuda.empty_cache()
+        torch.cuda.synchronize()
         free = torch.cuda.mem_get_info()[0]
-    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique)
-    env = diffsim.make(name, num_envs=num_envs, seed=0, horizon=horizon, device=device, threads=threads)
-    sim, (start_qpos, start_qvel) = env.sim, (env.qpos.clone(), env.qvel.clone())
+    env = diffsim.make(name, num_envs=num_envs, seed=0, device=device)
+    sim = diffsim.Simulator(
+        env.scene,
+        num_envs,
+        env.control_dt,
+        env.task.substeps,
+        horizon,
+        device=device,
+        threads={"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique),
+        lanes=(1, 1) if "one thread" in technique else None,
+    )
+    start_qpos, start_qvel = env.qpos.clone(), env.qvel.clone()
     actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()
 
     def forward() -> torch.Tensor:
@@ -362,7 +374,7 @@ def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[
 
     seconds: dict[str, Any] = {}
     for what, function in (("no_grad", torch.no_grad()(forward)), ("forward", forward), ("both", both)):
-        call = graph.capture(function, device) if technique == "cuda graph" else function
+        call = graph.capture(function, device) if "graph" in technique else function
         fastest = float("inf")
         for k in range(7):
             if device == "cuda":
@@ -379,7 +391,9 @@ def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[
 
 
 def measure_scaling(args: Args, table: Table) -> None:
-    techniques = ["cuda graph", "cuda, eager"] if args.device != "cpu" else ["cpu, 1 thread", "cpu, all cores"]
+    techniques = ["cuda graph", "cuda graph, one thread per environment", "cuda, eager"]
+    if args.device == "cpu":
+        techniques = ["cpu, 1 thread", "cpu, all cores"]
     for name in args.env:
         task = diffsim.TASKS[name]
         settings = [(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons]
