@@ -236,7 +236,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             for b in range(m.ball_count[lane]):
                 i = m.ball_slot[lane * NBALL + b]
                 adr = qpos_adr(m, at + i)
-                wb = next_rate(ck_v, ck_a, end, VADR + i, e, h)
+                wb = next_rate(ck_v, ck_a, end, VADR + link_of(m, at + i), e, h)
                 rot_b = wp.normalize(load_quat_row(ck_q, end, adr, e) * exp_quat(h * wb))
                 gb = to_tangent(rot_b, load_quat(g_qpos_out, e, adr))
                 for k in range(3):
@@ -265,7 +265,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                     i = m.ball_slot[lane * NBALL + b]
                     turn[b] = load_quat_row(ck_q, row, qpos_adr(m, at + i), e)
                     gb = vec3(gq[i], gq[i + 1], gq[i + 2])
-                    gb_turn, gb_start = exp_adjoint(h * next_rate(ck_v, ck_a, row, VADR + i, e, h), gb)
+                    gb_turn, gb_start = exp_adjoint(h * next_rate(ck_v, ck_a, row, VADR + link_of(m, at + i), e, h), gb)
                     for k in range(3):
                         gqd[i + k] = gqd[i + k] + h * (gb_turn[k] - gb[k])
                         gq[i + k] = gb_start[k]
