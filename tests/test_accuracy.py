@@ -313,6 +313,7 @@ def test_cartpole_upright_and_hanging():
 
 def source(scene):
     """Warp's C++ of the scene's forward and backward kernel."""
+    wp.init()
     shape, text = shape_of(scene, wp.float64, implicit=False, env_last=False), ""
     for build in (forward_kernel, backward_kernel):
         module = build(shape).module
@@ -329,7 +330,7 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "damping": r"\(var_m\)\.damping\b",
     "slide": r"\(var_m\)\.slide\b",
     "hinge": r"\bsin\(",
-    "motor": r"\(var_m\)\.motor_link\b",
+    "motor": r"\(var_m\)\.motor_slot\b",
     "ball": r"\(var_m\)\.(ball_link|qpos_adr|inboard|outboard)\b",
     "muscle": r"\(var_m\)\.(npair|pair_\w+|segment_\w+)\b",
     "hill": r"\(var_m\)\.hill\b",

@@ -47,7 +47,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     uses = shape.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
     NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
-    MUSCLE, HILL = "muscle" in uses, "hill" in uses
+    MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1
     VADR, NBALL, BALL_SPRING = shape.dof0 - 1, shape.nball, shape.nball > 0 and "stiffness" in uses
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
@@ -431,7 +431,9 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         keep = finite and not contained
         for k in range(NU):
             if m.motor_lane[k] == lane:
-                g = gtau[m.motor_slot[lane * NU + k]]
+                g = T(0.0)
+                if wp.static(MOTOR):
+                    g = gtau[m.motor_slot[lane * NU + k]]
                 if wp.static(MUSCLE):
                     g = g + g_pull[k]
                 g_ctrl[e, k] = wp.where(keep, g * m.gear[k], T(0.0))

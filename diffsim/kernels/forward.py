@@ -35,7 +35,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     muscle = muscle_law(shape, adjoint=False)
     add_pull, measure, hill = muscle.add_pull, muscle.measure, muscle.hill
     NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
-    MUSCLE, HILL = "muscle" in uses, "hill" in uses
+    MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1  # the first link with inertia
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
     VADR = shape.dof0 - 1  # link i's joint in qvel is VADR + i
@@ -175,9 +175,10 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
             tension = wp.zeros(shape=NU, dtype=T)
             lengths = wp.zeros(shape=NU, dtype=T)
             rates = wp.zeros(shape=NU, dtype=T)
-        for k in range(NU):
-            i = m.motor_slot[lane * NU + k]
-            motor[i] = motor[i] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+        if wp.static(MOTOR):
+            for k in range(NU):
+                i = m.motor_slot[lane * NU + k]
+                motor[i] = motor[i] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
         for i in range(1, n):
             q[i] = qpos[e, qpos_adr(m, at + i)]
             qd[i] = qvel[e, VADR + link_of(m, at + i)]
