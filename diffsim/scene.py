@@ -57,6 +57,7 @@ class Scene:
         muscle_model: "linear" (the paper's: force = maximum force times activation) or "hill".
         contact_link, contact_position, contact_radius: (nc,), (nc, 3), (nc,) spheres that may touch the ground.
         k_n, k_d, k_t, mu, k_limit, d_limit: penalty constants, see PENALTY_DEFAULTS.
+        density, viscosity: of the fluid around the robot, kg/m^3 and kg/(m s).
     """
 
     name: str
@@ -100,6 +101,8 @@ class Scene:
     mu: float
     k_limit: float
     d_limit: float
+    density: float = 0.0
+    viscosity: float = 0.0
 
     def __post_init__(self) -> None:
         if self.muscle_model not in MUSCLE_MODELS:
@@ -150,6 +153,7 @@ class Scene:
             "motor": bool((self.motor_link > 0).any()),
             "muscle": len(self.segment_muscle) > 0,
             "hill": len(self.segment_muscle) > 0 and self.muscle_model == "hill",
+            "drag": self.density > 0 or self.viscosity > 0,
         }
         return frozenset(name for name, used in present.items() if used)
 
@@ -168,8 +172,26 @@ class Scene:
             link += 1
         return link
 
+    @property
+    def drag(self) -> tuple[Array, Array, Array, Array]:
+        """The fluid's drag on each link, MuJoCo's inertia-box law; see kernels/drag.py for its form.
+
+        Returns:
+            principal axes (nlink, 3, 3) in the link's frame; the viscous coefficients (nlink, 3) of force and torque,
+            then 0; the pressure coefficients of force and of torque (nlink, 3) each, per principal axis.
+        """
+        moments, axes = np.linalg.eigh(self.inertia)
+        mass = np.where(self.mass > 0, self.mass, np.inf)[:, None]
+        # The sides of the box of uniform density that has this inertia
+        sides = np.sqrt(np.maximum(moments.sum(1, keepdims=True) - 2 * moments, 0.0) * 6 / mass)
+        diameter, (x, y, z) = sides.mean(1), sides.T
+        viscous = np.pi * self.viscosity * np.stack((3 * diameter, diameter**3, 0 * diameter), 1)
+        force = 0.5 * self.density * np.stack((y * z, x * z, x * y), 1)
+        torque = self.density / 64 * np.stack((x * (y**4 + z**4), y * (x**4 + z**4), z * (x**4 + y**4)), 1)
+        return axes, viscous, force, torque
+
     def without(self, *features: str) -> Scene:
-        """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping", "muscle".
+        """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping", "muscle", "drag".
 
         Raises:
             ValueError: a feature that cannot be left out.
@@ -189,6 +211,7 @@ class Scene:
                 "segment_position": np.zeros((0, 2, 3)),
                 "segment_muscle": np.zeros(0, np.int32),
             },
+            "drag": {"density": 0.0, "viscosity": 0.0},
         }
         changes: dict[str, Any] = {}
         for feature in features:
@@ -253,6 +276,8 @@ class _Reader:
             com=com,
             inertia=inertia,
             gravity=np.array(m.opt.gravity),
+            density=float(m.opt.density),
+            viscosity=float(m.opt.viscosity),
             **columns,
             **self._actuators(),
             **self._contacts(),
@@ -282,11 +307,19 @@ class _Reader:
             for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited"):
                 if self._any(f"tendon_{field}", d):
                     raise self._error(f"{name}: {field} of a tendon is not simulated")
-        if m.opt.density or m.opt.viscosity or np.any(m.opt.wind):
-            raise self._error("option density, viscosity or wind: a fluid is not simulated")
+        if np.any(m.opt.wind):
+            raise self._error("option wind: only a fluid at rest is simulated")
         for b in range(m.nbody):
+            welded = 0 < b and m.body_mass[b] > 0 and not m.body_jntnum[b]
+            if (m.opt.density or m.opt.viscosity) and welded and m.body_weldid[b]:
+                raise self._error(
+                    f"{self._name(obj.mjOBJ_BODY, b)}: in a fluid each body needs a joint; merge its geoms"
+                )
             if m.body_gravcomp[b] or m.body_mocapid[b] >= 0:
                 raise self._error(f"{self._name(obj.mjOBJ_BODY, b)}: gravcomp and mocap are not simulated")
+        for g in range(m.ngeom):
+            if (m.opt.density or m.opt.viscosity) and m.geom_fluid[g, 0]:
+                raise self._error(f"{self._name(obj.mjOBJ_GEOM, g)}: fluidshape ellipsoid is not simulated")
         for j in range(m.njnt):
             name, dof = self._name(obj.mjOBJ_JOINT, j), m.jnt_dofadr[j]
             if m.jnt_actfrclimited[j]:

@@ -205,7 +205,28 @@ def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float =
         drift = drift - np.cross(link.angular_velocity, velocity)
         mass = mass + jacobian.T @ np.diag(resistance) @ jacobian
         force = force + jacobian.T @ (push - resistance * drift)
-    return np.linalg.solve(mass, force)
+    return np.linalg.solve(mass, force + fluid_forces(scene, links))
+
+
+def fluid_forces(scene: Scene, links: list[Link]) -> Array:
+    """(nv,) drag of the fluid: on each link that of the box of uniform density with its mass and inertia."""
+    total = np.zeros(scene.nv)
+    for i, link in enumerate(links):
+        if scene.mass[i] == 0 or not (scene.density or scene.viscosity):
+            continue
+        moments, axes = np.linalg.eigh(scene.inertia[i])
+        a, b, c = np.sqrt(6 * (moments.sum() - 2 * moments) / scene.mass[i])
+        mean = (a + b + c) / 3
+        frame = link.rotation @ axes
+        velocity, jacobian, _ = link.point(link.rotation @ scene.com[i])
+        l, w = frame.T @ velocity, frame.T @ link.angular_velocity
+        force = -3 * np.pi * scene.viscosity * mean * l
+        force -= scene.density / 2 * np.array([b * c, a * c, a * b]) * np.abs(l) * l
+        torque = -np.pi * scene.viscosity * mean**3 * w
+        arms = np.array([a * (b**4 + c**4), b * (a**4 + c**4), c * (a**4 + b**4)])
+        torque -= scene.density / 64 * arms * np.abs(w) * w
+        total += jacobian.T @ frame @ force + link.angular_jacobian.T @ frame @ torque
+    return total
 
 
 def integrate(scene: Scene, qpos: Array, qvel: Array, h: float) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import diffsim
 from diffsim.scene import Scene, load_scene
 from diffsim.simulator import Simulator
-from diffsim.tasks import TASKS
+from diffsim.tasks import PLANAR, TASKS
 
 Array = NDArray[np.float64]
 
@@ -155,7 +155,7 @@ def parse(mjcf: str) -> Scene:
 
 @cache
 def task_scene(name: str) -> Scene:
-    return load_scene(Path(diffsim.__file__).parent / "assets" / TASKS[name].asset)
+    return load_scene(Path(diffsim.__file__).parent / "assets" / (TASKS | PLANAR)[name].asset)
 
 
 @cache

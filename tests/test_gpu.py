@@ -17,6 +17,7 @@ from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.model import shape_of
 from diffsim.simulator import Simulator, default_lanes
+from diffsim.tasks import PLANAR
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import bptt  # noqa: E402
@@ -27,7 +28,7 @@ cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GP
 HORIZON = 32
 
 
-@pytest.mark.parametrize("name", diffsim.TASKS)
+@pytest.mark.parametrize("name", [*diffsim.TASKS, *PLANAR])
 def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> None:
     """And they hold no code for what the scene lacks."""
     scene = task_scene(name)

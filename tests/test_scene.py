@@ -253,7 +253,7 @@ def test_without():
     assert bare.features == {"floating", "hinge", "motor"} and bare.ncontact == 0
     assert scene.features > bare.features
     assert scene.without("contact").features == scene.features - {"contact"}
-    with pytest.raises(ValueError, match="floating.*contact, limit, stiffness, damping, muscle"):
+    with pytest.raises(ValueError, match="floating.*contact, limit, stiffness, damping, muscle, drag"):
         scene.without("floating")
 
 
@@ -375,7 +375,15 @@ UNSUPPORTED = {
         robot('<body><joint/><geom size="0.1"/></body><body><freejoint name="loose"/><geom size="0.1"/></body>'),
         "loose",
     ),
-    "fluid": (pendulum(rest='<option viscosity="1"/>'), "viscosity"),
+    "wind": (pendulum(rest='<option viscosity="1" wind="1 0 0"/>'), "wind"),
+    "ellipsoid in a fluid": (
+        pendulum(inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'),
+        "hull",
+    ),
+    "welded in a fluid": (
+        pendulum(inside='<body name="fin"><geom size="0.1"/></body>', rest='<option density="1"/>'),
+        "fin",
+    ),
     "no joint": (robot('<body><geom size="0.1"/></body>'), "no joint"),
     "negative penalty": (pendulum(rest='<custom><numeric name="k_n" data="-1"/></custom>'), "k_n"),
 }

@@ -22,6 +22,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.contact import contact_law
+from diffsim.kernels.drag import drag_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
@@ -46,6 +47,8 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     measure, hill, add_pull_adjoint = muscle.measure, muscle.hill, muscle.add_pull_adjoint
     uses = shape.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
+    DRAG, drag = "drag" in uses, drag_law(T)
+    drag_wrench, drag_adjoint = drag.drag_wrench, drag.drag_adjoint
     NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1
@@ -111,6 +114,9 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         adj_v = momentum(m.mass[k], com, inertia, wp.spatial_cross(W, V))
         adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
         adj_p = vec6()
+        if wp.static(DRAG):
+            adj_w = adj_w - drag_wrench(m, k, R, com, V)
+            adj_v = adj_v + drag_adjoint(m, k, R, com, V, W)
         if wp.static(CONTACT):
             for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
                 p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)

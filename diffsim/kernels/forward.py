@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.contact import contact_law
+from diffsim.kernels.drag import drag_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
@@ -34,6 +35,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     passive_force, passive_gain = joint.passive_force, joint.passive_gain
     muscle = muscle_law(shape, adjoint=False)
     add_pull, measure, hill = muscle.add_pull, muscle.measure, muscle.hill
+    DRAG, drag_wrench = "drag" in uses, drag_law(T).drag_wrench
     NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
     FIRST = 0 if FLOATING else 1  # the first link with inertia
@@ -52,6 +54,8 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
         Ia = inertia - Ib * wp.skew(com)
         Id = wp.diag(vec3(mass, mass, mass))
         F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
+        if wp.static(DRAG):
+            F = F - drag_wrench(m, k, R, com, V)
         if wp.static(CONTACT):
             for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
                 p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)

@@ -119,6 +119,10 @@ def types(dtype: type) -> SimpleNamespace:
         contact_begin: wp.array(dtype=int)  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
+        drag_frame: wp.array(dtype=mat3)  # principal axes in the link's frame, see drag.py
+        drag_viscous: wp.array(dtype=vec3)  # (a, c, 0)
+        drag_force: wp.array(dtype=vec3)
+        drag_torque: wp.array(dtype=vec3)
         gravity: vec3
         carrier_height: dtype  # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
         k_n: dtype
@@ -223,6 +227,10 @@ def model_of(scene: Scene, dtype: type, device: str, lanes: int = 1, sharers: in
     model.contact_begin = put(np.searchsorted(entry, np.arange(len(links) + 1)).astype(np.int32), int)
     model.contact_position = put(scene.contact_position[sphere], t.vec3)
     model.contact_radius = put(scene.contact_radius[sphere], dtype)
+    frame, *coefficients = scene.drag
+    model.drag_frame = put_links(frame, t.mat3)
+    for name, value in zip(("drag_viscous", "drag_force", "drag_torque"), coefficients, strict=True):
+        setattr(model, name, put(value[links] * carried[:, None], t.vec3))
     model.gravity = t.vec3(*scene.gravity)
     # Along the chain of slides that ends at the carrier nothing turns, so the offsets add up as they are.
     frame, height = np.eye(3), 0.0

@@ -9,7 +9,9 @@ from .half_cheetah import HalfCheetah
 from .hopper import Hopper
 from .humanoid import Humanoid
 from .humanoid_mtu import HumanoidMTU
+from .planar import Swimmer, Walker
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU)}
+PLANAR: dict[str, type[Task]] = {task.name: task for task in (Swimmer, Walker)}  # of guided policy search
 
-__all__ = ["TASKS", "Accuracy", "Integration", "Task"]
+__all__ = ["PLANAR", "TASKS", "Accuracy", "Integration", "Task"]

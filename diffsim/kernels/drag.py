@@ -1,0 +1,56 @@
+"""The drag of a fluid at rest on one link, MuJoCo's inertia-box law, and its adjoint.
+
+A link feels drag as the box of uniform density that has its inertia. In the box's principal axes, with velocity l of
+the centre of mass and angular velocity w, each component by itself,
+
+    f = -(a l + b |l| l),   torque = -(c w + d |w| w),
+
+with a and c the viscous drag of a sphere of the box's mean side, b and d the pressure on its faces (Scene.drag).
+
+The law does not know where the link is: turned together with all its motion, it is the same. So like the inertial part
+of phi it has no adjoint of the pose, only one of the velocity (backward.py). Both integrators take it explicitly.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.model import types
+from diffsim.kernels.spatial import spatial
+
+
+@cache
+def drag_law(dtype: type) -> SimpleNamespace:
+    t, sp = types(dtype), spatial(dtype)
+    T, vec3, vec6, mat3, Model = dtype, t.vec3, t.vec6, t.mat3, t.Model
+    join, force_at, point_velocity = sp.join, sp.force_at, sp.point_velocity
+
+    @wp.func
+    def wrench(F: mat3, com: vec3, force: vec3, torque: vec3):
+        """Of a force through com and a torque, both in the box's axes F."""
+        return force_at(com, F * force) + join(F * torque, vec3())
+
+    @wp.func
+    def drag_wrench(m: Model, i: int, R: mat3, com: vec3, V: vec6):
+        """The fluid's wrench on link i, whose centre of mass is at com."""
+        F = R * m.drag_frame[i]
+        l = wp.transpose(F) * point_velocity(V, com)
+        w = wp.transpose(F) * wp.spatial_top(V)
+        f = m.drag_viscous[i][0] * l + wp.cw_mul(m.drag_force[i], wp.cw_mul(wp.abs(l), l))
+        torque = m.drag_viscous[i][1] * w + wp.cw_mul(m.drag_torque[i], wp.cw_mul(wp.abs(w), w))
+        return wrench(F, com, -f, -torque)
+
+    @wp.func
+    def drag_adjoint(m: Model, i: int, R: mat3, com: vec3, V: vec6, W: vec6):
+        """Adjoint of V of -W . drag_wrench(V)."""
+        F = R * m.drag_frame[i]
+        l = wp.transpose(F) * point_velocity(V, com)
+        w = wp.transpose(F) * wp.spatial_top(V)
+        wl = wp.transpose(F) * point_velocity(W, com)
+        ww = wp.transpose(F) * wp.spatial_top(W)
+        g_l = m.drag_viscous[i][0] * wl + T(2.0) * wp.cw_mul(m.drag_force[i], wp.cw_mul(wp.abs(l), wl))
+        g_w = m.drag_viscous[i][1] * ww + T(2.0) * wp.cw_mul(m.drag_torque[i], wp.cw_mul(wp.abs(w), ww))
+        return wrench(F, com, g_l, g_w)
+
+    return SimpleNamespace(drag_wrench=drag_wrench, drag_adjoint=drag_adjoint)

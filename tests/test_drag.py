@@ -1,0 +1,106 @@
+"""A fluid's drag: against MuJoCo, the plain reference, closed forms and central differences."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import reference
+import torch
+from scenes import acceleration, free_states, parse, run
+from test_gradient import check_gradients
+
+from diffsim.simulator import Simulator
+
+# A free box of three unlike sides, two more on hinges about unlike axes, one of them on a slide besides. It is fast in
+# its fluid, so that both parts of the law count.
+FISH = """
+<mujoco>
+  <option density="300" viscosity="2" gravity="0.3 -0.2 -9.81"/>
+  <default> <geom contype="0" conaffinity="0"/> </default>
+  <worldbody>
+    <body>
+      {root} <geom type="box" size="0.2 0.1 0.05" euler="10 20 30" pos="0.1 0.02 0.03" density="400"/>
+      <body pos="0.3 0 0.1">
+        <joint name="a" axis="0.2 1 0.1" damping="0.1"/> <geom type="box" size="0.1 0.05 0.2" density="400"/>
+        <body pos="0 0.1 0.2">
+          <joint axis="0 0 1" type="slide"/> <joint name="b" axis="1 0 0.3"/>
+          <geom type="capsule" size="0.05 0.2" euler="40 0 0" density="400"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator> <motor joint="a" gear="5"/> <motor joint="b" gear="5"/> </actuator>
+</mujoco>"""
+ROOTS = {
+    "floating": "<freejoint/>",
+    "planar": '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><joint axis="0 0 1"/>',
+    "fixed": '<joint axis="0 1 1"/>',
+}
+BALL = """
+<mujoco>
+  <option density="3" viscosity="{viscosity}" gravity="0 0 0"/>
+  <worldbody> <body> <freejoint/> <geom type="sphere" size="0.1" mass="2"/> </body> </worldbody>
+</mujoco>"""
+
+
+@pytest.fixture(params=ROOTS)
+def fish(request):
+    return parse(FISH.format(root=ROOTS[request.param]))
+
+
+def states_of(scene, rng):
+    qpos, qvel, ctrl = free_states(scene, 8, rng)
+    return qpos, 2 * qvel, ctrl
+
+
+def test_accelerations_are_mujocos(fish, rng):
+    model, data = fish.mj_model, mujoco.MjData(fish.mj_model)
+    states = states_of(fish, rng)
+    for state, qacc in zip(zip(*states, strict=True), acceleration(fish, *states), strict=True):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state
+        mujoco.mj_forward(model, data)
+        assert np.abs(data.qfrc_fluid).min() > 1e-3
+        np.testing.assert_allclose(qacc, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
+def test_steps_are_the_references(fish, integrator, rng):
+    states = states_of(fish, rng)
+    q, v = run(fish, *states, substeps=4, integrator=integrator)
+    for e, state in enumerate(zip(*states, strict=True)):
+        expected = reference.step(fish, *state, 1 / 60, 4, integrator=integrator)
+        np.testing.assert_allclose(q[e], expected[0], atol=1e-10)
+        np.testing.assert_allclose(v[e], expected[1], atol=1e-10)
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
+def test_gradient_is_that_of_differences(fish, integrator, rng):
+    check_gradients(fish, states_of(fish, rng), rng, substeps=8, integrator=integrator)
+
+
+def test_gradient_at_rest_is_the_viscous_one(rng):
+    """|v| v has slope 0 at 0, so a body at rest feels viscosity only, and no division by zero."""
+    for viscosity in (0.0, 2.0):
+        scene = parse(BALL.format(viscosity=viscosity))
+        qpos = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
+        qvel = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
+        sim = Simulator(scene, 1, control_dt=0.01, substeps=1, dtype=torch.float64)
+        _, after = sim.step(qpos, qvel, torch.zeros(1, 0, dtype=torch.float64))
+        (slope,) = torch.autograd.grad(after[0, 0], qvel)
+        side = np.sqrt(0.4 * 6) * 0.1  # of the cube with the sphere's inertia
+        assert slope[0, 0].item() == pytest.approx(1 - 0.01 * 3 * np.pi * side * viscosity / 2, rel=1e-12)
+
+
+def test_terminal_velocity():
+    """A cube that falls in a fluid without viscosity ends at m g = rho / 2 s^2 v^2."""
+    scene = parse(BALL.format(viscosity=0).replace('gravity="0 0 0"', 'gravity="0 0 -9.81"').replace('"3"', '"100"'))
+    state = np.zeros((1, 7)), np.zeros((1, 6)), np.zeros((1, 0))
+    state[0][0, 3] = 1.0
+    _, v = run(scene, *state, steps=600, substeps=4)
+    assert v[0, 2] == pytest.approx(-np.sqrt(2 * 2 * 9.81 / (100 * 0.4 * 6 * 0.1**2)), rel=1e-6)
+
+
+def test_no_fluid_no_kernel_code():
+    scene = parse(FISH.format(root=ROOTS["floating"]))
+    assert "drag" in scene.features and "drag" not in scene.without("drag").features
