@@ -829,7 +829,7 @@ def make_system(args: Args) -> System:
 
 def film(directory: Path, search: Search, evaluation: Evaluation) -> None:
     """The trajectory without noise."""
-    length = torch.tensor([search.args.horizon])
+    length = torch.full_like(evaluation.lengths[:1], search.args.horizon)
     shown = Evaluation(evaluation.returns[:1], length, evaluation.speed, evaluation.qpos[:, :1])
     try:
         print(f"video: {write_video(directory / 'video.mp4', search.system, shown)}")
