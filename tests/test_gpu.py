@@ -34,6 +34,7 @@ def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> Non
     scene = task_scene(name)
     shape = shape_of(scene, wp.float32, False, True, *default_lanes(scene, 64))
     functions = {"add_pull": "muscle", "measure": "hill", "place_balls": "ball", "sphere_state": "contact"}
+    functions["drag_wrench"] = "drag"
     for kernel in (forward_kernel(shape), backward_kernel(shape)):
         directory = tmp_path / kernel.key
         wp.compile_aot_module(kernel.module, device=None, arch=90, module_dir=directory, strip_hash=True)
