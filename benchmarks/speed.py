@@ -100,15 +100,15 @@ class Table:
 
     name: str
     key: tuple[str, ...]
+    directory: Path
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, **row: Any) -> None:
+        """A row, which the file has at once: a measurement cut short keeps what it has."""
         self.rows.append({k: digits(v) for k, v in row.items()})
         print(" ", ", ".join(f"{k} {v}" for k, v in self.rows[-1].items()), flush=True)
-
-    def write(self, directory: Path) -> None:
-        path = directory / f"speed_{self.name}.csv"
-        directory.mkdir(parents=True, exist_ok=True)
+        path = self.directory / f"speed_{self.name}.csv"
+        self.directory.mkdir(parents=True, exist_ok=True)
         merged: dict[tuple[str, ...], dict[str, Any]] = {}
         if path.is_file():
             with path.open(newline="") as file:
@@ -559,11 +559,10 @@ def main(args: Args) -> None:
             continue
         measure, key = measures[part]
         print(f"{part}:", flush=True)
-        tables.append(Table(part, key))
+        tables.append(Table(part, key, args.output))
         measure(args, tables[-1])
         if not tables[-1].rows:
             fail(f"none of {', '.join(args.env)} has muscles")
-        tables[-1].write(args.output)
     for table in tables:
         print(f"\n{table.markdown()}")
     if {"scaling", "picture"} & set(args.parts):

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+from diffsim import graph
+
 
 def choose_device(device: str | None) -> str:
     """The device of this process: the given one, or a GPU if there is one; of several ranks each takes its own GPU."""
@@ -24,7 +26,9 @@ def join(device: torch.device) -> None:
 
 
 def leave() -> None:
+    """Part from the other ranks; NCCL would wait for ever for the graphs that hold its operations, so they go first."""
     if dist.is_initialized():
+        graph.release()
         dist.destroy_process_group()
 
 

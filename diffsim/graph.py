@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, TypeVar
+from weakref import WeakSet
 
 import torch
 
@@ -13,6 +14,7 @@ Result = TypeVar("Result")
 
 # Calls that run eagerly before the capture: they compile kernels, allocate optimiser state and pick algorithms.
 WARMUP = 2
+_captured: WeakSet[torch.cuda.CUDAGraph] = WeakSet()
 
 
 def capture(
@@ -34,6 +36,7 @@ def capture(
         return function
     stream = torch.cuda.Stream(device)
     graph = torch.cuda.CUDAGraph()
+    _captured.add(graph)
     if env is not None:
         graph.register_generator_state(env.generator)
     calls, result = 0, None
@@ -58,3 +61,9 @@ def capture(
         return result
 
     return call
+
+
+def release() -> None:
+    """Drop what was captured; the captured functions must not be called again."""
+    for graph in list(_captured):
+        graph.reset()
