@@ -68,9 +68,11 @@ class Args:
     horizon: int | None = None
     """control steps T of a trajectory; None: per task"""
     substeps: int | None = None
-    """simulation steps per control step; None: per task"""
-    integrator: Literal["semi_implicit", "implicit"] = "semi_implicit"
-    """time integration of the simulator"""
+    """simulation steps per control step; None: per --accuracy"""
+    integrator: Literal["semi_implicit", "implicit", "extrapolated"] | None = None
+    """time integration of the simulator; None: per --accuracy"""
+    accuracy: Literal["fast", "default", "accurate"] | None = None
+    """the task's preset of integrator and substeps (docs/accuracy.md); None: default, the paper's"""
     reward: Literal["native", "target"] | None = None
     """the task's own reward, or the paper's: squared errors of velocity and height; None: per task"""
     action_cost: float | None = None
@@ -190,8 +192,11 @@ class System(Dynamics):
     def __init__(self, args: Args) -> None:
         self.args, self.task = args, TASKS[args.env](check_device(args.device), REAL)
         scene = diffsim.load_scene(str(files("diffsim") / "assets" / self.task.asset))
-        substeps = self.task.substeps if args.substeps is None else args.substeps
-        super().__init__(scene, self.task.control_dt, substeps, args.integrator, args.device, args.threads)
+        preset = self.task.integration(args.accuracy or "default")
+        args.substeps = preset.substeps if args.substeps is None else args.substeps
+        args.integrator = args.integrator or preset.integrator
+        integration = (args.substeps, args.integrator, preset.theta)
+        super().__init__(scene, self.task.control_dt, *integration, args.device, args.threads)
         self.root_height = 0.0 if scene.floating else float(scene.mj_model.body_pos[1, 2])
         self.no_action = torch.zeros(self.nu, dtype=REAL, device=self.device)
         self.demonstration: tuple[Tensor, Tensor] | None = None  # x (T + 1, nx), u (T, nu)
@@ -784,6 +789,8 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
         saved = Args(**checkpoint["args"])
         if args.evaluate:
             saved.device = None  # wherever it was trained
+        if args.accuracy:  # a preset on the command line replaces the saved numbers, its own or given one by one
+            saved.substeps = saved.integrator = None
         args = tyro.cli(Args, args=argv, description=__doc__, default=saved)
         for name in FIXED:
             if getattr(args, name) != getattr(saved, name):

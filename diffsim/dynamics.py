@@ -29,7 +29,7 @@ class Dynamics:
 
     Args:
         scene: the robot.
-        control_dt, substeps, integrator, device, threads: see Simulator.
+        control_dt, substeps, integrator, theta, device, threads: see Simulator.
 
     Raises:
         ValueError: see Simulator.
@@ -44,12 +44,13 @@ class Dynamics:
         control_dt: float,
         substeps: int,
         integrator: str = "semi_implicit",
+        theta: float = 0.0,
         device: str | torch.device = "cpu",
         threads: int | None = None,
     ) -> None:
         self.scene, self.control_dt, self.device = scene, control_dt, check_device(device)
         self.nq, self.nv, self.nu, self.nx, self.nd = scene.nq, scene.nv, scene.nu, scene.nq + scene.nv, 2 * scene.nv
-        self._options = dict(substeps=substeps, integrator=integrator, threads=threads)
+        self._options = dict(substeps=substeps, integrator=integrator, theta=theta, threads=threads)
         self._simulators: dict[int, Simulator] = {}
         self.steps = 0
         self.simulator(1)
