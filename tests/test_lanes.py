@@ -74,3 +74,10 @@ def test_the_lanes_models_add_up(name: str) -> None:
                 seen.append((model.segment_muscle.numpy()[s], *link[lane, pairs[pair]]))
                 assert seen[-1][0] in d.muscles[lane]
     assert sorted(seen) == sorted(zip(scene.segment_muscle, *scene.segment_link.T, strict=True))
+
+
+@pytest.mark.parametrize("lanes", [(3, 1), (2, 4), (32, 1), 4])
+def test_lanes_are_checked(lanes: object) -> None:
+    scene = task_scene("cartpole")
+    with pytest.raises(ValueError, match="lanes is .* must be one of"):
+        diffsim.Simulator(scene, 1, lanes=lanes)  # type: ignore[arg-type]
