@@ -158,12 +158,16 @@ def model_of(scene: Scene, dtype: type, device: str, lanes: int = 1, sharers: in
         # Warp gives an empty array no address; one unread element keeps the struct uniform.
         return wp.array(values if len(values) else np.zeros((1, *values.shape[1:])), dtype=kind, device=device)
 
+    def padded(rows: list[list[int]], width: int) -> np.ndarray:
+        return np.array([[*row, *[0] * (width - len(row))] for row in rows], np.int32).flatten()
+
+    # The entries of all lanes in a row: which link each is, and of which lane; of each lane the slot of each link.
     d = divide(scene, lanes, sharers)
-    links = np.array([row + [0] * (d.slots - len(row)) for row in d.links]).flatten()
+    links, lane_of = padded(d.links, d.slots), np.repeat(np.arange(lanes), d.slots)
     slot = np.zeros((lanes, scene.nlink), np.int32)
     for lane, row in enumerate(d.links):
         slot[lane, row] = np.arange(len(row))
-    lane_of = np.repeat(np.arange(lanes), d.slots)
+    carried = np.array([link in d.weighs[lane] for lane, link in zip(lane_of, links, strict=True)], float)
 
     def put_links(values: Any, kind: type) -> wp.array:
         return put(values[links], kind)
@@ -179,24 +183,17 @@ def model_of(scene: Scene, dtype: type, device: str, lanes: int = 1, sharers: in
     model.turn2 = put_links(-hinge * (r @ (square * cos + skew * sin)), t.mat3)
     position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * axis
     model.position, model.axis = put_links(position, t.vec3), put_links(axis, t.vec3)
-    model.count, model.link = (
-        put(np.array([len(row) for row in d.links], np.int32), int),
-        put(links.astype(np.int32), int),
+    model.count, model.link = put(np.array([len(row) for row in d.links], np.int32), int), put(links, int)
+    model.parent, model.slide = (
+        put(slot[lane_of, scene.parent[links]], int),
+        put_links(scene.slide.astype(np.int32), int),
     )
-    model.parent = put(slot[lane_of, scene.parent[links]], int)
-    model.slide = put_links(scene.slide.astype(np.int32), int)
     first, last = (np.arange(scene.nlink) + np.where(scene.ball < 0, 0, k - scene.ball) for k in (0, 2))
-    balls = np.array(
-        [
-            row + [0] * (scene.nball - len(row))
-            for row in ([k for k, i in enumerate(links) if scene.ball[i] == 0] for links in d.links)
-        ]
-    )
-    model.ball_count = put(np.array([(scene.ball[row] == 0).sum() for row in d.links], np.int32), int)
-    model.ball_slot = put(balls.astype(np.int32).flatten(), int)
     model.qpos_adr, model.inboard = put_links(scene.qpos_adr, int), put(slot[lane_of, scene.parent[first][links]], int)
     model.outboard = put(slot[lane_of, last[links]], int)
-    carried = np.array([link in d.weighs[lane] for lane, link in zip(lane_of, links, strict=True)], float)
+    balls = [np.flatnonzero(scene.ball[row] == 0).tolist() for row in d.links]
+    model.ball_count = put(np.array([len(row) for row in balls], np.int32), int)
+    model.ball_slot = put(padded(balls, scene.nball), int)
     model.com, model.mass = put_links(scene.com, t.vec3), put(scene.mass[links] * carried, dtype)
     model.inertia = put(scene.inertia[links] * carried[:, None, None], t.mat3)
     for name in ("armature", "damping", "stiffness", "spring_ref", "lower", "upper"):
