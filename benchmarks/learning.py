@@ -379,7 +379,8 @@ def draw_experiment(args: Args, name: str, suffix: str = "", full: bool = False)
             axis.grid(alpha=0.3)
             axis.spines[["top", "right"]].set_visible(False)
         axes[0, column].set_title(env)
-    axes[0, 0].legend(fontsize=8)
+    lines = {line.get_label(): line for axis in axes[0] for line in axis.lines}
+    axes[0, 0].legend(lines.values(), lines.keys(), fontsize=8)
     for axis in axes[:, 0]:
         axis.set_ylabel("return of training episodes")
     figure.savefig(args.docs / f"{name}{suffix}.png", dpi=110)
