@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
+from statistics import median
 from typing import IO, Any, NoReturn
 
 import torch
@@ -169,9 +170,10 @@ class Run:
         """The progress line, now and then: what it took since the last call, and what is left to do."""
         self._durations.append(duration)
         terminal = sys.stdout.isatty()
-        if not last and time.monotonic() - self._shown < (0.1 if terminal else 10.0):
+        first = len(self._durations) < 2  # it compiled, and says nothing about the rest
+        if not last and (first or time.monotonic() - self._shown < (0.1 if terminal else 10.0)):
             return
-        self._shown, rate = time.monotonic(), len(self._durations) / sum(self._durations)
+        self._shown, rate = time.monotonic(), 1.0 / median(self._durations)
         total = self.args.iterations
         bar = f"{'#' * (20 * iteration // total):<20}"
         left = timedelta(seconds=round((total - iteration) / rate))
