@@ -114,7 +114,9 @@ class Args:
     pretraining: int = 1500
     """L-BFGS iterations of the first fit to the guiding samples"""
     pretraining_samples: int = 200
-    """guiding trajectories of that fit; more than --guiding-samples, the paper's, show what to do off the path"""
+    """trajectories of that fit, with the guides' mean actions; 0: the guiding samples with their own, as the paper"""
+    pretraining_spread: float = 3.0
+    """standard deviation of these trajectories' actions, relative to the guides': shows what to do off the path"""
     gate: int = 5
     """fits, from as many random networks, of which the first that follows the guides is taken, or the best"""
     samples: int = 10
@@ -125,9 +127,9 @@ class Args:
     """trajectories kept to choose from"""
     lbfgs_iterations: int = 60
     """L-BFGS iterations of each of an iteration's two optimisations"""
-    initial_regularizer: float = 1e-4
+    initial_regularizer: float = 1e-2
     """w_r at the start"""
-    regularizer_bounds: tuple[float, float] = (1e-6, 1e-2)
+    regularizer_bounds: tuple[float, float] = (1e-4, 1.0)
     """w_r is changed by factors of ten between these"""
     step: float = 0.1
     """policy-gradient: length of a step along the normalised gradient"""
@@ -551,23 +553,22 @@ class Search:
         if not error.median() < 1e-3:
             fail("the simulator's Jacobians are not those of its steps")
 
-        count = max(args.guiding_samples, args.pretraining_samples)
-        each = -(-count // args.guides)
+        each = -(-args.guiding_samples // args.guides)
         drawn = [self.measure(*g.sample(system, self.noise(each)), i) for i, g in enumerate(self.guides)]
-        data = Samples(*(torch.stack(column, 1).flatten(0, 1) for column in zip(*drawn, strict=True)))
-        self.control_steps += len(data.u) * args.horizon
-        worst, top = data.reward[torch.isfinite(data.reward)].aminmax()
+        guiding = Samples(*(torch.stack(column, 1).flatten(0, 1) for column in zip(*drawn, strict=True)))
+        guiding = guiding.pick(torch.arange(args.guiding_samples, device=system.device))
+        self.control_steps += each * args.guides * args.horizon
+        worst, top = guiding.reward[torch.isfinite(guiding.reward)].aminmax()
         self.floor = (2 * worst - top).item()  # as far below the worst guiding step as that is below the best
-        data = data._replace(reward=data.reward.clamp(min=self.floor))
-        guiding = data.pick(torch.arange(args.guiding_samples, device=system.device))
+        guiding = guiding._replace(reward=guiding.reward.clamp(min=self.floor))
         self.guide_return = guiding.returns.mean().item(), guiding.returns.std(correction=0).item()
         self.say("guiding samples: return {:.2f} +- {:.2f}".format(*self.guide_return))
 
-        statistics = [v.flatten(0, 1) for v in (data.obs, data.u)]
+        self.guiding = self.lessons() if args.pretraining_samples else (guiding.obs, guiding.u)
+        statistics = [v.flatten(0, 1) for v in self.guiding]
         self.policy = Policy(
             args.hidden, *(s for v in statistics for s in (v.mean(0), v.std(0).clamp(min=1e-3))), sigma
         )
-        self.guiding = data.obs, data.u
         if args.variant == "single-example":
             self.guiding = system.observe(plan.x[:, :-1]), plan.u
         self.pretrain(*self.guiding, attempts=1 if args.variant == "single-example" else args.gate)
@@ -582,6 +583,19 @@ class Search:
         self.scale = self.set.reward.std().clamp(min=1e-6).item()
         scalars = {"gps/plan": self.example_return, "gps/fit": self.fit}
         return self.returns(own) | scalars | dict(zip(("gps/guides", "gps/guides_std"), self.guide_return, strict=True))
+
+    def lessons(self) -> tuple[Tensor, Tensor]:
+        """Observations (m, T, no) of trajectories wider than the guides' and the guides' mean actions (m, T, nu) there
+        (DART, Laskey et al. 2017): a policy that has seen only the guides' narrow tube does not return to it."""
+        args, system, parts = self.args, self.system, []
+        each = -(-args.pretraining_samples // args.guides)
+        for guide in self.guides:
+            wide = guide._replace(L=args.pretraining_spread * guide.L)
+            x = wide.sample(system, self.noise(each))[0][:, :-1]
+            parts.append((system.observe(x), guide.mean(system, slice(0, args.horizon), x)))
+        self.control_steps += each * args.guides * args.horizon
+        obs, u = (torch.cat(column) for column in zip(*parts, strict=True))
+        return obs, u
 
     def pretrain(self, obs: Tensor, u: Tensor, attempts: int) -> None:
         """Line 3, from several random networks, until one follows the guides in closed loop."""
@@ -655,13 +669,18 @@ class Search:
         if iteration <= args.adaptive and args.variant in ("full", "unregularized"):
             active = torch.cat((active, self.adapt()))
 
-        S = self.set.pick(active)
-        mixture = self.mixture(S)
-        log_pi = [policy.log_prob(t, S.obs, S.u) for t in (theta, self.theta)]
-        estimates = [phi(log_p, mixture, S.reward, 0.0).item() for log_p in log_pi]
-        if not all(map(math.isfinite, estimates)):
-            raise FloatingPointError(f"the value estimates are {estimates}: no active sample has a finite density")
-        accepted, log_w = estimates[0] > estimates[1], log_weights(log_pi[0], mixture)
+        for confirmed in (False, True):
+            S = self.set.pick(active)
+            mixture = self.mixture(S)
+            log_pi = [policy.log_prob(t, S.obs, S.u) for t in (theta, self.theta)]
+            estimates = [phi(log_p, mixture, S.reward, 0.0).item() for log_p in log_pi]
+            if not all(map(math.isfinite, estimates)):
+                raise FloatingPointError(f"the value estimates are {estimates}: no active sample has a finite density")
+            accepted = estimates[0] > estimates[1]
+            if confirmed or not accepted:
+                break
+            active = torch.cat((active, self.append(None, self.draw(theta, source))))  # ten may have been lucky
+        log_w = log_weights(log_pi[0], mixture)
         weights = torch.softmax(log_w, 0)
         ess = 1.0 / weights.square().sum(0)
         scalars = {
@@ -811,7 +830,7 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
     for name, bound in least.items():
         if (value := getattr(args, name)) is not None and value < bound:
             fail(f"{flag(name)} must be at least {bound}, not {value}")
-    for name in ("noise", "spread", "step", "action_cost"):
+    for name in ("noise", "spread", "pretraining_spread", "step", "action_cost"):
         if not 0 < getattr(args, name) < math.inf:
             fail(f"{flag(name)} must be positive, not {getattr(args, name)}")
     for name in ("tracking", "initial_regularizer", "height_weight", "attitude_weight"):

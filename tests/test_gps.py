@@ -483,8 +483,10 @@ def test_files_of_a_run(trained: Path, checkpoint: dict[str, Any]) -> None:
     with (trained / "progress.csv").open() as file:
         rows = list(csv.DictReader(file))
     steps = [int(row["control_steps"]) for row in rows]
-    extra = [4 * (row["accepted"] == "0.0") for row in rows[1:]]  # a rejection draws the best policy's samples again
-    assert steps[0] == 30 * (8 + 4 + 4) and np.diff(steps).tolist() == [30 * (4 + e) for e in extra]
+    assert steps[0] == 30 * (8 + 8 + 4 + 4)  # guiding samples, those of pretraining, a network's and the policy's own
+    # Proposals are drawn twice before they are accepted; a rejection draws the best policy's samples again.
+    for drawn, row in zip(np.diff(steps) // 30, rows[1:], strict=True):
+        assert drawn in ((8,) if row["accepted"] == "1.0" else (8, 12))
     assert [bool(row["eval_return"]) for row in rows] == [False, False, True, False, True]
     assert len(checkpoint["search"]["set"][1]) <= 24
     assert not list(trained.glob("*.tmp"))
@@ -495,6 +497,21 @@ def test_guides_reproduce_the_plan(checkpoint: dict[str, Any]) -> None:
     mean, std = checkpoint["search"]["guide_return"]
     plan = checkpoint["search"]["example_return"]
     assert abs(mean - plan) < 0.01 * abs(plan) and 0 < std < 0.01 * abs(plan)
+
+
+def test_lessons_are_the_guides_means_about_a_wider_path(checkpoint: dict[str, Any]) -> None:
+    search = search_of(checkpoint)
+    search.args.pretraining_samples, guide = 400, search.guides[0]
+
+    def spread(factor: float) -> torch.Tensor:
+        search.args.pretraining_spread = factor
+        obs, u = search.lessons()
+        assert obs.shape == (400, 30, 5) and u.shape == (400, 30, 1)
+        torch.testing.assert_close(u[:, 0], guide.u[:1].expand(400, 1))  # without noise at the start, which all share
+        return (u[:, 1] - guide.u[1]).std()
+
+    ratio = spread(0.1) / spread(0.01)  # small: at this plan the motor is in the tail of its tanh
+    torch.testing.assert_close(ratio, torch.tensor(10.0).double(), rtol=0.15, atol=0)
 
 
 def search_of(checkpoint: dict[str, Any]) -> gps.Search:
