@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
-from scenes import task_scene
+from scenes import leg_scene, task_scene
 
 import diffsim
 from diffsim.kernels.lanes import divide
@@ -19,7 +21,7 @@ LANES = [(1, 1), (2, 1), (4, 1), (2, 2), (8, 4)]
 def test_everything_is_dealt_once(name: str, lanes: tuple[int, int]) -> None:
     scene = task_scene(name)
     d = divide(scene, *lanes)
-    muscles = range(scene.nu) if "muscle" in scene.features else []
+    muscles = sorted(set(scene.segment_muscle))
     for hands, things in (
         (d.weighs, range(scene.nlink)),
         (d.spheres, range(len(scene.contact_link))),
@@ -81,3 +83,25 @@ def test_lanes_are_checked(lanes: object) -> None:
     scene = task_scene("cartpole")
     with pytest.raises(ValueError, match="lanes is .* must be one of"):
         diffsim.Simulator(scene, 1, lanes=lanes)  # type: ignore[arg-type]
+
+
+def motors_among_muscles() -> diffsim.Scene:
+    """The humanoid with muscles, ten of which are motors of its joints instead."""
+    scene = task_scene("humanoid_mtu")
+    kept = scene.segment_muscle >= 10
+    segments = {name: getattr(scene, name)[kept] for name in ("segment_link", "segment_position", "segment_muscle")}
+    link = scene.motor_link.copy()
+    link[:10] = [1, 18, 2, 17, 9, 10, 4, 13, 8, 16]
+    return dataclasses.replace(scene, motor_link=link, **segments)
+
+
+@pytest.mark.parametrize("lanes", LANES)
+@pytest.mark.parametrize("scene", [task_scene("ant"), leg_scene("hill"), motors_among_muscles()])
+def test_a_motors_gradient_is_written_by_a_lane_that_has_its_link(scene: diffsim.Scene, lanes: tuple[int, int]) -> None:
+    model = model_of(scene, wp.float64, "cpu", *lanes)
+    slots = model.motor_slot.numpy().reshape(lanes[0], scene.nu)
+    link = model.link.numpy().reshape(lanes[0], -1)
+    motors = np.flatnonzero(scene.motor_link)
+    assert len(motors)
+    for k, lane in zip(motors, model.motor_lane.numpy()[motors], strict=True):
+        assert link[lane, slots[lane, k]] == scene.motor_link[k]

@@ -60,7 +60,8 @@ def divide(scene: Scene, lanes: int = 1, sharers: int = 1) -> Lanes:
     below: list[list[int]] = [[] for _ in range(scene.nlink)]  # the subtree of each link
     for i in reversed(range(scene.nlink)):
         below[i] = sorted([i] + [k for child in np.flatnonzero(parent[1:] == i) + 1 for k in below[child]])
-    ends = [{0} | set(scene.segment_link[scene.segment_muscle == k].flatten()) for k in range(scene.nu)]
+    pulled = np.unique(scene.segment_muscle).tolist()  # the other actuators are motors, which go with their links
+    ends = [{0} | set(scene.segment_link[scene.segment_muscle == k].flatten()) for k in pulled]
     trunk, limbs = [0], [below[i] for i in range(1, scene.nlink) if parent[i] == 0]
     best = [list(range(scene.nlink))] * groups, scene.nlink - 1
     while limbs:
@@ -88,7 +89,7 @@ def divide(scene: Scene, lanes: int = 1, sharers: int = 1) -> Lanes:
             cost[lane] += price
         return [sorted(hand) for hand in hands]
 
-    muscles = deal(ends, SPHERE) if "muscle" in scene.features else [[] for _ in range(lanes)]
+    muscles = [[pulled[k] for k in hand] for hand in deal(ends, SPHERE)]
     spheres = deal([{int(i)} for i in scene.contact_link], SPHERE)
     weighs = deal([{i} for i in range(scene.nlink)], 1.0)
     return Lanes(sharers, best[1], links, weighs, spheres, muscles)

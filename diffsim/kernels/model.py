@@ -215,7 +215,7 @@ def model_of(scene: Scene, dtype: type, device: str, lanes: int = 1, sharers: in
     model.pair_link = put(slot[pairs[:, :1], pairs[:, 1:]].flatten(), int)
     model.pair_begin = put(np.append(start, len(order)).astype(np.int32), int)
     model.segment_a, model.segment_b = (put(scene.segment_position[order, end], t.vec3) for end in (0, 1))
-    model.segment_muscle, model.hill = put(scene.segment_muscle[order], int), put(np.nan_to_num(scene.hill), t.vec9)
+    model.segment_muscle, model.hill = put(scene.segment_muscle[order], int), put(scene.hill, t.vec9)
     # Contact spheres by lane, then by slot.
     rows = [
         (lane * d.slots + slot[lane, scene.contact_link[k]], k) for lane, hand in enumerate(d.spheres) for k in hand
