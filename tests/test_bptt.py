@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from learners import ROOT, run
+from learners import ROOT, assert_derivatives, run
 
 import diffsim
 
@@ -50,18 +50,8 @@ def test_gradient_is_the_finite_difference(task: str, horizon: int) -> None:
         assert window.truncated.any(0).tolist() == [False, True, False] and not window.terminated.any()
         return bptt.bptt_loss(window.reward, window.done, 0.99)
 
-    parameters = dict(actor.named_parameters())
-    gradients = dict(zip(parameters, torch.autograd.grad(loss(), parameters.values()), strict=True))
-    for name, index in (("mean.0.weight", 40), ("mean.3.weight", 7), ("log_std", 0)):
-        weight, step = parameters[name].data.view(-1), 1e-6
-        with torch.no_grad():
-            value = weight[index].item()
-            weight[index] = value + step
-            above = loss()
-            weight[index] = value - step
-            difference = (above - loss()).item() / (2 * step)
-            weight[index] = value
-        assert gradients[name].flatten()[index].item() == pytest.approx(difference, rel=1e-5), name
+    places = (("mean.0.weight", 40), ("mean.3.weight", 7), ("log_std", 0))
+    assert_derivatives(dict(actor.named_parameters()), loss, places, rel=1e-5)
 
 
 def test_large_gradients_are_clipped_and_only_infinite_ones_skipped() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import csv
 import importlib.util
 import json
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from learners import assert_refuses
 from scenes import acting_states
 
 import diffsim
@@ -692,25 +692,4 @@ def test_demonstration_of_shac(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_bad_input_is_one_line_and_exit_code_2(
     arguments: str, message: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    places = {"file": tmp_path / "file", "trained": trained}
-    places["file"].write_text("hello")
-    before = sorted(tmp_path.rglob("*"))
-    argv = arguments.format(**places).split()
-    if not {"--run-dir", "--resume", "--evaluate"} & set(argv):
-        argv += ["--run-dir", str(tmp_path / "run")]
-    with pytest.raises(SystemExit) as exit:
-        gps.main(argv)
-    assert exit.value.code == 2
-    error = capsys.readouterr().err
-    assert error.startswith("gps.py: ") and error.count("\n") == 1 and message.format(**places) in error
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_no_script_imports_another() -> None:
-    scripts = {path.stem for path in ROOT.glob("*.py")}
-    assert {"gps", "shac"} <= scripts
-    for path in ROOT.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-            assert not scripts & {name.split(".")[0] for name in names}, path.name
+    assert_refuses(gps, arguments, message, trained, tmp_path, capsys)

@@ -7,7 +7,6 @@ import csv
 import importlib
 import json
 import signal
-import subprocess
 import sys
 import traceback
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import ROOT, assert_same, run
+from learners import ROOT, assert_refuses, assert_refuses_a_missing_gpu, assert_same, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -57,7 +56,7 @@ def checkpoint(trained: Path) -> dict[str, Any]:
 
 def test_no_script_imports_another() -> None:
     scripts = {path.stem: path for path in ROOT.glob("*.py")}
-    assert {"shac", "bptt", "ppo_baseline"} <= scripts.keys()
+    assert {"shac", "bptt", "ppo_baseline", "gps"} <= scripts.keys()
     for path in scripts.values():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
@@ -228,26 +227,9 @@ def test_bad_input_is_one_line_and_exit_code_2(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    places = {name: tmp_path / name for name in ("file", "truncated", "foreign")} | {"trained": trained}
-    places["file"].write_text("hello")
-    places["truncated"].write_bytes((trained / "checkpoint.pt").read_bytes()[:5000])
-    torch.save({"weights": torch.zeros(3)}, places["foreign"])
-    before = sorted(tmp_path.rglob("*"))
-    argv = arguments.format(**places).split()
-    if not {"--run-dir", "--resume", "--evaluate"} & set(argv):
-        argv += ["--run-dir", str(tmp_path / "run")]
-    with pytest.raises(SystemExit) as exit:
-        learner.main(argv)
-    assert exit.value.code == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"{learner.__name__}.py: ") and error.count("\n") == 1
-    assert message.format(**places, name=learner.__name__) in error
-    assert sorted(tmp_path.rglob("*")) == before
+    assert_refuses(learner, arguments, message, trained, tmp_path, capsys)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_cuda_where_there_is_none(learner: ModuleType) -> None:
-    command = [sys.executable, str(ROOT / f"{learner.__name__}.py"), "--device", "cuda"]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 2 and result.stdout == ""
-    assert result.stderr.splitlines()[-1].startswith(f"{learner.__name__}.py: ") and "cuda" in result.stderr.lower()
+    assert_refuses_a_missing_gpu(learner)

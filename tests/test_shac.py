@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import ROOT, assert_same
+from learners import ROOT, assert_derivatives, assert_refuses, assert_refuses_a_missing_gpu, assert_same
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import diffsim
@@ -125,18 +124,8 @@ def test_gradient_of_the_actor_loss_is_its_finite_difference() -> None:
         assert window.terminated.any(0).tolist() == [False, False, True]
         return shac.actor_loss(window.reward, shac.next_values(critic, normalise, window), window.done, GAMMA)
 
-    parameters = dict(actor.named_parameters())
-    gradients = dict(zip(parameters, torch.autograd.grad(loss(), parameters.values()), strict=True))
-    for name, index in (("mean.0.weight", 40), ("mean.2.bias", 3), ("mean.3.weight", 7), ("log_std", 2)):
-        weight, step = parameters[name].data.view(-1), 1e-6
-        with torch.no_grad():
-            value = weight[index].item()
-            weight[index] = value + step
-            above = loss()
-            weight[index] = value - step
-            difference = (above - loss()).item() / (2 * step)
-            weight[index] = value
-        assert gradients[name].flatten()[index].item() == pytest.approx(difference, rel=5e-6), name
+    places = (("mean.0.weight", 40), ("mean.2.bias", 3), ("mean.3.weight", 7), ("log_std", 2))
+    assert_derivatives(dict(actor.named_parameters()), loss, places, rel=5e-6)
 
 
 def test_clipped_adam_is_adam_after_clipping_and_skips_bad_gradients() -> None:
@@ -399,28 +388,12 @@ def test_help_names_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
 def test_bad_input_is_one_line_and_exit_code_2(
     arguments: str, message: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    places = {name: tmp_path / name for name in ("file", "truncated", "foreign")} | {"trained": trained}
-    places["file"].write_text("hello")
-    places["truncated"].write_bytes((trained / "checkpoint.pt").read_bytes()[:5000])
-    torch.save({"weights": torch.zeros(3)}, places["foreign"])
-    before = sorted(tmp_path.rglob("*"))
-    argv = arguments.format(**places).split()
-    if not {"--run-dir", "--resume", "--evaluate"} & set(argv):
-        argv += ["--run-dir", str(tmp_path / "run")]
-    with pytest.raises(SystemExit) as exit:
-        shac.main(argv)
-    assert exit.value.code == 2
-    error = capsys.readouterr().err
-    assert error.startswith("shac.py: ") and error.count("\n") == 1 and message.format(**places) in error
-    assert sorted(tmp_path.rglob("*")) == before
+    assert_refuses(shac, arguments, message, trained, tmp_path, capsys)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_cuda_where_there_is_none() -> None:
-    command = [sys.executable, str(ROOT / "shac.py"), "--device", "cuda"]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 2 and result.stdout == ""
-    assert result.stderr.splitlines()[-1].startswith("shac.py: ") and "cuda" in result.stderr.lower()
+    assert_refuses_a_missing_gpu(shac)
 
 
 def test_track_without_wandb(
