@@ -1,12 +1,9 @@
-"""What the benchmarks of accuracy and stability share: a trained policy, the states it visits, tables."""
+"""What the benchmarks of accuracy and stability share: a trained policy and the states it visits."""
 
 from __future__ import annotations
 
-import csv
-import re
 import sys
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -78,48 +75,3 @@ def visited_states(
 def idle(scene: Scene) -> Tensor:
     """(nu,) the control without any force: 0 of a motor, -1 of a muscle."""
     return torch.where(torch.tensor(scene.motor_link) > 0, 0.0, -1.0).double()
-
-
-# Tables ---------------------------------------------------------------------------------------------------------------
-
-
-def digits(value: Any) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def write_csv(path: Path, rows: list[dict[str, Any]], key: tuple[str, ...]) -> list[dict[str, str]]:
-    """Write the rows' cells over those of rows that agree in all of `key`; returns all rows of the file."""
-    new = [{name: digits(value) for name, value in row.items()} for row in rows]
-    old = read_csv(path) if path.is_file() else []
-    merged: dict[tuple[str, ...], dict[str, str]] = {}
-    for row in [*old, *new]:
-        merged.setdefault(tuple(row.get(k, "") for k in key), {}).update(row)
-    columns = list(dict.fromkeys(name for row in [*new, *old] for name in row))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="")
-        writer.writeheader()
-        writer.writerows(merged.values())
-    return list(merged.values())
-
-
-def markdown(rows: list[dict[str, Any]], columns: list[str] | None = None) -> str:
-    columns = columns or list(rows[0])
-    lines = [columns, ["---"] * len(columns), *([digits(row.get(c, "")) for c in columns] for row in rows)]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def fill(document: Path, name: str, text: str) -> None:
-    """Put the text between the lines <!-- name --> and <!-- /name --> of a document."""
-    pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-    new, count = pattern.subn(lambda found: f"{found[1]}\n{text.strip()}\n\n{found[2]}", document.read_text())
-    if count != 1:
-        raise ValueError(f"{document} must hold <!-- {name} --> and <!-- /{name} --> once, not {count} times")
-    document.write_text(new)

@@ -13,7 +13,6 @@ benchmarks/results/gate.csv and the table of docs/accuracy.md.
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import sys
@@ -26,7 +25,8 @@ from typing import Annotated, Any
 
 import learning
 import tyro
-from common import DOCS, RESULTS, ROOT, fill, markdown, read_csv, write_csv
+from common import DOCS, RESULTS, ROOT
+from tables import fill, markdown, merge_csv, read_csv
 
 import diffsim
 from diffsim.run import fail
@@ -105,8 +105,7 @@ def collect(args: Args, variant: str, env: str) -> dict[str, Any] | None:
             evaluation, settings = (json.loads((run / f"{name}.json").read_text()) for name in ("evaluation", "args"))
             if not found.keys() <= evaluation.keys():
                 continue
-            with (run / "progress.csv").open(newline="") as file:
-                last = list(csv.DictReader(file))[-1]
+            last = read_csv(run / "progress.csv")[-1]
             seconds.append(float(last["seconds"]))
             iterations.append(int(last["iteration"]))
             seeds.append(run.name.split("__")[1])
@@ -159,7 +158,7 @@ def main(args: Args, arguments: tuple[str, ...]) -> None:
     found = [row for env in diffsim.TASKS for variant in VARIANTS if (row := collect(args, variant, env))]
     path = args.output / "gate.csv"
     if found:
-        write_csv(path, found, ("task", "variant"))
+        merge_csv(path, found, ("task", "variant"))
     if not path.is_file():
         fail(f"no evaluated run in {args.runs}")
     text = markdown(read_csv(path))

@@ -14,7 +14,6 @@ gps_generalisation.png: Figures 2, 1 and 3 of the paper. An interrupted run is r
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import subprocess
@@ -30,6 +29,7 @@ import matplotlib
 import numpy as np
 import torch
 import tyro
+from tables import markdown, read_csv, write_csv
 from torch import Tensor
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -226,22 +226,6 @@ def paths(search: gps.Search, count: int = 10) -> list[dict[str, Any]]:
 # Tables and pictures --------------------------------------------------------------------------------------------------
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    if rows:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def number(text: str) -> float:
     return float(text) if text else math.nan
 
@@ -278,13 +262,6 @@ def collect(args: Args) -> None:
             rows = [row | {key: f"{float(row[key]):.4g}" for key in "xy"} for row in rows if int(row["step"]) % 4 == 0]
         rows = [row for row in read_csv(path) if tuple(row[key] for key in RUN) not in here] + rows
         write_csv(path, sorted(rows, key=lambda row: tuple(row[key] for key in RUN)))
-
-
-def markdown(rows: list[dict[str, Any]]) -> str:
-    if not rows:
-        return "(no runs yet)\n"
-    lines = ["| " + " | ".join(rows[0]) + " |", "|" + " --- |" * len(rows[0])]
-    return "\n".join(lines + ["| " + " | ".join(map(str, row.values())) + " |" for row in rows]) + "\n"
 
 
 def tabulate(docs: Path) -> str:

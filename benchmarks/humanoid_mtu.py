@@ -10,7 +10,6 @@ Writes docs/results/humanoid_mtu_{runs,curves}.csv, docs/humanoid_mtu.png, and t
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import Annotated, Any
 import matplotlib
 import numpy as np
 import tyro
+from tables import fill, read_csv, write_csv
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -36,7 +36,6 @@ import matplotlib.pyplot as plt  # noqa: E402
 # Georgiev et al. 2024, "Adaptive Horizon Actor-Critic": best points of the curves of PPO, SHAC and AHAC.
 PUBLISHED = {"PPO": 4246, "SHAC": 6114, "AHAC": 6964}
 TIMED = (PUBLISHED["PPO"], PUBLISHED["AHAC"])
-BEGIN, END = "<!-- table of benchmarks/humanoid_mtu.py -->\n", "<!-- end of the table -->\n"
 POINTS = 200  # kept of each curve
 
 
@@ -59,21 +58,6 @@ SETTING = ("environments", "substeps", "device")  # equal in the runs of one lin
 
 def setting(row: dict[str, str]) -> tuple[str, ...]:
     return tuple(row[name] for name in SETTING)
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        fail(f"{path} does not exist")
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def read_run(args: Args, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -137,12 +121,7 @@ def write_table(args: Args, rows: list[dict[str, str]]) -> None:
         cells += [cell(group, "falls per episode")]
         cells += ["; ".join(passing(row, least) for row in group) for least in TIMED]
         lines.append("| " + " | ".join(cells) + " |")
-    page = args.docs / "humanoid_mtu.md"
-    before, marker, rest = page.read_text().partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not marker or not end:
-        fail(f"{page} has no place for the table: {BEGIN.strip()} ... {END.strip()}")
-    page.write_text(before + BEGIN + "\n".join(lines) + "\n" + END + after)
+    fill(args.docs / "humanoid_mtu.md", "results", "\n".join(lines) + "\n")
     print("\n".join(lines))
 
 
@@ -177,6 +156,8 @@ def main(args: Args) -> None:
         rows, curves = zip(*(read_run(args, folder) for folder in args.runs), strict=True)
         write_csv(paths[0], sorted(rows, key=lambda row: (row["environments"], row["substeps"], row["seed"])))
         write_csv(paths[1], [point for curve in curves for point in curve])
+    if not all(path.is_file() for path in paths):
+        fail(f"no results in {args.docs / 'results'} yet: give the directories of finished runs")
     write_table(args, read_csv(paths[0]))
     draw(args, read_csv(paths[1]))
 

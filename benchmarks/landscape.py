@@ -16,7 +16,6 @@ exists is kept: delete it to measure it anew.
 
 from __future__ import annotations
 
-import csv
 import shutil
 import signal
 import subprocess
@@ -44,7 +43,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = ("gradients", "weight", "surface")
 BEGIN = time.perf_counter()
 sys.path.insert(0, str(ROOT))
-from learning import fill, write_csv  # noqa: E402
+from tables import fill, read_csv, write_csv  # noqa: E402
 
 import shac  # noqa: E402
 
@@ -266,9 +265,8 @@ def random_directions(args: Args, snapshot: Snapshot) -> dict[str, Tensor]:
 # Figures --------------------------------------------------------------------------------------------------------------
 
 
-def read_csv(path: Path) -> dict[str, np.ndarray]:
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+def columns_of(path: Path) -> dict[str, np.ndarray]:
+    rows = read_csv(path)
     return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
 
 
@@ -338,7 +336,7 @@ def roughness(values: np.ndarray) -> tuple[int, float]:
 def draw(args: Args, task: str) -> str:
     """Draws a task's figures from its csv files, and returns its part of the page."""
     results = args.docs / "results"
-    line = read_csv(results / f"landscape_{task}_weight.csv")
+    line = columns_of(results / f"landscape_{task}_weight.csv")
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), layout="constrained")
     for axis, name, title in ((axes[0], "bptt", "BPTT"), (axes[1], "shac", "SHAC")):
         axis.plot(line["step"], line[name], linewidth=1)
@@ -353,7 +351,7 @@ def draw(args: Args, task: str) -> str:
     figure.savefig(args.docs / f"landscape_{task}_weight.png", dpi=110)
     plt.close(figure)
 
-    surface = read_csv(results / f"landscape_{task}_surface.csv")
+    surface = columns_of(results / f"landscape_{task}_surface.csv")
     side = round(len(surface["k1"]) ** 0.5)
     k1, k2 = (surface[name].reshape(side, side) for name in ("k1", "k2"))
     figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained", subplot_kw={"projection": "3d"})
@@ -363,7 +361,7 @@ def draw(args: Args, task: str) -> str:
     figure.savefig(args.docs / f"landscape_{task}_surface.png", dpi=110)
     plt.close(figure)
 
-    gradients = read_csv(results / f"landscape_{task}_gradients.csv")
+    gradients = columns_of(results / f"landscape_{task}_gradients.csv")
     figure, axis = plt.subplots(figsize=(5, 3.2), layout="constrained")
     for name, color in (("bptt", "C2"), ("shac", "C0")):
         for quantile, style in (("q0.5", ":"), ("q0.99", "--"), ("q1", "-")):

@@ -13,7 +13,6 @@ docs/experiments.md. An interrupted run is resumed from its checkpoint; its curv
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import importlib
 import json
@@ -28,15 +27,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median, pstdev
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Annotated, Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
 import torch
 import tyro
+from tables import fill, markdown, read_csv, write_csv
 
 import diffsim
 from diffsim import graph
+from diffsim.run import fail
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -205,19 +206,6 @@ def published_by(algorithm: str) -> tuple[str, dict[str, int]]:
     return ("PPO", PUBLISHED_PPO) if algorithm == "ppo_baseline" else ("SHAC", PUBLISHED)
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def number(text: str) -> float:
     return float(text) if text else float("nan")
 
@@ -238,7 +226,7 @@ def collect(args: Args, env: str) -> dict[str, Any] | None:
     passed: dict[float, list[float]] = {t: [] for t in THRESHOLDS.get(env, ())}
     for folder in sorted((args.runs / args.algorithm).glob(f"{env}__*"), key=lambda p: int(p.name.split("__")[1])):
         seed, path = folder.name.split("__")[1], folder / "progress.csv"
-        progress = read_csv(path) if path.is_file() else []
+        progress = read_csv(path)
         if not any(row["return"] for row in progress):
             continue
         points += [
@@ -287,7 +275,7 @@ def short(text: str) -> str:
 def summarise(args: Args, rows: list[dict[str, Any]]) -> None:
     """Merges the rows into the summary and prints and writes it as markdown."""
     path = args.docs / "results" / f"{args.algorithm}_summary.csv"
-    merged = {row["task"]: row for row in read_csv(path)} if path.is_file() else {}
+    merged = {row["task"]: row for row in read_csv(path)}
     merged |= {row["task"]: row for row in rows}
     merged = [merged[env] for env in diffsim.TASKS if env in merged]
     write_csv(path, merged)
@@ -455,11 +443,6 @@ def table(args: Args, experiment: Experiment) -> list[dict[str, Any]]:
     return rows
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *([str(value) for value in row.values()] for row in rows)]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
 def time_breakdown(args: Args, env_name: str) -> dict[str, Any]:
     """Table 12: the parts of one iteration of SHAC, each captured and timed alone."""
     sys.path.insert(0, str(ROOT))
@@ -502,17 +485,6 @@ def timed(function: Callable[[], Any], device: torch.device, warmup: int = 4, ca
     return (time.perf_counter() - begin) / calls
 
 
-def fill(page: Path, name: str, text: str) -> None:
-    """Puts text between the page's comments <!-- name --> and <!-- /name -->, at its end if it does not have them."""
-    begin, end = f"<!-- {name} -->\n", f"<!-- /{name} -->\n"
-    before = page.read_text() if page.is_file() else ""
-    if begin not in before:
-        before += begin + end
-    head, _, tail = before.partition(begin)
-    page.write_text(f"{head}{begin}{text}{end}{tail.partition(end)[2]}")
-    print(text)
-
-
 def write_page(args: Args) -> None:
     """The pictures and tables of docs/experiments.md, of the csv files that there are."""
     page = args.docs / "experiments.md"
@@ -529,13 +501,9 @@ def write_page(args: Args) -> None:
             draw_experiment(args, name, "_full", full=True)
             text += f"\n![{experiment.title}, to their ends]({name}_full.png)\n"
         fill(page, name, text)
+        print(text)
     if (args.docs / "results" / "time.csv").is_file():
         fill(page, "time", markdown(read_csv(args.docs / "results" / "time.csv")))
-
-
-def fail(message: str) -> NoReturn:
-    print(f"learning.py: {message}", file=sys.stderr)
-    sys.exit(2)
 
 
 def main(args: Args) -> None:
@@ -547,7 +515,7 @@ def main(args: Args) -> None:
         fail(f"no script {args.algorithm}.py in {ROOT}")
     if args.experiment == "time":
         path = args.docs / "results" / "time.csv"
-        merged = {row["task"]: row for row in read_csv(path)} if path.is_file() else {}
+        merged = {row["task"]: row for row in read_csv(path)}
         merged |= {env: time_breakdown(args, env) for env in args.env}
         write_csv(path, [merged[env] for env in diffsim.TASKS if env in merged])
         write_page(args)

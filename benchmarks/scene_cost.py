@@ -21,8 +21,9 @@ import matplotlib
 import numpy as np
 import torch
 import tyro
-from common import DOCS, RESULTS, fill, idle, markdown, write_csv
+from common import DOCS, RESULTS, idle
 from speed import time_diffsim
+from tables import fill, markdown, merge_csv
 
 import diffsim
 from diffsim.run import fail
@@ -175,7 +176,7 @@ def main(args: Args) -> None:
         fail("--num-envs and --repeats must be at least 1")
     torch.set_num_threads(1)
     rows = measure(args)
-    write_csv(args.output / "scene_cost.csv", rows, ("of", "count", "device", "environments"))
+    merge_csv(args.output / "scene_cost.csv", rows, ("of", "count", "device", "environments"))
     text = markdown(fits(rows))
     if args.device == "cpu":
         if args.output == RESULTS:

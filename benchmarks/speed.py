@@ -13,7 +13,6 @@ setting. A machine that does something else meanwhile gives wrong numbers.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import gc
 import importlib.util
@@ -29,17 +28,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import matplotlib
 import mujoco
 import numpy as np
 import torch
 import tyro
+from tables import digits, markdown, merge_csv, read_csv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import diffsim
 from diffsim import graph
+from diffsim.run import fail
 from diffsim.simulator import available_cores
 
 matplotlib.use("Agg")
@@ -80,17 +81,6 @@ class Args:
     """directory of the csv files"""
 
 
-def fail(message: str) -> NoReturn:
-    print(f"speed.py: {message}", file=sys.stderr)
-    sys.exit(2)
-
-
-def digits(value: Any) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
 # Tables ---------------------------------------------------------------------------------------------------------------
 
 
@@ -107,22 +97,7 @@ class Table:
         """A row, which the file has at once: a measurement cut short keeps what it has."""
         self.rows.append({k: digits(v) for k, v in row.items()})
         print(" ", ", ".join(f"{k} {v}" for k, v in self.rows[-1].items()), flush=True)
-        path = self.directory / f"speed_{self.name}.csv"
-        self.directory.mkdir(parents=True, exist_ok=True)
-        merged: dict[tuple[str, ...], dict[str, Any]] = {}
-        if path.is_file():
-            with path.open(newline="") as file:
-                merged = {tuple(row[k] for k in self.key): row for row in csv.DictReader(file)}
-        merged |= {tuple(row[k] for k in self.key): row for row in self.rows}
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(self.rows[0]), extrasaction="ignore", restval="")
-            writer.writeheader()
-            writer.writerows(merged.values())
-
-    def markdown(self) -> str:
-        columns = list(self.rows[0])
-        lines = [columns, ["---"] * len(columns), *([row[c] for c in columns] for row in self.rows)]
-        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        merge_csv(self.directory / f"speed_{self.name}.csv", self.rows[-1:], self.key)
 
 
 # Physics --------------------------------------------------------------------------------------------------------------
@@ -425,8 +400,7 @@ def draw(directory: Path) -> None:
     path = directory / "speed_scaling.csv"
     if not path.is_file():
         fail(f"{path} does not exist: measure with --parts scaling first")
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(path)
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
     for axis, of, fixed, value in (
         (axes[0], "environments", "horizon", "32"),
@@ -564,7 +538,7 @@ def main(args: Args) -> None:
         if not tables[-1].rows:
             fail(f"none of {', '.join(args.env)} has muscles")
     for table in tables:
-        print(f"\n{table.markdown()}")
+        print(f"\n{markdown(table.rows)}", end="")
     if {"scaling", "picture"} & set(args.parts):
         draw(args.output)
 

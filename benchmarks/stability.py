@@ -30,7 +30,8 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from common import DOCS, RESULTS, RUNS, Policy, fill, idle, load_policy, markdown, read_csv, visited_states, write_csv
+from common import DOCS, RESULTS, RUNS, Policy, idle, load_policy, visited_states
+from tables import fill, markdown, merge_csv, read_csv
 from torch import Tensor
 from tradeoff import CONTROL_DT, closed_loop, label, mechanics, simulator
 
@@ -380,7 +381,7 @@ def main(args: Args) -> None:
         for part in args.parts:
             measure = {"step": measure_step, "sweeps": measure_sweeps, "horizon": measure_horizon}.get(part)
             rows = measure(case) if measure else measure_long(case, args.steps)
-            write_csv(args.output / f"stability_{part}.csv", rows, keys[part])
+            merge_csv(args.output / f"stability_{part}.csv", rows, keys[part])
             print(f"  {part}", flush=True)
         report(args.output)
     print(f"written to {args.output}")

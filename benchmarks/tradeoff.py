@@ -37,8 +37,9 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from common import DOCS, RESULTS, RUNS, Policy, fill, idle, load_policy, markdown, read_csv, visited_states, write_csv
+from common import DOCS, RESULTS, RUNS, Policy, idle, load_policy, visited_states
 from speed import time_diffsim
+from tables import fill, markdown, merge_csv, read_csv
 from torch import Tensor
 
 import diffsim
@@ -489,7 +490,7 @@ def main(args: Args) -> None:
     path = args.output / "tradeoff.csv"
     if not args.draw_only:
         for name in args.env:
-            write_csv(path, measure(args, name), KEY)
+            merge_csv(path, measure(args, name), KEY)
     report(args.output)
     print(f"written to {path}, {path.with_suffix('.md')} and pictures beside them")
 

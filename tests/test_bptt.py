@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import csv
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from learners import ROOT, assert_derivatives, run
+from learners import assert_derivatives, run
 
+import bptt
 import diffsim
-
-sys.path.insert(0, str(ROOT))
-import bptt  # noqa: E402
 
 
 @pytest.mark.parametrize("horizon", [1, 12])

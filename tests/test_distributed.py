@@ -12,8 +12,7 @@ import pytest
 import torch
 from learners import ROOT, assert_same
 
-sys.path.insert(0, str(ROOT))
-import shac  # noqa: E402
+import shac
 
 # Trains, with each rank taking its share of the noise and start states that one process alone would draw.
 WORKER = """

@@ -17,13 +17,11 @@ from learners import assert_refuses
 from scenes import acting_states
 
 import diffsim
+import gps
+import shac
 from diffsim import dynamics
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import gps  # noqa: E402
-import shac  # noqa: E402
-
 spec = importlib.util.spec_from_file_location("gps_benchmark", ROOT / "benchmarks" / "gps.py")
 benchmark = importlib.util.module_from_spec(spec)
 sys.modules[spec.name] = benchmark

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -11,18 +10,16 @@ import torch
 import warp as wp
 from scenes import task_scene
 
+import bptt
 import diffsim
+import ppo_baseline
+import shac
 from diffsim import graph
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.model import shape_of
 from diffsim.simulator import Simulator, default_lanes
 from diffsim.tasks import PLANAR
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import bptt  # noqa: E402
-import ppo_baseline  # noqa: E402
-import shac  # noqa: E402
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU, and PyTorch sees none")
 HORIZON = 32

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import landscape
 import numpy as np
 import pytest
 import torch
-from learners import ROOT
 
 import diffsim
-
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
-import landscape  # noqa: E402
-
-import shac  # noqa: E402
+import shac
 
 
 @pytest.fixture

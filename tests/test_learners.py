@@ -19,8 +19,6 @@ from learners import ROOT, assert_refuses, assert_refuses_a_missing_gpu, assert_
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils._python_dispatch import TorchDispatchMode
 
-sys.path.insert(0, str(ROOT))
-
 # Windows of cartpole with a time-out on the way (240 steps), an evaluation before the end and one at it.
 SMALL = "--env cartpole --num-envs 3 --horizon 32 --iterations 10 --eval-every 4 --eval-episodes 3 --quiet".split()
 SPECIFIC = {"bptt": [], "ppo_baseline": ["--minibatch-size", "40", "--epochs", "2"]}

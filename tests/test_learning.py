@@ -6,15 +6,11 @@ import contextlib
 import csv
 import dataclasses
 import json
-import sys
 from pathlib import Path
 
+import learning
 import numpy as np
 import pytest
-from learners import ROOT
-
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
-import learning  # noqa: E402
 
 
 def write_run(folder: Path, returns: np.ndarray, steps: int, seconds: float, finished: bool = True) -> None:

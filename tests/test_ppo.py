@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import csv
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from learners import ROOT, run
+from learners import run
 from torch.distributions import Normal, kl_divergence
 
 import diffsim
-
-sys.path.insert(0, str(ROOT))
-import ppo_baseline as ppo  # noqa: E402
+import ppo_baseline as ppo
 
 
 @pytest.mark.parametrize("lam", [0.0, 0.9, 1.0])

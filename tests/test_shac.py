@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import ROOT, assert_derivatives, assert_refuses, assert_refuses_a_missing_gpu, assert_same
+from learners import assert_derivatives, assert_refuses, assert_refuses_a_missing_gpu, assert_same
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import diffsim
+import shac
 from diffsim import evaluation
-
-sys.path.insert(0, str(ROOT))
-import shac  # noqa: E402
 
 GAMMA, LAM = 0.97, 0.9
 # Ten windows of cartpole with a time-out in the eighth, and an evaluation on the way.
