@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
+import torch.nn.functional as F
 import tyro
 from torch import Tensor, nn
 
@@ -410,7 +411,7 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
         for _ in range(0 if args.no_critic else args.critic_iterations):
             losses = []
             for obs, value in zip(*batches, strict=True):
-                loss = (critic(obs).squeeze(-1) - value).square().mean()  # Eq. 6
+                loss = F.mse_loss(critic(obs).squeeze(-1), value)  # Eq. 6
                 critic_optimizer.step(loss)
                 losses.append(loss.detach())
         for slow, fast in zip(target.parameters(), critic.parameters(), strict=True):

@@ -12,17 +12,20 @@ if TYPE_CHECKING:
 
 
 class ControlStep(torch.autograd.Function):
-    """qpos, qvel, ctrl -> qpos, qvel. The simulator's checkpoint slot holds what backward needs; no tensor is saved."""
+    """qpos, qvel, ctrl -> qpos and qvel side by side.
+
+    The simulator's checkpoint slot holds what backward needs; no tensor is saved.
+    """
 
     @staticmethod
     def forward(
         ctx: Any, sim: Simulator, slot: int, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> torch.Tensor:
         result = sim._forward(slot, qpos, qvel, ctrl)
         ctx.sim, ctx.slot, ctx.version = sim, slot, sim._version[slot]
         return result
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_qpos: torch.Tensor, g_qvel: torch.Tensor) -> tuple[Any, ...]:
-        return (None, None, *ctx.sim._backward(ctx.slot, ctx.version, g_qpos, g_qvel))
+    def backward(ctx: Any, g_end: torch.Tensor) -> tuple[Any, ...]:
+        return (None, None, *ctx.sim._backward(ctx.slot, ctx.version, g_end))

@@ -173,6 +173,13 @@ class Scene:
         return link
 
     @property
+    def inert(self) -> int:
+        """Number of links after the fixed base without mass, contact or muscle: the slides of a planar robot."""
+        busy = (self.mass > 0) | self.inertia.any((1, 2))
+        busy[[*self.contact_link, *self.segment_link.flatten()]] = True
+        return 0 if self.floating else int((np.cumsum(busy[1:]) == 0).sum())
+
+    @property
     def drag(self) -> tuple[Array, Array, Array, Array]:
         """The fluid's drag on each link, MuJoCo's inertia-box law; see kernels/drag.py for its form.
 

@@ -112,12 +112,14 @@ class Simulator:
         def tensor(*size: int, of: torch.dtype = dtype) -> torch.Tensor:
             return torch.zeros(size, dtype=of, device=self.device)
 
+        # One buffer for qpos, qvel and ctrl side by side: torch copies each in one operation, the kernels see parts.
         n, slots = num_envs, horizon + 1  # the last slot serves steps that record nothing
-        self._in = [tensor(slots, n, k) for k in (self.nq, self.nv, self.nu)]
-        self._out = [tensor(n, k) for k in (self.nq, self.nv)]
+        self._widths = (self.nq, self.nv, self.nu)
+        self._start = tensor(slots, n, sum(self._widths))
+        self._end = tensor(n, self.nq + self.nv)
         self._nonfinite = tensor(slots, n, of=torch.bool)
-        self._g_in = [tensor(n, k) for k in (self.nq, self.nv)]
-        self._g_out = [tensor(n, k) for k in (self.nq, self.nv, self.nu)]
+        self._g_end = tensor(n, self.nq + self.nv)
+        self._g_start = tensor(n, sum(self._widths))
         self._checkpoint: list[wp.array] | None = None
         self._shape = shape
         self._slot, self._last = 0, horizon
@@ -159,9 +161,10 @@ class Simulator:
         if recorded:
             slot = self._slot
             self._slot = (slot + 1) % self.horizon
-            end = ControlStep.apply(self, slot, qpos, qvel, ctrl)
+            state = ControlStep.apply(self, slot, qpos, qvel, ctrl)
         else:
-            end = self._forward(self.horizon, qpos, qvel, ctrl)
+            state = self._forward(self.horizon, qpos, qvel, ctrl)
+        end = state.split(self._widths[:2], dim=1)
         if self._coarse is None:
             return end
         return self._extrapolate((qpos, qvel), self._coarse.step(qpos, qvel, ctrl), end)
@@ -196,25 +199,23 @@ class Simulator:
 
     # -- called by bridge.ControlStep ---------------------------------------------------------------------------------
 
-    def _forward(self, slot: int, *state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        for buffer, value in zip(self._in, state, strict=True):
-            buffer[slot].copy_(value.detach())
+    def _forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
+        torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
         self._last = slot
         if slot < self.horizon:
             self._version[slot] += 1
         self._launch("forward", slot)
-        return self._out[0].clone(), self._out[1].clone()
+        return self._end.clone()
 
-    def _backward(self, slot: int, version: int, g_qpos: torch.Tensor, g_qvel: torch.Tensor) -> list[torch.Tensor]:
+    def _backward(self, slot: int, version: int, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
         if self._version[slot] != version:
             raise RuntimeError(
                 f"backward through a control step whose checkpoint was overwritten: at most {self.horizon} "
                 "differentiable steps can be alive; build the simulator with a larger horizon"
             )
-        self._g_in[0].copy_(g_qpos)
-        self._g_in[1].copy_(g_qvel)
+        self._g_end.copy_(g_end)
         self._launch("backward", slot)
-        return [g.clone() for g in self._g_out]
+        return self._g_start.clone().split(self._widths, dim=1)
 
     # -- launches -----------------------------------------------------------------------------------------------------
 
@@ -265,13 +266,17 @@ class Simulator:
         row0 = slot * self.substeps if record else 0
         real = WARP_DTYPE[self.dtype]
         head = [self._model, real(self.control_dt / self.substeps), real(self.theta), self.substeps, first]
-        state = [wp.from_torch(buffer[slot]) for buffer in self._in]
+        qpos, qvel, ctrl = self._parts(self._start[slot], 3)
         nonfinite = wp.from_torch(self._nonfinite[slot])
         if kernel == "forward":
-            out = [wp.from_torch(buffer) for buffer in self._out]
-            return [*head, *state, int(record), row0, *rows, *out, nonfinite]
-        gradients = [wp.from_torch(buffer) for buffer in (*self._g_in, *self._g_out, self.nonfinite_gradients)]
-        return [*head, row0, *rows, state[0], state[2], nonfinite, *gradients]
+            return [*head, qpos, qvel, ctrl, int(record), row0, *rows, *self._parts(self._end, 2), nonfinite]
+        gradients = [*self._parts(self._g_end, 2), *self._parts(self._g_start, 3)]
+        blown_up = wp.from_torch(self.nonfinite_gradients)
+        return [*head, row0, *rows, qpos, ctrl, nonfinite, *gradients, blown_up]
+
+    def _parts(self, buffer: torch.Tensor, count: int) -> list[wp.array]:
+        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl."""
+        return [wp.from_torch(part) for part in buffer.split(self._widths[:count], dim=1)]
 
     def _rows(self, count: int) -> list[wp.array]:
         """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""

@@ -51,7 +51,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     drag_wrench, drag_adjoint = drag.drag_wrench, drag.drag_adjoint
     NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
-    FIRST = 0 if FLOATING else 1
+    INERT, FIRST = shape.inert, 0 if FLOATING else 1 + shape.inert  # the first link with inertia
     VADR, NBALL, BALL_SPRING = shape.dof0 - 1, shape.nball, shape.nball > 0 and "stiffness" in uses
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
     LANES, SHARERS, TRUNK, SLOTS = shape.lanes, shape.sharers, shape.trunk, shape.slots
@@ -329,6 +329,11 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 lam[i] = (u[i] - UW) * load(ck_f, row, f0 + 6, e)
                 W[i] = W[p] + S[i] * lam[i]
             # 3. the partial derivatives of phi, link by link
+            for i in range(1, INERT + 1):
+                adj_a[i] = vec6()
+                adj_v[i] = vec6()
+                adj_w[i] = vec6()
+                adj_p[i] = vec6()
             for i in range(FIRST, n):
                 la, lv, lw, lp = link_adjoint(m, at + i, R[i], x[i], V[i], A[i], W[i], height, h, theta)
                 adj_a[i] = la

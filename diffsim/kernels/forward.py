@@ -38,7 +38,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     DRAG, drag_wrench = "drag" in uses, drag_law(T).drag_wrench
     NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
-    FIRST = 0 if FLOATING else 1  # the first link with inertia
+    INERT, FIRST = shape.inert, 0 if FLOATING else 1 + shape.inert  # the first link with inertia
     BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
     VADR = shape.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LANES, SHARERS, TRUNK, SLOTS = shape.nball, shape.lanes, shape.sharers, shape.trunk, shape.slots
@@ -232,6 +232,11 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                         store(ck_q, row, adr, e, turn[b][3])
                         for k in range(3):
                             store(ck_q, row, adr + 1 + k, e, turn[b][k])
+            for i in range(1, INERT + 1):
+                Ia[i] = mat3()
+                Ib[i] = mat3()
+                Id[i] = mat3()
+                P[i] = vec6()
             for i in range(FIRST, n):
                 ia, ib, id, force = link_inertia(m, at + i, R[i], x[i], V[i], height, h, theta)
                 Ia[i] = ia

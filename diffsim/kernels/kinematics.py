@@ -78,10 +78,11 @@ def kinematics(shape: Shape) -> SimpleNamespace:
                 turn = R[i]
             p = m.parent[k]
             a = R[p] * m.axis[k]
+            R_joint = m.turn0[k]
             if wp.static(HINGE):
-                R[i] = R[p] * (m.turn0[k] + wp.sin(q[i]) * m.turn1[k] + wp.cos(q[i]) * m.turn2[k])
-            else:
-                R[i] = R[p] * m.turn0[k]
+                if i > CARRIER:
+                    R_joint = R_joint + wp.sin(q[i]) * m.turn1[k] + wp.cos(q[i]) * m.turn2[k]
+            R[i] = R[p] * R_joint
             if wp.static(BALL):
                 if m.outboard[k] == i + 2:
                     R[i] = R[i] * turn

@@ -31,6 +31,7 @@ class Shape:
     sharers: int
     trunk: int
     slots: int
+    inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
 
     @property
     def floating(self) -> bool:
@@ -58,7 +59,8 @@ class Shape:
 def shape_of(scene: Scene, dtype: type, implicit: bool, env_last: bool, lanes: int = 1, sharers: int = 1) -> Shape:
     d = divide(scene, lanes, sharers)
     base = (scene.nlink, scene.nu, scene.carrier, scene.nball, scene.features)
-    return Shape(*base, dtype, implicit, env_last, lanes, sharers, d.trunk, d.slots)
+    inert = scene.inert if lanes == sharers else min(scene.inert, d.trunk)
+    return Shape(*base, dtype, implicit, env_last, lanes, sharers, d.trunk, d.slots, inert)
 
 
 def module_options(shape: Shape) -> dict[str, Any]:

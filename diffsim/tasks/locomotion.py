@@ -16,7 +16,7 @@ FORWARD_VELOCITY = 5  # column of the observation: v_x
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
     """Turns vector (..., 3) by the unit quaternion wxyz (..., 4): v + 2 w (u x v) + 2 u x (u x v), broadcasting."""
-    w, u = quat[..., :1], quat[..., 1:]
+    w, u = quat.split((1, 3), dim=-1)
     t = 2.0 * torch.linalg.cross(u, vector)
     return torch.addcmul(vector, w, t) + torch.linalg.cross(u, t)
 
@@ -65,10 +65,11 @@ class Locomotion(Task):
         body = torch.cat((angular.unsqueeze(-2), self._axes.expand(*angular.shape[:-1], 2, 3)), dim=-2)
         angular, x_axis, z_axis = rotate(quat.unsqueeze(-2), body).unbind(dim=-2)
         up = z_axis[..., 2:]
-        to_target = F.normalize(self._target - position[..., :2], dim=-1)
-        heading = (x_axis[..., :2] * to_target).sum(-1, keepdim=True)
+        place, height = position.split((2, 1), dim=-1)
+        way = self._target - place
+        distance = (way.square().sum(-1, keepdim=True) + 1e-12).sqrt()
+        heading = (x_axis[..., :2] * way).sum(-1, keepdim=True) / distance
         w, xyz = quat.split((1, 3), dim=-1)
-        height = position[..., 2:]
         seen = (height, xyz, w, velocity, angular, joints, 0.1 * rates, up, heading)
         return torch.cat((*seen, action) if self.observe_action else seen, dim=-1)
 
