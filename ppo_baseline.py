@@ -338,6 +338,8 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
             fail(f"{path} is at iteration {checkpoint['iteration']} already: give more --iterations or --stop-after")
         if args.resume and len(checkpoint["ranks"]) != distributed.size():
             fail(f"{path} was trained by {len(checkpoint['ranks'])} processes, not {distributed.size()}")
+        if args.resume and args.device.partition(":")[0] != saved.device.partition(":")[0]:
+            fail(f"{path} was trained on {saved.device}, which {args.device} cannot continue exactly")
     if args.env not in diffsim.TASKS:
         fail(f"unknown task {args.env!r}: choose from {', '.join(diffsim.TASKS)}")
     args.device = distributed.choose_device(args.device)

@@ -62,10 +62,12 @@ def assert_refuses(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Arguments, with {places} to fill in, give one line that holds the message, exit code 2, and no file."""
-    places = {name: tmp_path / name for name in ("file", "truncated", "foreign")} | {"trained": trained}
+    places = {name: tmp_path / name for name in ("file", "truncated", "foreign", "elsewhere")} | {"trained": trained}
     places["file"].write_text("hello")
     places["truncated"].write_bytes((trained / "checkpoint.pt").read_bytes()[:5000])
     torch.save({"weights": torch.zeros(3)}, places["foreign"])
+    checkpoint = torch.load(trained / "checkpoint.pt", weights_only=True)
+    torch.save(checkpoint | {"args": checkpoint["args"] | {"device": "cuda:0"}}, places["elsewhere"])
     before = sorted(tmp_path.rglob("*"))
     argv = arguments.format(**places).split()
     if not {"--run-dir", "--resume", "--evaluate"} & set(argv):

@@ -211,6 +211,10 @@ def test_help_names_every_flag(learner: ModuleType, capsys: pytest.CaptureFixtur
         ("--resume {file}.pt", "no such checkpoint: {file}.pt"),
         ("--evaluate {truncated}", "{truncated} is not a whole checkpoint of {name}.py"),
         ("--evaluate {foreign}", "{foreign} is not a whole checkpoint of {name}.py"),
+        (
+            "--resume {elsewhere} --device cpu --iterations 20",
+            "{elsewhere} was trained on cuda:0, which cpu cannot continue",
+        ),
         ("--evaluate {trained}/checkpoint.pt --env ant", "has --env cartpole, not ant"),
         ("--resume {trained}/checkpoint.pt --num-envs 4", "has --num-envs 3, not 4"),
         ("--resume {trained}/checkpoint.pt", "is at iteration 10 already"),
