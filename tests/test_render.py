@@ -20,6 +20,8 @@ def draw(*args: object, **kwargs: object) -> np.ndarray:
     try:
         return render_frames(*args, **kwargs)  # type: ignore[arg-type]
     except RuntimeError as error:
+        if "finds no OpenGL" not in str(error):
+            raise
         pytest.skip(str(error))
 
 
