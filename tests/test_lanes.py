@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
-from scenes import leg_scene, task_scene
+from scenes import leg_scene, parse, task_scene
 
 import diffsim
 from diffsim.kernels.lanes import divide
-from diffsim.kernels.model import model_of
+from diffsim.kernels.model import model_of, shape_of
 
 LANES = [(1, 1), (2, 1), (4, 1), (2, 2), (8, 4)]
 
@@ -105,3 +105,15 @@ def test_a_motors_gradient_is_written_by_a_lane_that_has_its_link(scene: diffsim
     assert len(motors)
     for k, lane in zip(motors, model.motor_lane.numpy()[motors], strict=True):
         assert link[lane, slots[lane, k]] == scene.motor_link[k]
+
+
+def test_lanes_skip_inert_links_that_all_of_them_have() -> None:
+    """A hinge on a slide and a hinge alone: the second lane starts with a link that has mass."""
+    arm = '<body>{}<joint axis="0 1 0"/><geom size="0.1"/></body>'
+    slide = '<joint type="slide"/>'
+    scene = parse(f"<mujoco><worldbody>{arm.format(slide)}{arm.format('')}</worldbody></mujoco>")
+    assert scene.inert == 1
+    assert shape_of(scene, wp.float64, False, True).inert == 1
+    assert shape_of(scene, wp.float64, False, True, 2, 1).inert == 0
+    assert shape_of(scene, wp.float64, False, True, 2, 2).inert == 1
+    assert shape_of(task_scene("half_cheetah"), wp.float64, False, True, 2, 1).inert == 2

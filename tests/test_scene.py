@@ -408,3 +408,13 @@ def test_missing_and_broken_files(tmp_path):
         with pytest.raises(SceneError, match="broken.xml") as error:
             load_scene(broken)
         assert "\n" not in str(error.value)
+
+
+def test_only_the_links_before_the_first_load_are_inert():
+    assert {name: task_scene(name).inert for name in ("hopper", "half_cheetah", "cartpole", "ant")} == {
+        "hopper": 2,
+        "half_cheetah": 2,
+        "cartpole": 0,
+        "ant": 0,
+    }
+    assert parse(CRANE).inert == 2
