@@ -274,7 +274,7 @@ class Simulator:
         blown_up = wp.from_torch(self.nonfinite_gradients)
         return [*head, row0, *rows, qpos, ctrl, nonfinite, *gradients, blown_up]
 
-    def _parts(self, buffer: torch.Tensor, count: int) -> list[wp.array]:
+    def _parts(self, buffer: torch.Tensor, count: int) -> list[Any]:
         """The kernels' views of qpos, qvel and, if `count` is 3, ctrl."""
         return [wp.from_torch(part) for part in buffer.split(self._widths[:count], dim=1)]
 
