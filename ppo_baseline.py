@@ -25,7 +25,7 @@ from torch import Tensor, nn
 import diffsim
 from diffsim import distributed, graph
 from diffsim.evaluation import Evaluation, evaluate, write_video
-from diffsim.run import EpisodeStatistics, Mark, Run, constants, fail, flag, load_checkpoint
+from diffsim.run import EpisodeStatistics, Mark, Run, constants, fail, flag, read_arguments
 
 
 @dataclass
@@ -320,29 +320,7 @@ def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) ->
 
 def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
     """The arguments, complete and checked, and the checkpoint that they name."""
-    args, checkpoint = tyro.cli(Args, args=argv, description=__doc__), None
-    if args.resume and args.evaluate:
-        fail("--resume and --evaluate exclude each other")
-    if path := args.resume or args.evaluate:
-        checkpoint = load_checkpoint(path, FORMAT)
-        saved = Args(**checkpoint["args"])
-        if args.evaluate:
-            saved.device = None  # wherever it was trained
-        if args.accuracy:  # a preset on the command line replaces the saved numbers, its own or given one by one
-            saved.substeps = saved.integrator = None
-        args = tyro.cli(Args, args=argv, description=__doc__, default=saved)
-        for name in FIXED:
-            if getattr(args, name) != getattr(saved, name):
-                fail(f"{path} has {flag(name)} {getattr(saved, name)}, not {getattr(args, name)}")
-        if args.resume and checkpoint["iteration"] >= min(args.iterations, args.stop_after or args.iterations):
-            fail(f"{path} is at iteration {checkpoint['iteration']} already: give more --iterations or --stop-after")
-        if args.resume and len(checkpoint["ranks"]) != distributed.size():
-            fail(f"{path} was trained by {len(checkpoint['ranks'])} processes, not {distributed.size()}")
-        if args.resume and args.device.partition(":")[0] != saved.device.partition(":")[0]:
-            fail(f"{path} was trained on {saved.device}, which {args.device} cannot continue exactly")
-    if args.env not in diffsim.TASKS:
-        fail(f"unknown task {args.env!r}: choose from {', '.join(diffsim.TASKS)}")
-    args.device = distributed.choose_device(args.device)
+    args, checkpoint = read_arguments(Args, argv, __doc__, FORMAT, FIXED, diffsim.TASKS)
     defaults = dict(zip(COLUMNS, PER_TASK.get(args.env, GENERAL), strict=True))
     if args.device == "cpu":
         defaults |= {name: min(defaults[name], most) for name, most in CPU.items()}

@@ -12,16 +12,19 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from statistics import median
-from typing import IO, Any, NoReturn
+from typing import IO, Any, NoReturn, TypeVar
 
 import torch
+import tyro
 from torch.utils.tensorboard import SummaryWriter
 
 from diffsim import distributed
+
+Args = TypeVar("Args")
 
 
 def fail(message: object) -> NoReturn:
@@ -47,6 +50,50 @@ def load_checkpoint(path: Path, kind: str) -> dict[str, Any]:
     except Exception:  # torch.load raises whatever broken bytes lead it to
         pass
     fail(f"{path} is not a whole checkpoint of {kind.partition('-')[0]}.py")
+
+
+def read_arguments(
+    kind: type[Args], argv: list[str] | None, description: str, form: str, fixed: Sequence[str], tasks: Collection[str]
+) -> tuple[Args, dict[str, Any] | None]:
+    """The command line over the defaults or, with --resume and --evaluate, over the arguments that a checkpoint holds.
+
+    Args:
+        kind: dataclass of the arguments.
+        argv: None: of the process.
+        description: what --help says first.
+        form: of the checkpoints, see load_checkpoint.
+        fixed: arguments that a checkpoint decides.
+        tasks: names that --env may have.
+
+    Returns:
+        The arguments, device included, and the checkpoint, if any. Anything wrong ends the script.
+    """
+    args: Any = tyro.cli(kind, args=argv, description=description)
+    checkpoint = None
+    if args.resume and args.evaluate:
+        fail("--resume and --evaluate exclude each other")
+    if path := args.resume or args.evaluate:
+        checkpoint = load_checkpoint(path, form)
+        saved: Any = kind(**checkpoint["args"])
+        if args.evaluate:
+            saved.device = None  # wherever it was trained
+        if args.accuracy:  # a preset on the command line replaces the saved numbers, its own or given one by one
+            saved.substeps = saved.integrator = None
+        args = tyro.cli(kind, args=argv, description=description, default=saved)
+        for name in fixed:
+            if getattr(args, name) != getattr(saved, name):
+                fail(f"{path} has {flag(name)} {getattr(saved, name)}, not {getattr(args, name)}")
+    if args.resume and checkpoint:
+        if checkpoint["iteration"] >= min(args.iterations, args.stop_after or args.iterations):
+            fail(f"{path} is at iteration {checkpoint['iteration']} already: give more --iterations or --stop-after")
+        if (ranks := len(checkpoint.get("ranks", "1"))) != distributed.size():
+            fail(f"{path} was trained by {ranks} processes, not {distributed.size()}")
+        if args.device.partition(":")[0] != saved.device.partition(":")[0]:
+            fail(f"{path} was trained on {saved.device}, which {args.device} cannot continue exactly")
+    if args.env not in tasks:
+        fail(f"unknown task {args.env!r}: choose from {', '.join(tasks)}")
+    args.device = distributed.choose_device(args.device)
+    return args, checkpoint
 
 
 def constants(items: Sequence[str]) -> dict[str, float]:
