@@ -35,6 +35,7 @@ from torch.func import functional_call, vmap
 
 import diffsim
 from diffsim import distributed
+from diffsim.run import load_checkpoint
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -128,7 +129,7 @@ def snapshots(args: Args, env: str) -> list[Path]:
 
 
 def load(args: Args, path: Path, env: Any) -> Snapshot:
-    checkpoint = shac.load_checkpoint(path, shac.FORMAT)
+    checkpoint = load_checkpoint(path, shac.FORMAT)
     settings = shac.Args(**checkpoint["args"] | {"device": args.device})
     actor, normalise = shac.build(settings, env)
     target = shac.mlp(normalise.mean.numel(), settings.critic_hidden, 1, orthogonal=True).to(env.device)

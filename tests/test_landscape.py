@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import subprocess
+import sys
 from pathlib import Path
 
 import landscape
@@ -61,3 +64,14 @@ def test_rewards_after_the_end_of_an_episode_do_not_count(
     terminated[1, 0, 0] = truncated[0, 0, 1] = terminated[3, 0, 1] = True
     monkeypatch.setattr(landscape, "rollout", lambda *_: (reward, terminated, truncated, None))
     assert landscape.bptt_loss(None, snapshot, {}, None, 4).tolist() == [-(1 + 3 + 2) / 8]
+
+
+def test_the_command_trains_measures_and_draws(tmp_path: Path) -> None:
+    look = "--env cartpole --iterations 2 4 --trajectories 2 --points 5 --side 3 --horizon 40 --device cpu".split()
+    command = [sys.executable, landscape.__file__, *look, "--runs", str(tmp_path / "runs"), "--docs", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True)
+    for name, count in (("gradients", 2), ("weight", 5), ("surface", 9)):
+        rows = list(csv.DictReader((tmp_path / "results" / f"landscape_cartpole_{name}.csv").open()))
+        assert len(rows) == count
+        assert (tmp_path / f"landscape_cartpole_{name}.png").stat().st_size > 5_000
+    assert "landscape_cartpole_surface.png" in (tmp_path / "experiments.md").read_text()
