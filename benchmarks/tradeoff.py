@@ -216,6 +216,8 @@ class Flight:
         self.actions = actions[:30] if scene.ncontact == 0 else idle(scene).expand_as(actions[:30])
         self.model = mujoco.MjModel.from_xml_path(scene.path)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+        if scene.ncontact:  # motors off: MuJoCo's own muscles pull at rest, too
+            self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self.free = mujoco.MjModel.from_xml_path(scene.path)
         self.free.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         self.free.dof_damping[:], self.free.jnt_stiffness[:] = 0.0, 0.0
