@@ -628,7 +628,9 @@ class Search:
         mean, std = lessons.mean(0), lessons.std(0).clamp(min=1e-3)
         distance = lambda obs: ((obs - mean) / std).square().mean(-1)  # noqa: E731
         near = (distance(samples.obs) <= distance(lessons).amax(0)).cumprod(1).bool()
-        return samples.obs[near], guide.mean(self.system, slice(0, self.args.horizon), samples.x[:, :-1])[near]
+        thin = max(1, len(lessons) // len(samples.obs))  # as dense in time as those picked of the lessons
+        u = guide.mean(self.system, slice(0, self.args.horizon), samples.x[:, :-1])
+        return samples.obs[near][::thin], u[near][::thin]
 
     # Lines 5 to 18
 
