@@ -646,10 +646,11 @@ class Search:
         return score.argsort(descending=True, stable=True)[: self.args.active].sort().values
 
     def prune(self) -> None:
-        """Bounds S: the guiding samples and the best-scored others stay; generators without samples go."""
+        """Bounds S: the guiding samples, those of the best policy and the best-scored others stay, in that order;
+        generators without samples go."""
         if len(self.set.u) <= self.args.stored:
             return
-        score = self.score() + 1e9 * (self.guided(self.set) | (self.set.source == self.best))
+        score = self.score() + 2e9 * self.guided(self.set) + 1e9 * (self.set.source == self.best)
         self.set = self.set.pick(score.argsort(descending=True, stable=True)[: self.args.stored].sort().values)
         used = torch.tensor(sorted({*self.set.source.tolist(), self.best}), device=self.theta.device)
         index = torch.full((len(self.generators),), -1, device=used.device)
