@@ -117,8 +117,8 @@ class Args:
     """trajectories of that fit, with the guides' mean actions; 0: the guiding samples with their own, as the paper"""
     pretraining_spread: float = 3.0
     """standard deviation of these trajectories' actions, relative to the guides': shows what to do off the path"""
-    gate: int = 5
-    """fits, from as many random networks, of which the first that follows the guides is taken, or the best"""
+    gate: int = 10
+    """fits, each with the states that the last one visited, until one follows the guides; or the best is taken"""
     samples: int = 10
     """trajectories of the policy per iteration"""
     active: int = 100
@@ -465,9 +465,9 @@ class Search:
         act = lambda t, x: policy.mean(theta, system.observe(x)) + policy.sigma * noise[:, t]  # noqa: E731
         return self.measure(*system.rollout(start, self.args.horizon, act), source)
 
-    def draw(self, theta: Tensor, source: int = -1) -> Samples:
-        """--samples trajectories; the restart variant's start at states of the guides."""
-        count, start = self.args.samples, None
+    def draw(self, theta: Tensor, source: int = -1, count: int | None = None) -> Samples:
+        """Trajectories, --samples of them; the restart variant's start at states of the guides."""
+        count, start = count or self.args.samples, None
         self.control_steps += count * self.args.horizon
         noise = self.noise(count)
         if source >= 0 and self.args.variant == "restart":
@@ -594,27 +594,43 @@ class Search:
             x = wide.sample(system, self.noise(each))[0][:, :-1]
             parts.append((system.observe(x), guide.mean(system, slice(0, args.horizon), x)))
         self.control_steps += each * args.guides * args.horizon
-        obs, u = (torch.cat(column) for column in zip(*parts, strict=True))
+        obs, u = (torch.stack(column, 1).flatten(0, 1) for column in zip(*parts, strict=True))
         return obs, u
 
     def pretrain(self, obs: Tensor, u: Tensor, attempts: int) -> None:
-        """Line 3, from several random networks, until one follows the guides in closed loop."""
-        policy, best = self.policy, -math.inf
+        """Line 3, until the network follows the guides in closed loop: the states that it visited instead, as far as
+        the lessons go, join them with the guides' mean actions (DAgger, Ross et al. 2011)."""
+        policy, lessons, best = self.policy, obs, -math.inf
         # As many steps as the guiding samples have, picked from all: neighbours in time teach little more than one.
         steps = torch.randperm(u[..., 0].numel(), generator=self.rng)[: self.args.guiding_samples * self.args.horizon]
         obs, u = (tensor.flatten(0, 1)[steps.to(u.device)] for tensor in (obs, u))
+        theta = policy.initial(self.rng)
         for attempt in range(attempts):
-            objective = lambda theta: policy.log_prob(theta, obs, u).mean()  # noqa: E731
-            theta, _ = maximise(objective, policy.initial(self.rng), self.args.pretraining)
-            returns = self.draw(theta).returns
+            objective = lambda theta: policy.log_prob(theta, obs, u).mean()  # noqa: E731, B023
+            theta, _ = maximise(objective, theta, self.args.pretraining)
+            seen = self.draw(theta, count=self.args.guiding_samples)
+            returns = seen.returns
             fit = ((u - policy.mean(theta, obs)) / policy.sigma).square().mean().sqrt().item()
             text = f"pretraining {attempt + 1}: rms error {fit:.2f} standard deviations, return of its rollouts "
             self.say(text + f"{returns.mean():.2f}, best {returns.max():.2f}")
             if returns.mean() > best:
                 best, self.theta, self.fit = returns.mean().item(), theta, fit
-            if best >= self.guide_return[0] - 0.25 * abs(self.guide_return[0]):
+            if best >= self.guide_return[0] - 0.1 * abs(self.guide_return[0]):
                 return
-        self.say("warning: no pretrained policy came within a quarter of the guides' return on average")
+            if attempt + 1 < attempts:
+                labelled = (self.label(g, lessons[i :: len(self.guides)], seen) for i, g in enumerate(self.guides))
+                obs, u = (torch.cat(column) for column in zip((obs, u), *labelled, strict=True))
+        self.say("warning: no pretrained policy came within a tenth of the guides' return on average")
+
+    def label(self, guide: Guide, lessons: Tensor, samples: Samples) -> tuple[Tensor, Tensor]:
+        """Observations (k, no) and a guide's mean actions there (k, nu) from samples, while they are as near to its
+        path as its lessons (m, T, no) at that time: beyond, as after a fall, its linear gains mean nothing."""
+        mean, std = lessons.mean(0), lessons.std(0).clamp(min=1e-3)
+        distance = lambda obs: ((obs - mean) / std).square().mean(-1)  # noqa: E731
+        near = (distance(samples.obs) <= distance(lessons).amax(0)).cumprod(1).bool()
+        thin = max(1, len(lessons) // len(samples.obs))  # as dense in time as those picked of the lessons
+        u = guide.mean(self.system, slice(0, self.args.horizon), samples.x[:, :-1])
+        return samples.obs[near][::thin], u[near][::thin]
 
     # Lines 5 to 18
 
@@ -630,10 +646,11 @@ class Search:
         return score.argsort(descending=True, stable=True)[: self.args.active].sort().values
 
     def prune(self) -> None:
-        """Bounds S: the guiding samples and the best-scored others stay; generators without samples go."""
+        """Bounds S: the guiding samples, those of the best policy and the best-scored others stay, in that order;
+        generators without samples go."""
         if len(self.set.u) <= self.args.stored:
             return
-        score = self.score() + 1e9 * (self.guided(self.set) | (self.set.source == self.best))
+        score = self.score() + 2e9 * self.guided(self.set) + 1e9 * (self.set.source == self.best)
         self.set = self.set.pick(score.argsort(descending=True, stable=True)[: self.args.stored].sort().values)
         used = torch.tensor(sorted({*self.set.source.tolist(), self.best}), device=self.theta.device)
         index = torch.full((len(self.generators),), -1, device=used.device)
@@ -679,7 +696,8 @@ class Search:
             accepted = estimates[0] > estimates[1]
             if confirmed or not accepted:
                 break
-            active = torch.cat((active, self.append(None, self.draw(theta, source))))  # ten may have been lucky
+            again = self.draw(theta, source, args.guiding_samples)  # ten may have been lucky
+            active = torch.cat((active, self.append(None, again)))
         log_w = log_weights(log_pi[0], mixture)
         weights = torch.softmax(log_w, 0)
         ess = 1.0 / weights.square().sum(0)

@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Annotated, Any
 
 import matplotlib
@@ -54,6 +55,7 @@ RUN = ("env", "variant", "seed")
 KEPT = ("iteration", "control_steps", "seconds", "return", "objective", "objective_std", "accepted", "regularizer")
 KEPT += ("plan", "guides", "guides_std", "fit", "eval_objective", "eval_objective_std", "eval_without_noise")
 KEPT += ("eval_return", "eval_speed", "ess", "guide_share", "model_steps")
+TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (250, 400)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
 COLOURS = dict(zip(gps.Variant.__args__, plt.get_cmap("tab10").colors, strict=False))
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
@@ -305,8 +307,41 @@ def tabulate(docs: Path) -> str:
             kept, mean = (sum(float(row[key]) for row in own) / len(own) for key in ("kept", "mean"))
             cells[name] = f"{kept:.0%} ({mean:.0f})"
         table.append({"task": env, "perturbed": kind, "size": size, "seeds": len(rows) // len(CONTROLLERS)} | cells)
-    text += markdown(table) + "\n## Time of an iLQR iteration\n\n"
+    text += markdown(table) + "\n## Control steps to the same return\n\n" + markdown(compare(docs))
+    text += "\n## Time of an iLQR iteration\n\n"
     return text + markdown(read_csv(docs / "results" / "gps_time.csv"))  # type: ignore[arg-type]
+
+
+def compare(docs: Path) -> list[dict[str, Any]]:
+    """Control steps of samples until the mean return of training first passes a target: of the seeds that do, median.
+
+    Returns are the task's own over our horizon T; an episode of another length counts as T times its mean step.
+    """
+    runs, table = grouped(read_csv(docs / "results" / "gps_runs.csv"), *RUN), []
+    for env, targets in TARGETS.items():
+        learners = {"gps": [rows for (task, variant, _), rows in runs.items() if (task, variant) == (env, "full")]}
+        for name in ("shac", "ppo_baseline"):
+            learners[name] = list(grouped(read_csv(docs / "results" / f"{name}_{env}.csv"), "seed").values())
+        if not learners["gps"]:
+            continue
+        T = float(learners["gps"][0][0]["horizon"])
+        planning = median(float(rows[0]["model_steps"]) for rows in learners["gps"])
+        for target in targets:
+            cells = {}
+            for name, seeds in learners.items():
+                steps = [first_pass(rows, target, T) for rows in seeds]
+                reached = [count for count in steps if count < math.inf]
+                cells[name] = f"{median(reached):,.0f}" if reached else "never"
+                cells[name] += f" ({len(reached)} of {len(seeds)})"
+            table.append(
+                {"task": env, "T": f"{T:.0f}", "return": target} | cells | {"gps, of planning": f"{planning:,.0f}"}
+            )
+    return table
+
+
+def first_pass(rows: list[dict[str, str]], target: float, T: float) -> float:
+    passed = (row for row in rows if number(row["return"]) * T / float(row.get("length") or T) >= target)
+    return next((float(row["control_steps"]) for row in passed), math.inf)
 
 
 def draw(docs: Path) -> None:

@@ -481,10 +481,10 @@ def test_files_of_a_run(trained: Path, checkpoint: dict[str, Any]) -> None:
     with (trained / "progress.csv").open() as file:
         rows = list(csv.DictReader(file))
     steps = [int(row["control_steps"]) for row in rows]
-    assert steps[0] == 30 * (8 + 8 + 4 + 4)  # guiding samples, those of pretraining, a network's and the policy's own
-    # Proposals are drawn twice before they are accepted; a rejection draws the best policy's samples again.
+    assert steps[0] == 30 * (8 + 8 + 8 + 4)  # guiding samples, those of pretraining, a network's and the policy's own
+    # Before a proposal is accepted it is drawn again; a rejection draws the best policy's samples again.
     for drawn, row in zip(np.diff(steps) // 30, rows[1:], strict=True):
-        assert drawn in ((8,) if row["accepted"] == "1.0" else (8, 12))
+        assert drawn in ((4 + 8,) if row["accepted"] == "1.0" else (4 + 4, 4 + 8 + 4))
     assert [bool(row["eval_return"]) for row in rows] == [False, False, True, False, True]
     assert len(checkpoint["search"]["set"][1]) <= 24
     assert not list(trained.glob("*.tmp"))
@@ -510,6 +510,39 @@ def test_lessons_are_the_guides_means_about_a_wider_path(checkpoint: dict[str, A
 
     ratio = spread(0.1) / spread(0.01)  # small: at this plan the motor is in the tail of its tanh
     torch.testing.assert_close(ratio, torch.tensor(10.0).double(), rtol=0.15, atol=0)
+
+
+def test_labels_are_the_guides_means_until_a_trajectory_leaves_the_lessons(checkpoint: dict[str, Any]) -> None:
+    search = search_of(checkpoint)
+    guide, (lessons, _) = search.guides[0], search.lessons()  # 8 trajectories
+    samples = search.measure(*guide.sample(search.system, 0.1 * search.noise(2)))
+    samples.obs[1, 12] += 10.0  # the second trajectory leaves at step 12, and what it does later counts no more
+    obs, u = search.label(guide, lessons, samples)
+    x = torch.cat((samples.x[0, :30], samples.x[1, :12]))
+    path, K = (torch.cat((tensor[:30], tensor[:12])) for tensor in (guide.x, guide.K))
+    mean = torch.cat((guide.u, guide.u[:12])) + (K @ (x - path).unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(u, mean[::4])  # as many of its steps as 2 of the 8 lessons
+    torch.testing.assert_close(obs, search.system.observe(x)[::4])
+
+
+def test_pretraining_learns_from_the_states_that_a_network_visited(
+    checkpoint: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search, sizes, starts = search_of(checkpoint), [], []
+
+    def maximise(objective: Any, theta: torch.Tensor, iterations: int) -> tuple[torch.Tensor, float]:
+        with monkeypatch.context() as patch:
+            patch.setattr(gps.Policy, "log_prob", lambda policy, theta, obs, u: sizes.append(len(obs)) or theta)
+            objective(theta)
+        starts.append(theta)
+        return theta + 1.0, 0.0
+
+    monkeypatch.setattr(gps, "maximise", maximise)
+    monkeypatch.setattr(search, "label", lambda guide, lessons, samples: (samples.obs[:, 0], samples.u[:, 0]))
+    search.guide_return = 0.0, 0.0  # out of reach
+    search.pretrain(*search.lessons(), attempts=3)
+    assert sizes == [8 * 30, 8 * 30 + 8, 8 * 30 + 16]  # each time the first steps of 8 trajectories join
+    assert torch.equal(starts[1], starts[0] + 1.0) and torch.equal(starts[2], starts[1] + 1.0)  # from the last network
 
 
 def search_of(checkpoint: dict[str, Any]) -> gps.Search:
