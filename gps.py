@@ -41,7 +41,7 @@ from diffsim.ilqr import (
     step_jacobian,
     symmetric,
 )
-from diffsim.run import Mark, Run, fail, flag, load_checkpoint
+from diffsim.run import Mark, Run, fail, flag, read_arguments
 from diffsim.simulator import check_device
 from diffsim.tasks import PLANAR
 
@@ -816,26 +816,9 @@ def evaluate(search: Search) -> tuple[Evaluation, dict[str, float], str]:
 
 def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
     """The arguments, complete and checked, and the checkpoint that they name."""
-    args, checkpoint = tyro.cli(Args, args=argv, description=__doc__), None
     if distributed.size() > 1:
         fail("trains in one process; start it without torchrun")
-    if args.resume and args.evaluate:
-        fail("--resume and --evaluate exclude each other")
-    if path := args.resume or args.evaluate:
-        checkpoint = load_checkpoint(path, FORMAT)
-        saved = Args(**checkpoint["args"])
-        if args.evaluate:
-            saved.device = None  # wherever it was trained
-        if args.accuracy:  # a preset on the command line replaces the saved numbers, its own or given one by one
-            saved.substeps = saved.integrator = None
-        args = tyro.cli(Args, args=argv, description=__doc__, default=saved)
-        for name in FIXED:
-            if getattr(args, name) != getattr(saved, name):
-                fail(f"{path} has {flag(name)} {getattr(saved, name)}, not {getattr(args, name)}")
-        if args.resume and checkpoint["iteration"] >= min(args.iterations, args.stop_after or args.iterations):
-            fail(f"{path} is at iteration {checkpoint['iteration']} already: give more --iterations or --stop-after")
-    if args.env not in TASKS:
-        fail(f"unknown task {args.env!r}: choose from {', '.join(TASKS)}")
+    args, checkpoint = read_arguments(Args, argv, __doc__, FORMAT, FIXED, TASKS)
     for name, value in zip(COLUMNS, PER_TASK.get(args.env, DEFAULT), strict=True):
         if getattr(args, name) is None:
             setattr(args, name, value)
@@ -858,7 +841,6 @@ def parse(argv: list[str] | None) -> tuple[Args, dict[str, Any] | None]:
         fail(f"--regularizer-bounds must be two numbers in order, not {args.regularizer_bounds}")
     if args.demonstration and args.guides > 1:
         fail("--demonstration is one trajectory: --guides must be 1")
-    args.device = distributed.choose_device(args.device)
     return args, checkpoint
 
 

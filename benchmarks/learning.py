@@ -341,10 +341,15 @@ def results(args: Args, algorithm: str, env: str) -> list[Curve]:
     return curves(path) if path.is_file() else []
 
 
+def compared(args: Args, experiment: Experiment) -> list[str]:
+    """The tasks on which there are two learners to compare."""
+    return [env for env in experiment.tasks if sum(bool(results(args, a, env)) for a in experiment.algorithms) > 1]
+
+
 def draw_experiment(args: Args, name: str, suffix: str = "", full: bool = False) -> None:
     """Mean and standard deviation over seeds; on linear axes up to where the first learner ends, or all on log axes."""
     experiment = EXPERIMENTS[name]
-    tasks = [env for env in experiment.tasks if any(results(args, a, env) for a in experiment.algorithms)]
+    tasks = compared(args, experiment)
     figure, axes = plt.subplots(2, len(tasks), figsize=(3.4 * len(tasks), 5.6), squeeze=False, layout="constrained")
     for column, env in enumerate(tasks):
         for axis, x, label in zip(
@@ -407,7 +412,7 @@ def passing(runs: list[Curve], target: float) -> tuple[float, float]:
 
 def table(args: Args, experiment: Experiment) -> list[dict[str, Any]]:
     rows = []
-    for env in experiment.tasks:
+    for env in compared(args, experiment):
         target, reference = TARGETS[env], None
         for algorithm in experiment.algorithms:
             if not (runs := results(args, algorithm, env)):
@@ -486,11 +491,13 @@ def timed(function: Callable[[], Any], device: torch.device, warmup: int = 4, ca
 
 
 def write_page(args: Args) -> None:
-    """The pictures and tables of docs/experiments.md, of the csv files that there are."""
+    """Pictures and tables of the csv files that there are: of this experiment, and of those that the page shows."""
     page = args.docs / "experiments.md"
+    shown = page.read_text() if page.is_file() else ""
     for name, experiment in EXPERIMENTS.items():
-        rows = table(args, experiment)
-        if len({row["learner"] for row in rows}) < 2:
+        if name != args.experiment and f"<!-- {name} -->" not in shown:
+            continue
+        if not (rows := table(args, experiment)):
             continue
         text = f"{markdown(rows)}\n![{experiment.title}]({name}.png)\n"
         if name == "horizon":
