@@ -86,7 +86,7 @@ def read_arguments(
     if args.resume and checkpoint:
         if checkpoint["iteration"] >= min(args.iterations, args.stop_after or args.iterations):
             fail(f"{path} is at iteration {checkpoint['iteration']} already: give more --iterations or --stop-after")
-        if (ranks := len(checkpoint.get("ranks", "1"))) != distributed.size():
+        if (ranks := len(checkpoint.get("ranks", [None]))) != distributed.size():
             fail(f"{path} was trained by {ranks} processes, not {distributed.size()}")
         if args.device.partition(":")[0] != saved.device.partition(":")[0]:
             fail(f"{path} was trained on {saved.device}, which {args.device} cannot continue exactly")
