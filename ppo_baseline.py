@@ -78,6 +78,8 @@ class Args:
     """the probability ratio counts only within 1 - clip and 1 + clip"""
     value_coef: float = 2.0
     """weight of the value's squared error, in units of its standard deviation"""
+    entropy_coef: float = 0.0
+    """weight of the policy's entropy, which keeps its noise from vanishing; the paper's is 0"""
     bound_coef: float = 1e-4
     """weight of the squared excess of the policy's mean beyond 1.1, where the action is clipped"""
     initial_log_std: float = 0.0
@@ -309,6 +311,11 @@ def clipped_loss(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
     return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
 
 
+def entropy(log_std: Tensor) -> Tensor:
+    """Of a diagonal Gaussian, in nats."""
+    return (log_std + (1 + math.log(2 * math.pi)) / 2).sum(-1)
+
+
 @torch.no_grad()
 def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) -> None:
     """Divides lr by 1.5 where kl is beyond twice the target, and multiplies it by 1.5 below half of it."""
@@ -418,7 +425,8 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
                 policy_loss = clipped_loss(log_ratio(b, mean, policy.log_std, old_log_std), b.advantage, args.clip)
                 value_loss = (value - b.target).square().mean()
                 bound_loss = (mean.abs() - 1.1).clamp(min=0).square().sum(-1).mean()
-                norm = optimizer.step(policy_loss + args.value_coef * value_loss + args.bound_coef * bound_loss)
+                loss = policy_loss + args.value_coef * value_loss + args.bound_coef * bound_loss
+                norm = optimizer.step(loss - args.entropy_coef * entropy(policy.log_std))
                 metrics.append(torch.stack((policy_loss.detach(), value_loss.detach(), kl, norm)))
         std = policy.log_std.detach().exp().mean()
         return torch.cat([torch.stack(metrics).mean(0), torch.stack([optimizer.skipped, optimizer.lr, std])])

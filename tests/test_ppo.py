@@ -81,6 +81,14 @@ def test_ratio_and_divergence_are_those_of_the_distributions() -> None:
     torch.testing.assert_close(ppo.log_ratio(batch, mean, log_std, old_log_std), expected)
     result = ppo.kl_divergence(batch.mean, old_log_std, mean, log_std)
     torch.testing.assert_close(result, kl_divergence(old, new).sum(-1).mean())
+    torch.testing.assert_close(ppo.entropy(log_std), new.entropy()[0].sum())
+
+
+def test_entropy_bonus_raises_the_noise(tmp_path: Path) -> None:
+    """A wrong sign would lower it; the bonus is so large that nothing else counts."""
+    arguments = "--env cartpole --iterations 2 --eval-episodes 4 --threads 1 --quiet --entropy-coef 100"
+    checkpoint = run(ppo, tmp_path, *arguments.split())
+    assert checkpoint["policy"]["log_std"].item() > 0.005
 
 
 def test_clipped_objective_and_its_gradient_case_by_case() -> None:
