@@ -325,7 +325,8 @@ def gradient_sizes(args: Args, task: str, snapshot: Snapshot) -> dict[str, Any]:
 
 
 def write_columns(path: Path, **columns: np.ndarray) -> None:
-    write_csv(path, [dict(zip(columns, map(float, row), strict=True)) for row in zip(*columns.values(), strict=True)])
+    rows = ([f"{value:.7g}" for value in row] for row in zip(*columns.values(), strict=True))
+    write_csv(path, [dict(zip(columns, row, strict=True)) for row in rows])
 
 
 def roughness(values: np.ndarray) -> tuple[int, float]:

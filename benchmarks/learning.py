@@ -64,8 +64,9 @@ VARIANTS = {  # of a script: its flags
     "shac_general": ("shac", "--general-hyperparameters"),
     "shac_deterministic": ("shac", "--deterministic-policy"),
     "shac_1024": ("shac", "--num-envs", "1024"),
-    "ppo_256": ("ppo_baseline", "--num-envs", "256", "--minibatch-size", "2048"),
-    "ppo_4096": ("ppo_baseline", "--num-envs", "4096", "--minibatch-size", "32768"),
+    "ppo_256": ("ppo_baseline", "--num-envs", "256", "--minibatch-size", "2048", "--entropy-coef", "0"),
+    "ppo_4096": ("ppo_baseline", "--num-envs", "4096", "--minibatch-size", "32768", "--entropy-coef", "0"),
+    **{f"ppo_e{c}": ("ppo_baseline", "--entropy-coef", c) for c in ("0", "0.002", "0.005", "0.01", "0.02")},
     **{f"shac_h{h}": ("shac", "--horizon", str(h), "--num-envs", str(2048 // h)) for h in (4, 8, 16, 64, 128)},
 }
 
@@ -80,8 +81,13 @@ EXPERIMENTS = {
     "comparison": Experiment("Figures 4 and 7: the learners", ("shac", "ppo_baseline", "bptt", "shac_no_critic")),
     "environments": Experiment(
         "SHAC and PPO at several numbers of environments",
-        ("shac", "shac_1024", "ppo_256", "ppo_baseline", "ppo_4096"),
+        ("shac", "shac_1024", "ppo_256", "ppo_e0", "ppo_4096"),
         ("ant", "humanoid"),
+    ),
+    "entropy": Experiment(
+        "PPO's entropy bonus",
+        ("ppo_baseline", "ppo_e0", "ppo_e0.002", "ppo_e0.005", "ppo_e0.01", "ppo_e0.02"),
+        ("hopper", "ant", "humanoid"),
     ),
     "horizon": Experiment(
         "Figure 6: short horizon length, 2,048 samples per iteration",
@@ -100,9 +106,11 @@ TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid
 class Args:
     algorithm: str = "shac"
     """learner: a script in the repository's root, without .py, or a variant of one, e.g. shac_no_critic"""
-    experiment: Literal["comparison", "environments", "horizon", "general", "deterministic", "time"] | None = None
-    """several learners at once, drawn together: Figures 4 and 7 of the SHAC paper, more of the same, its Figures 6, 8
-    and 9, or its Table 12"""
+    experiment: (
+        Literal["comparison", "environments", "entropy", "horizon", "general", "deterministic", "time"] | None
+    ) = None
+    """several learners at once, drawn together: Figures 4 and 7 of the SHAC paper, two more of the kind, its Figures
+    6, 8 and 9, or its Table 12"""
     env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
     """tasks"""
     seeds: tuple[int, ...] = (1, 2, 3)

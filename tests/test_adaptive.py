@@ -1,0 +1,29 @@
+"""benchmarks/adaptive.py: control steps are sorted rightly into those in flight and those on the ground."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+import adaptive  # noqa: E402
+
+
+@pytest.mark.parametrize(("height", "flight"), [(-0.05, "0.000"), (1.0, "1.000")])
+def test_a_hopper_is_in_flight_where_it_is_lifted(
+    height: float, flight: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An untrained policy, from the start of an episode, 5 cm lower or 1 m above."""
+
+    def start(name: str, _: object, count: int) -> tuple[adaptive.Tensor, adaptive.Tensor]:
+        env = adaptive.diffsim.make(name, num_envs=count, stochastic_init=False)
+        qpos = env.qpos.double()
+        qpos[:, 1] += height
+        return qpos, env.qvel.double()
+
+    monkeypatch.setattr(adaptive, "visited_states", start)
+    row = adaptive.measure(adaptive.Args(runs=tmp_path, states=2, steps=2), "hopper")
+    assert row["steps in flight"] == flight
+    assert "gain" not in row  # there is nothing to compare
