@@ -14,7 +14,7 @@ class Ant(Locomotion):
     name = "ant"
     asset = "ant.xml"
     substeps = 16
-    fast = Integration("semi_implicit", 0.0, 8)
+    fast = Integration("implicit", 0.0, 8)
     accurate = Integration("extrapolated", 0.0, 16)
     obs_dim = 37
     num_random = 29

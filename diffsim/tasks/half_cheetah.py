@@ -14,7 +14,7 @@ class HalfCheetah(Task):
     name = "half_cheetah"
     asset = "half_cheetah.xml"
     substeps = 16
-    fast = Integration("semi_implicit", 0.0, 8)
+    fast = Integration("implicit", 0.0, 8)
     accurate = Integration("extrapolated", 0.0, 16)
     obs_dim = 17
     num_random = 18

@@ -14,7 +14,7 @@ class Humanoid(Locomotion):
     name = "humanoid"
     asset = "humanoid.xml"
     substeps = 48
-    fast = Integration("implicit", 0.0, 16)
+    fast = Integration("implicit", 0.0, 24)
     accurate = Integration("extrapolated", 0.0, 96)
     obs_dim = 76
     num_random = 55

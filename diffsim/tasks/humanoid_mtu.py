@@ -17,7 +17,7 @@ class HumanoidMTU(Locomotion):
     name = "humanoid_mtu"
     asset = "humanoid_mtu.xml"
     substeps = 48
-    fast = Integration("implicit", 0.0, 16)  # the humanoid's, and not measured here
+    fast = Integration("implicit", 0.0, 24)
     accurate = Integration("extrapolated", 0.0, 96)
     obs_dim = 53
     num_random = 53
