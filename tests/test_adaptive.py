@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import adaptive
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-import adaptive  # noqa: E402
 
 
 @pytest.mark.parametrize(("height", "flight"), [(-0.05, "0.000"), (1.0, "1.000")])
