@@ -17,14 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import mujoco
 import numpy as np
 import torch
 import tyro
 from common import DOCS, RESULTS, RUNS, load_policy, visited_states
 from tables import fill, markdown, merge_csv
 from torch import Tensor
-from tradeoff import CONTROL_DT, deepest, simulator
+from tradeoff import CONTROL_DT, deepest, simulator, state_errors
 
 import diffsim
 from diffsim.run import fail
@@ -77,15 +76,6 @@ def motion(args: Args, name: str) -> tuple[Any, list[Tensor], Tensor, np.ndarray
     return scene, [torch.cat(x) for x in zip(*starts, strict=True)], torch.cat(ends), np.concatenate(touching)
 
 
-def errors(model: mujoco.MjModel, qpos: Tensor, expected: Tensor) -> np.ndarray:
-    """(B,) root mean square over degrees of freedom."""
-    found, difference = np.full(len(qpos), np.inf), np.zeros(model.nv)
-    for k, (a, b) in enumerate(zip(qpos.numpy(), expected.numpy(), strict=True)):
-        mujoco.mj_differentiatePos(model, difference, 1.0, b, a)
-        found[k] = np.sqrt(np.mean(difference**2))
-    return found
-
-
 def measure(args: Args, name: str) -> dict[str, Any]:
     scene, starts, ends, touching = motion(args, name)
     default = diffsim.TASKS[name].substeps
@@ -96,7 +86,7 @@ def measure(args: Args, name: str) -> dict[str, Any]:
     for substeps in [n for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 48) if n <= default]:
         sim = simulator(scene, Integration("semi_implicit", 0.0, substeps), torch.float64, len(ends))
         with torch.no_grad():
-            found = errors(scene.mj_model, sim.step(*starts)[0], ends)
+            found = state_errors(scene.mj_model, sim.step(*starts)[0], ends)
         quantiles[substeps] = [float(np.quantile(found[kind], 0.95)) for kind in (touching, ~touching)]
     allowed = quantiles[default][0]
     least = next(n for n in quantiles if all(quantiles[m][1] <= allowed for m in quantiles if m >= n) or n == default)

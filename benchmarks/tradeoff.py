@@ -158,13 +158,18 @@ def gradients(
     return {horizon: np.concatenate(found) for horizon, found in result.items()}
 
 
-def state_error(model: mujoco.MjModel, qpos: Tensor, expected: Tensor) -> float:
-    """Median over environments of the root mean square over degrees of freedom."""
+def state_errors(model: mujoco.MjModel, qpos: Tensor, expected: Tensor) -> np.ndarray:
+    """(N,) root mean square over degrees of freedom."""
     errors, difference = [], np.zeros(model.nv)
     for a, b in zip(qpos.numpy(), expected.numpy(), strict=True):
         mujoco.mj_differentiatePos(model, difference, 1.0, b, a)
         errors.append(np.sqrt(np.mean(difference**2)))
-    return float(np.median(errors))
+    return np.array(errors)
+
+
+def state_error(model: mujoco.MjModel, qpos: Tensor, expected: Tensor) -> float:
+    """Median over environments."""
+    return float(np.median(state_errors(model, qpos, expected)))
 
 
 def deepest(model: mujoco.MjModel, qpos: Tensor) -> np.ndarray:
