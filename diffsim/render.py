@@ -74,7 +74,7 @@ def render_frames(
     return np.ascontiguousarray(frames[:, ::-1])  # OpenGL's first row is the lowest
 
 
-def write_video(path: str | os.PathLike[str], frames: NDArray[np.uint8], fps: float = 60.0) -> Path:
+def save_video(path: str | os.PathLike[str], frames: NDArray[np.uint8], fps: float = 60.0) -> Path:
     """Write frames (T, height, width, 3) as .mp4, or as .gif where imageio-ffmpeg is not installed.
 
     Returns:

@@ -8,25 +8,26 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from diffsim import graph
+from diffsim.training import graph
 
 
-def choose_device(device: str | None) -> str:
-    """The device of this process: the given one, or a GPU if there is one; of several ranks each takes its own GPU."""
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+def choose_device(device: str) -> str:
+    """The device of this process: with "auto" a GPU if there is one; of several ranks each takes its own GPU."""
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     return f"cuda:{os.environ['LOCAL_RANK']}" if device == "cuda" and "LOCAL_RANK" in os.environ else device
 
 
-def join(device: torch.device) -> None:
-    """Meet the other ranks, if torchrun started this process: over NCCL on GPUs, over gloo on the CPU."""
+def initialize(device: torch.device) -> None:
+    """Connect to the other ranks if torchrun started this process: NCCL on GPUs, gloo on the CPU."""
     if "LOCAL_RANK" in os.environ and not dist.is_initialized():
         if device.type == "cuda":
             torch.cuda.set_device(device)
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
 
 
-def leave() -> None:
-    """Part from the other ranks; NCCL would wait for ever for the graphs that hold its operations, so they go first."""
+def finalize() -> None:
+    """Disconnect from the other ranks. NCCL waits for CUDA graphs that hold its operations, so they are freed first."""
     if dist.is_initialized():
         graph.release()
         dist.destroy_process_group()

@@ -1,0 +1,96 @@
+"""Evaluate a policy: the first episode of each of many fresh environments."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffsim import render
+from diffsim.env import DiffEnv
+from diffsim.scene import Scene
+
+SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
+
+
+@dataclass
+class Evaluation:
+    """One episode each of n environments.
+
+    Attributes:
+        returns: (n,) undiscounted.
+        lengths: (n,) control steps.
+        speed: mean forward speed, m/s; None for a robot without ground.
+        qpos: (T, n, nq) before each step; valid up to an episode's length.
+        scene, control_dt: what the episodes are of, to draw them.
+    """
+
+    returns: Tensor
+    lengths: Tensor
+    speed: float | None
+    qpos: Tensor
+    scene: Scene
+    control_dt: float
+
+    @property
+    def length(self) -> float:
+        return self.lengths.float().mean().item()
+
+    def scalars(self) -> dict[str, float]:
+        values = {"eval/return": self.returns.median().item(), "eval/length": self.length}
+        return values if self.speed is None else values | {"eval/speed": self.speed}
+
+    def __str__(self) -> str:
+        r = self.returns
+        speed = "" if self.speed is None else f", forward speed {self.speed:.2f} m/s"
+        spread = f"mean {r.mean():.1f}, std {r.std(correction=0):.1f}, min {r.min():.1f}"
+        return f"return median {r.median():.1f}, {spread}, length {self.length:.1f}{speed}"
+
+    def write_json(self, path: Path, settings: Mapping[str, Any]) -> None:
+        """Write the median return, every episode's return and length, the speed and what they were measured with."""
+        values = {
+            "return": self.returns.median().item(),
+            "length": self.length,
+            "speed": self.speed,
+            "returns": self.returns.tolist(),
+            "lengths": self.lengths.tolist(),
+            "settings": dict(settings),
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(values, indent=2, default=str) + "\n")
+
+    def save_video(self, path: Path) -> Path:
+        """Film the episode of median return, every other control step; returns the file written, an mp4 or a gif.
+
+        Raises:
+            ImportError, OSError, RuntimeError: what is missing to draw or to write, see render.py.
+        """
+        episode = self.returns.argsort()[(len(self.returns) - 1) // 2]
+        qpos = self.qpos[: self.lengths[episode] : 2, episode].cpu().numpy()
+        frames = render.render_frames(self.scene, qpos, width=480, height=360)
+        return render.save_video(path, frames, fps=0.5 / self.control_dt)
+
+
+@torch.no_grad()
+def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> Evaluation:
+    """The first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu)."""
+    obs, _ = env.reset(seed=SEED)
+    alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+    returns, lengths, qpos = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long), []
+    while alive.any():
+        qpos.append(env.qpos)
+        obs, reward, terminated, truncated, _ = env.step(policy(obs))
+        returns += torch.where(alive, reward, torch.zeros_like(reward))
+        lengths += alive
+        alive &= ~(terminated | truncated)
+    path = torch.stack(qpos)
+    speed = None
+    if "contact" in env.scene.features:  # the first coordinate of a robot that walks is its x
+        distance = path[..., 0].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, 0]
+        speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
+    return Evaluation(returns, lengths, speed, path, env.scene, env.control_dt)
