@@ -21,12 +21,12 @@ import numpy as np
 import torch
 import tyro
 from common import DOCS, RESULTS, RUNS, load_policy, visited_states
-from diffsim.run import fail
 from tables import fill, markdown, merge_csv
 from torch import Tensor
 from tradeoff import CONTROL_DT, deepest, simulator, state_errors
 
 import diffsim
+from diffsim.run import fail
 from diffsim.tasks import Integration
 
 INSTANTS = 16  # of a control step at which contact is looked for

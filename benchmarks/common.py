@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import torch
-from diffsim.run import fail, load_checkpoint
 from torch import Tensor, nn
 
 import diffsim
+from diffsim.run import fail, load_checkpoint
 from diffsim.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -26,10 +26,10 @@ from typing import Annotated, Any
 import learning
 import tyro
 from common import DOCS, RESULTS, ROOT
-from diffsim.run import fail
 from tables import fill, markdown, merge_csv, read_csv
 
 import diffsim
+from diffsim.run import fail
 
 STIFF = ("--penalty", "k_n=1e5", "k_d=1e4")  # on which published SHAC's hopper falls from 4,794 to 1,603
 VARIANTS = {

@@ -35,10 +35,9 @@ from torch import Tensor
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # this file is called gps, too: the learner's comes first
-from diffsim.run import fail, load_checkpoint  # noqa: E402
-
 import gps  # noqa: E402
 import shac  # noqa: E402
+from diffsim.run import fail, load_checkpoint  # noqa: E402
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402

@@ -25,10 +25,9 @@ from tables import fill, read_csv, write_csv
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+import shac  # noqa: E402
 from diffsim.evaluation import evaluate  # noqa: E402
 from diffsim.run import fail  # noqa: E402
-
-import shac  # noqa: E402
 from diffsim.tasks.humanoid_mtu import HumanoidMTU  # noqa: E402
 
 matplotlib.use("Agg")

@@ -14,11 +14,11 @@ from tempfile import mkdtemp
 from typing import Any
 
 import torch
-from diffsim.run import fail
 from torch.profiler import ProfilerActivity, profile
 
 import diffsim
 from diffsim import graph
+from diffsim.run import fail
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import shac  # noqa: E402

@@ -30,12 +30,12 @@ import matplotlib
 import numpy as np
 import torch
 import tyro
-from diffsim.run import load_checkpoint
 from torch import Tensor
 from torch.func import functional_call, vmap
 
 import diffsim
 from diffsim import distributed
+from diffsim.run import load_checkpoint
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402

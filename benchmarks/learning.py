@@ -33,11 +33,11 @@ import matplotlib
 import numpy as np
 import torch
 import tyro
-from diffsim.run import fail
 from tables import fill, markdown, read_csv, write_csv
 
 import diffsim
 from diffsim import graph
+from diffsim.run import fail
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402

@@ -22,11 +22,11 @@ import numpy as np
 import torch
 import tyro
 from common import DOCS, RESULTS, idle
-from diffsim.run import fail
 from speed import time_diffsim
 from tables import fill, markdown, merge_csv
 
 import diffsim
+from diffsim.run import fail
 from diffsim.scene import Scene
 
 matplotlib.use("Agg")

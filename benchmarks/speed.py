@@ -35,12 +35,12 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from diffsim.run import fail
 from tables import digits, markdown, merge_csv, read_csv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import diffsim
 from diffsim import graph
+from diffsim.run import fail
 from diffsim.simulator import available_cores
 
 matplotlib.use("Agg")

@@ -31,12 +31,12 @@ import numpy as np
 import torch
 import tyro
 from common import DOCS, RESULTS, RUNS, Policy, idle, load_policy, visited_states
-from diffsim.run import fail
 from tables import fill, markdown, merge_csv, read_csv
 from torch import Tensor
 from tradeoff import CONTROL_DT, closed_loop, label, mechanics, simulator
 
 import diffsim
+from diffsim.run import fail
 from diffsim.scene import Scene
 from diffsim.tasks import Integration
 

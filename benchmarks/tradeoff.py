@@ -38,13 +38,13 @@ import numpy as np
 import torch
 import tyro
 from common import DOCS, RESULTS, RUNS, Policy, idle, load_policy, visited_states
-from diffsim.evaluation import evaluate
-from diffsim.run import constants, fail
 from speed import time_diffsim
 from tables import fill, markdown, merge_csv, read_csv
 from torch import Tensor
 
 import diffsim
+from diffsim.evaluation import evaluate
+from diffsim.run import constants, fail
 from diffsim.scene import Scene
 from diffsim.simulator import INTEGRATORS
 from diffsim.tasks import Integration

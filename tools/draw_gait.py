@@ -19,11 +19,10 @@ import tyro
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from diffsim.run import fail  # noqa: E402
-
 import shac  # noqa: E402
 from diffsim import evaluation  # noqa: E402
 from diffsim.render import render_frames  # noqa: E402
+from diffsim.run import fail  # noqa: E402
 
 
 @dataclass
