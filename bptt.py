@@ -27,6 +27,7 @@ from diffsim.training import (
     ParallelFlags,
     Positive,
     Run,
+    Stateful,
     Widths,
     episode_metrics,
     evaluate,
@@ -114,8 +115,12 @@ class Actor(nn.Module):
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
-    def forward(self, obs: Tensor, noise: Tensor | float = 0.0) -> Tensor:
+    def forward(self, obs: Tensor, noise: Tensor) -> Tensor:
         return torch.tanh(self.mean(self.normalizer(obs)) + noise)
+
+    def deterministic(self) -> nn.Sequential:
+        """The policy without noise, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.mean, nn.Tanh())
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -140,11 +145,12 @@ class BPTT:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        (obs_dim,), (action_dim,) = env.single_observation_space.shape, env.single_action_space.shape
-        self.policy = Actor(args, obs_dim, action_dim).to(env.device)
+        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.policy = self.actor.deterministic()
         # However large a gradient is, it is clipped and followed: chaos is what the comparison is about.
-        self.optimizer = ClippedAdam(self.policy, args.max_grad_norm, args.betas, skip_norm=math.inf)
-        self.modules = {"policy": self.policy, "optimizer": self.optimizer}
+        self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas, skip_norm=math.inf)
+        self.modules: dict[str, Stateful] = {"actor": self.actor, "optimizer": self.optimizer}
 
     def set_learning_rate(self, iteration: int) -> None:
         args = self.args
@@ -153,22 +159,22 @@ class BPTT:
     def update(self) -> dict[str, Tensor]:
         """Descend the loss of a window of all environments."""
         args = self.args
-        rollout = collect(self.env, self.policy, self.policy.sample_noise(args.horizon, self.env.num_envs))
+        rollout = collect(self.env, self.actor, self.actor.sample_noise(args.horizon, self.env.num_envs))
         loss = bptt_loss(rollout.reward, rollout.done, args.gamma)
         norm = self.optimizer.step(loss)
         if args.normalize_obs:
-            self.policy.normalizer.update(rollout.obs.detach())
+            self.actor.normalizer.update(rollout.obs.detach())
         episode = {"r": rollout.episode_return, "l": rollout.episode_length}
         metrics = episode_metrics(self.env, rollout.done, episode, rollout.nonfinite)
         return {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped} | metrics
 
 
-def collect(env: DiffEnv, policy: Actor, noise: Tensor) -> Rollout:
+def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
     """H steps of all environments from where they stand, with the policy's noise (H, N, action_dim)."""
     steps = []
     obs = env.detach()
     for step_noise in noise.unbind():
-        next_obs, reward, terminated, truncated, info = env.step(policy(obs, step_noise))
+        next_obs, reward, terminated, truncated, info = env.step(actor(obs, step_noise))
         episode = info["episode"]["r"], info["episode"]["l"]
         steps.append((obs, reward, terminated | truncated, info["nonfinite"], *episode))
         obs = next_obs
@@ -202,7 +208,7 @@ def train(args: Args) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:
-        evaluate_checkpoint(args, BPTT)
+        evaluate_checkpoint(args)
     else:
         train(args)
 

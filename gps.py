@@ -24,13 +24,14 @@ from typing import Annotated, Any, Literal, NamedTuple
 import torch
 import torch.nn.functional as F
 import tyro
+from diffsim.evaluation import SEED as EVALUATION_SEED
+from diffsim.evaluation import Evaluation, write_video
+from diffsim.run import Mark, Run, fail, flag, read_arguments
 from torch import Tensor
 
 import diffsim
 from diffsim import distributed
 from diffsim.dynamics import REAL, Dynamics
-from diffsim.evaluation import SEED as EVALUATION_SEED
-from diffsim.evaluation import Evaluation, write_video
 from diffsim.ilqr import (
     Plan,
     backward_pass,
@@ -41,7 +42,6 @@ from diffsim.ilqr import (
     step_jacobian,
     symmetric,
 )
-from diffsim.run import Mark, Run, fail, flag, read_arguments
 from diffsim.simulator import check_device
 from diffsim.tasks import PLANAR
 

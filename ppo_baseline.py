@@ -29,6 +29,7 @@ from diffsim.training import (
     ParallelFlags,
     Positive,
     Run,
+    Stateful,
     Widths,
     distributed,
     episode_metrics,
@@ -98,7 +99,7 @@ class Args(ParallelFlags):
     """evaluate the deterministic policy every this many iterations (0: only at the end)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
         return values
@@ -121,14 +122,14 @@ class ActorCritic(nn.Module):
         self.mean, self.value = nn.Linear(obs_dim, action_dim), nn.Linear(obs_dim, 1)
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
 
-    def heads(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
         features = self.features(obs)
         return self.mean(features), self.value(features).squeeze(-1)
 
-    def forward(self, obs: Tensor) -> Tensor:
-        """The deterministic policy."""
-        return self.heads(self.normalizer(obs))[0]
+    def deterministic(self) -> nn.Sequential:
+        """The mean alone, of observations as they come, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.features, self.mean)
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -168,15 +169,16 @@ class PPO:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        (obs_dim,), (action_dim,) = env.single_observation_space.shape, env.single_action_space.shape
-        self.policy = ActorCritic(args, obs_dim, action_dim).to(env.device)
+        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        self.actor_critic = ActorCritic(args, obs_dim, action_dim).to(env.device)
+        self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
-        self.optimizer = ClippedAdam(self.policy, args.max_grad_norm, lr=args.lr)
+        self.optimizer = ClippedAdam(self.actor_critic, args.max_grad_norm, lr=args.lr)
         samples, sizes = args.horizon * env.num_envs, ((obs_dim,), (action_dim,), (action_dim,), (), ())
         self.batch = Batch(*(torch.zeros(samples, *size, device=env.device) for size in sizes))
         self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
-        self.modules = {
-            "policy": self.policy,
+        self.modules: dict[str, Stateful] = {
+            "actor_critic": self.actor_critic,
             "return_normalizer": self.return_normalizer,
             "optimizer": self.optimizer,
         }
@@ -184,11 +186,11 @@ class PPO:
     @torch.no_grad()
     def roll_out(self) -> dict[str, Tensor]:
         """Act for a rollout, and keep its samples with their advantages and value targets."""
-        args, policy, normalizer = self.args, self.policy, self.policy.normalizer
+        args, policy, normalizer = self.args, self.actor_critic, self.actor_critic.normalizer
         noise = torch.randn(args.horizon, self.env.num_envs, policy.log_std.numel(), device=self.env.device)
         rollout = collect(self.env, policy, noise)
         value = self.return_normalizer.inverse(rollout.value)
-        next_value = self.return_normalizer.inverse(policy.heads(normalizer(rollout.next_obs))[1])
+        next_value = self.return_normalizer.inverse(policy(normalizer(rollout.next_obs))[1])
         next_value = next_value.masked_fill(rollout.terminated, 0.0)
         advantage = gae(rollout.reward, value, next_value, rollout.done, args.gamma, args.gae_lambda)
         self.return_normalizer.update(value + advantage)
@@ -204,13 +206,13 @@ class PPO:
 
     def update(self) -> dict[str, Tensor]:
         """Descend the clipped loss (Eq. 7) in epochs of minibatches."""
-        args, policy, metrics = self.args, self.policy, []
+        args, policy, metrics = self.args, self.actor_critic, []
         old_log_std = policy.log_std.detach().clone()
         for _ in range(args.epochs):
             order = torch.randperm(len(self.batch.obs), device=self.env.device)
             for tensors in zip(*(tensor[order].chunk(self.minibatches) for tensor in self.batch), strict=True):
                 b = Batch(*tensors)
-                mean, value = policy.heads(b.obs)
+                mean, value = policy(b.obs)
                 kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
                 adapt(self.optimizer.lr, distributed.average(kl), args.target_kl, args.lr_bounds)
                 policy_loss = clipped_loss(log_ratio(b, mean, policy.log_std, old_log_std), b.advantage, args.clip)
@@ -233,7 +235,7 @@ def collect(env: DiffEnv, policy: ActorCritic, noise: Tensor) -> Rollout:
     steps = []
     obs, std = env.detach(), policy.log_std.exp()
     for step_noise in noise.unbind():
-        mean, value = policy.heads(policy.normalizer(obs))
+        mean, value = policy(policy.normalizer(obs))
         action = mean + std * step_noise
         next_obs, reward, terminated, truncated, info = env.step(action)
         ends = terminated, terminated | truncated, info["nonfinite"]
@@ -302,7 +304,7 @@ def train(args: Args) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:
-        evaluate_checkpoint(args, PPO)
+        evaluate_checkpoint(args)
     else:
         train(args)
 

@@ -29,6 +29,7 @@ from diffsim.training import (
     ParallelFlags,
     Positive,
     Run,
+    Stateful,
     Widths,
     episode_metrics,
     evaluate,
@@ -131,8 +132,12 @@ class Actor(nn.Module):
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
-    def forward(self, obs: Tensor, noise: Tensor | float = 0.0) -> Tensor:
+    def forward(self, obs: Tensor, noise: Tensor) -> Tensor:
         return torch.tanh(self.mean(self.normalizer(obs)) + noise)
+
+    def deterministic(self) -> nn.Sequential:
+        """The policy without noise, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.mean, nn.Tanh())
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -159,16 +164,17 @@ class SHAC:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        (obs_dim,), (action_dim,) = env.single_observation_space.shape, env.single_action_space.shape
-        self.policy = Actor(args, obs_dim, action_dim).to(env.device)
+        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.policy = self.actor.deterministic()
         self.critic = mlp(obs_dim, args.critic_hidden, 1, orthogonal=True).to(env.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.actor_optimizer = ClippedAdam(self.policy, args.max_grad_norm, args.betas)
+        self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
         self.critic_optimizer = ClippedAdam(self.critic, args.max_grad_norm, args.betas)
         self.obs = torch.zeros(args.horizon * env.num_envs, obs_dim, device=env.device)  # the critic's samples
         self.value = torch.zeros(args.horizon * env.num_envs, device=env.device)
-        self.modules = {
-            "policy": self.policy,
+        self.modules: dict[str, Stateful] = {
+            "actor": self.actor,
             "critic": self.critic,
             "target": self.target,
             "actor_optimizer": self.actor_optimizer,
@@ -182,8 +188,8 @@ class SHAC:
 
     def update_actor(self) -> dict[str, Tensor]:
         """Descend the loss of a window of all environments (Eq. 5); keep the critic's samples of it."""
-        args, normalizer = self.args, self.policy.normalizer
-        rollout = collect(self.env, self.policy, self.policy.sample_noise(args.horizon, self.env.num_envs))
+        args, normalizer = self.args, self.actor.normalizer
+        rollout = collect(self.env, self.actor, self.actor.sample_noise(args.horizon, self.env.num_envs))
         next_value = self.next_values(rollout)
         loss = actor_loss(rollout.reward, next_value, rollout.done, args.gamma)
         norm = self.actor_optimizer.step(loss)
@@ -216,16 +222,16 @@ class SHAC:
         """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
         if self.args.no_critic:
             return torch.zeros_like(rollout.reward)
-        values = self.target(self.policy.normalizer(rollout.next_obs)).squeeze(-1)
+        values = self.target(self.actor.normalizer(rollout.next_obs)).squeeze(-1)
         return torch.where(rollout.terminated, torch.zeros_like(values), values)
 
 
-def collect(env: DiffEnv, policy: Actor, noise: Tensor) -> Rollout:
+def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
     """H steps of all environments from where they stand, with the policy's noise (H, N, action_dim)."""
     steps = []
     obs = env.detach()
     for step_noise in noise.unbind():
-        next_obs, reward, terminated, truncated, info = env.step(policy(obs, step_noise))
+        next_obs, reward, terminated, truncated, info = env.step(actor(obs, step_noise))
         episode = info["episode"]["r"], info["episode"]["l"]
         done = terminated | truncated
         steps.append((obs, info["final_obs"], reward, terminated, done, info["nonfinite"], *episode))
@@ -271,7 +277,7 @@ def train(args: Args) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:
-        evaluate_checkpoint(args, SHAC)
+        evaluate_checkpoint(args)
     else:
         train(args)
 

@@ -6,7 +6,7 @@ The physics knows nothing of this package.
 from __future__ import annotations
 
 from diffsim.training import distributed
-from diffsim.training.checkpoint import Learner, load_learner
+from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, load_policy
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import (
@@ -38,13 +38,15 @@ __all__ = [
     "ParallelFlags",
     "Positive",
     "Run",
+    "SavedPolicy",
+    "Stateful",
     "Widths",
     "distributed",
     "episode_metrics",
     "evaluate",
     "evaluate_checkpoint",
     "fail",
-    "load_learner",
+    "load_policy",
     "moments",
     "parse",
     "parse_penalty",

@@ -1,23 +1,33 @@
-"""Checkpoints: one file that continues a run exactly, and from which any script's policy can be loaded."""
+"""Checkpoints: one file that continues a run exactly, and whose policy anyone can load without the script."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import sys
+import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Protocol
 
 import torch
 from torch import nn
 
-from diffsim.env import DiffEnv
 from diffsim.training.errors import fail
+from diffsim.training.normalizer import ObsNormalizer
 
 FORMAT = 2
-SCRIPTS = Path(__file__).resolve().parents[2]  # where the scripts lie: the repository's root
+
+# What a policy may consist of, and the attributes that its constructor takes.
+LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
+    "ELU": (nn.ELU, ()),
+    "LayerNorm": (nn.LayerNorm, ("normalized_shape",)),
+    "Linear": (nn.Linear, ("in_features", "out_features")),
+    "ObsNormalizer": (ObsNormalizer, ("size",)),
+    "ReLU": (nn.ReLU, ()),
+    "SiLU": (nn.SiLU, ()),
+    "Softplus": (nn.Softplus, ()),
+    "Tanh": (nn.Tanh, ()),
+}
 
 
 class Stateful(Protocol):
@@ -27,61 +37,86 @@ class Stateful(Protocol):
 
 
 class Learner(Protocol):
-    """What a script's algorithm shows to what surrounds it."""
+    """What a script's algorithm shows to what surrounds it.
 
-    @property
-    def modules(self) -> Mapping[str, Stateful]:
-        """Everything, beside environments and random numbers, that the next iteration depends on."""
+    Attributes:
+        modules: everything, beside environments and random numbers, that the next iteration depends on.
+        policy: the deterministic policy, observations (..., obs_dim) -> actions (..., nu), as a chain of LAYERS.
+    """
 
-    @property
-    def policy(self) -> nn.Module:
-        """The deterministic policy: observations (..., obs_dim) -> actions (..., nu)."""
+    modules: dict[str, Stateful]
+    policy: nn.Sequential
 
 
-def save(path: Path, state: Mapping[str, Any]) -> None:
-    """Replace the file in one step: whoever reads it finds the old one or the new one, whole."""
+@dataclass
+class SavedPolicy:
+    """A checkpoint's deterministic policy, with where it comes from.
+
+    Attributes:
+        network: observations (..., obs_dim) -> actions (..., nu).
+        script, args, iteration: which script trained it, with which arguments (env among them), for how long.
+    """
+
+    network: nn.Sequential
+    script: str
+    args: dict[str, Any]
+    iteration: int
+
+
+def save(path: Path, script: str, learner: Learner, state: Mapping[str, Any]) -> None:
+    """Replace the file in one step: whoever reads it finds the old one or the new one, whole.
+
+    Args:
+        path: the file.
+        script: name of the learner's script.
+        learner: whose modules and policy are saved.
+        state: what else continues the run: args and iteration at least.
+    """
+    modules = {name: module.state_dict() for name, module in learner.modules.items()}
+    policy = {"layers": _describe(learner.policy), "weights": learner.policy.state_dict()}
     temporary = path.with_suffix(".tmp")
-    torch.save({"format": FORMAT, **state}, temporary)
+    torch.save({"format": FORMAT, "script": script, **state, "modules": modules, "policy": policy}, temporary)
     os.replace(temporary, path)
 
 
 def load(path: Path, script: str | None = None) -> dict[str, Any]:
-    """The checkpoint at path, of the given script if one is named; anything else ends the script."""
+    """The checkpoint at path, of the given script if one is named; anything else ends the script with one line."""
     if not path.is_file():
         fail(f"no such checkpoint: {path}")
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        if state["format"] == FORMAT and state["script"] == (script or state["script"]):
-            return state
-    except Exception:  # torch.load raises whatever broken bytes lead it to
+        with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums that it writes
+            if archive.testzip() is None:
+                state = torch.load(path, map_location="cpu", weights_only=True)
+                if state["format"] != FORMAT:
+                    fail(f"{path} has format {state['format']} of another version of diffsim; this one reads {FORMAT}")
+                if script not in (None, state["script"]):
+                    fail(f"{path} is a checkpoint of {state['script']}.py, not of {script}.py")
+                return state
+    except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         pass
-    fail(f"{path} is not a whole checkpoint of {script or 'any'}.py" if script else f"{path} is not a whole checkpoint")
+    fail(f"{path} is not a whole checkpoint")
 
 
-def load_learner(path: Path, env: DiffEnv) -> Learner:
-    """The learner of any script's checkpoint, built for env (its device and sizes) with the checkpoint's weights."""
+def load_policy(path: Path) -> SavedPolicy:
+    """The policy of any script's checkpoint, on the CPU in float32; anything else ends the script with one line."""
     state = load(path)
-    script = _script(state["script"])
-    args = script.Args(**state["args"])
-    args.device = str(env.device)
-    learner: Learner = getattr(script, state["learner"])(args, env)
-    restore(learner, state)
-    return learner
+    network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
+    network.load_state_dict(state["policy"]["weights"])
+    return SavedPolicy(network, state["script"], state["args"], state["iteration"])
 
 
 def restore(learner: Learner, state: Mapping[str, Any]) -> None:
+    """Load the weights and statistics of a checkpoint into a learner of the same sizes."""
     for name, module in learner.modules.items():
         module.load_state_dict(state["modules"][name])
 
 
-def _script(name: str) -> ModuleType:
-    """The module of a script, imported from its file once."""
-    if name in sys.modules:
-        return sys.modules[name]
-    path = next((folder / f"{name}.py" for folder in (SCRIPTS, Path.cwd()) if (folder / f"{name}.py").is_file()), None)
-    spec = importlib.util.spec_from_file_location(name, path) if path else None
-    if spec is None or spec.loader is None:
-        fail(f"{name}.py, which wrote the checkpoint, is neither in {SCRIPTS} nor in the working directory")
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def _describe(policy: nn.Sequential) -> list[list[Any]]:
+    """Each layer's name and constructor arguments."""
+    described = []
+    for layer in policy:
+        name = type(layer).__name__
+        if name not in LAYERS:
+            raise TypeError(f"a policy cannot be saved with layer {name}; checkpoint.LAYERS has {', '.join(LAYERS)}")
+        described.append([name, *(getattr(layer, attribute) for attribute in LAYERS[name][1])])
+    return described

@@ -14,7 +14,7 @@ class ObsNormalizer(nn.Module):
     The statistics are buffers, so they are saved with the policy that depends on them.
 
     Args:
-        shape: of what is normalized, without batch dimensions: (obs_dim,), or () for scalars.
+        size: numbers of an observation; None: what is normalized are scalars.
     """
 
     count: Tensor
@@ -22,8 +22,10 @@ class ObsNormalizer(nn.Module):
     var: Tensor
     std: Tensor
 
-    def __init__(self, *shape: int) -> None:
+    def __init__(self, size: int | None = None) -> None:
         super().__init__()
+        self.size = size
+        shape = () if size is None else (size,)
         self.register_buffer("count", torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("var", torch.ones(shape))
@@ -37,7 +39,7 @@ class ObsNormalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Adds x (..., *shape) of all ranks to the statistics (Chan et al.'s parallel variance)."""
+        """Adds x (..., size) or (...) of all ranks to the statistics (Chan et al.'s parallel variance)."""
         x = x.reshape(-1, *self.mean.shape)
         var, mean = moments(x)
         new = len(x) * distributed.size()

@@ -10,6 +10,13 @@ from torch import Tensor, nn
 from diffsim.training import distributed
 
 
+class ScaledAdam(torch.optim.Adam):
+    """Fused Adam with GradScaler's hooks: it divides by grad_scale and, where found_inf is 1, changes nothing."""
+
+    grad_scale: Tensor | None = None
+    found_inf: Tensor | None = None
+
+
 class ClippedAdam:
     """Adam on the gradient, averaged over the ranks and clipped to a norm; bad gradients are counted and skipped.
 
@@ -39,7 +46,7 @@ class ClippedAdam:
         self.vector = nn.utils.parameters_to_vector(self.parameters).detach()
         nn.utils.vector_to_parameters(self.vector, self.parameters)
         self.lr = torch.full((), lr, device=self.vector.device)
-        self.adam = torch.optim.Adam([self.vector], self.lr, betas, fused=True, capturable=self.vector.is_cuda)
+        self.adam = ScaledAdam([self.vector], self.lr, betas, fused=True, capturable=self.vector.is_cuda)
         self.max_norm, self.skip_norm = max_norm, skip_norm
         self.skipped = torch.zeros_like(self.lr)
 
@@ -49,7 +56,6 @@ class ClippedAdam:
         self.vector.grad = distributed.average(torch.cat([gradient.flatten() for gradient in gradients]))
         norm = torch.linalg.vector_norm(self.vector.grad)
         bad = (~(norm < self.skip_norm)).to(norm.dtype)
-        # GradScaler's hooks: fused Adam divides by grad_scale and, where found_inf is 1, leaves everything as it was.
         self.adam.grad_scale = (norm / self.max_norm).clamp(min=1.0)
         self.adam.found_inf = bad
         self.adam.step()

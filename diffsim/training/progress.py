@@ -9,9 +9,13 @@ import sys
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NoReturn
 
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
+
+# The first columns of every progress.csv.
+COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return", "eval_length", "eval_speed")
 
 
 class EpisodeStatistics:
@@ -43,7 +47,7 @@ class ProgressFile:
     """
 
     def __init__(self, path: Path, iteration: int) -> None:
-        self.path, self.columns = path, ["iteration", "control_steps", "seconds"]
+        self.path, self.columns = path, list(COLUMNS)
         rows: list[dict[str, str]] = []
         if iteration > 0 and path.is_file():
             with path.open(newline="") as file:
@@ -105,7 +109,8 @@ class ProgressLog:
         self.tensorboard = SummaryWriter(str(directory), purge_step=control_steps + 1 if iteration else None)
         table = "\n".join(f"|{name}|{value}|" for name, value in hyperparameters.items())
         self.tensorboard.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}")
-        self.total, self.quiet, self.bar = total, quiet, None
+        self.total, self.quiet = total, quiet
+        self.bar: tqdm[NoReturn] | None = None
 
     def write(self, iteration: int, control_steps: int, seconds: float, scalars: Mapping[str, float]) -> None:
         for key, value in scalars.items():

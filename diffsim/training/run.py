@@ -25,7 +25,7 @@ from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, evaluate
-from diffsim.training.flags import Args, Flags, ParallelFlags, parse_penalty
+from diffsim.training.flags import Flags, ParallelFlags, parse_penalty
 from diffsim.training.progress import EpisodeStatistics, ProgressLog
 
 L = TypeVar("L", bound=Learner)
@@ -104,16 +104,14 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> Dif
         fail(error)
 
 
-def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Learner]) -> None:
+def evaluate_checkpoint(args: Flags) -> None:
     """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video."""
-    assert args.evaluate and args.run_dir
+    assert args.evaluate
     torch.set_num_threads(1)
-    env, state = make_env(args, args.eval_episodes), checkpoint.load(args.evaluate, args.script())
-    trained = learner(args, env)
-    checkpoint.restore(trained, state)
-    evaluation = evaluate(env, trained.policy)
+    env, saved = make_env(args, args.eval_episodes), checkpoint.load_policy(args.evaluate)
+    evaluation = evaluate(env, saved.network.to(env.device))
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    write_evaluation(args, evaluation, state["iteration"])
+    write_evaluation(args, evaluation, saved.iteration)
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int) -> None:
@@ -375,11 +373,9 @@ class Run:
             return
         args = {k: None if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.args).items()}
         args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
-        state: dict[str, Any] = dict(script=self.args.script(), learner=type(self._learner).__name__, args=args)
-        state |= dict(iteration=self.iteration, control_steps=self.control_steps, seconds=self.seconds)
-        state |= dict(totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
-        state["modules"] = {name: module.state_dict() for name, module in self._learner.modules.items()}
-        checkpoint.save(self.directory / "checkpoint.pt", state)
+        state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
+        state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
+        checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
 
     def _close(self) -> None:
         for number, handler in self._handlers.items():
