@@ -1,4 +1,4 @@
-"""Simulator: the buffers of a batch of environments, and the launches of its kernels."""
+"""Simulator: the buffers of a batch of environments, the launches of its kernels, and the node of torch's graph."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
-from diffsim.bridge import ControlStep
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
@@ -28,6 +28,27 @@ MIN_WORK_PER_THREAD = 4_000
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
 LANES = [(lanes, sharers) for lanes in (1, 2, 4, 8, 16) for sharers in (1, 2, 4, 8, 16) if sharers <= lanes]
+
+
+class Checkpoint(NamedTuple):
+    """Where a simulator keeps what the backward pass of one control step needs."""
+
+    slot: int
+    version: int  # of the slot, which serves a new step after each round of the ring
+
+
+class ControlStep(torch.autograd.Function):
+    """qpos, qvel, ctrl -> qpos and qvel side by side. The simulator's checkpoint holds what backward needs."""
+
+    @staticmethod
+    def forward(ctx: Any, sim: Simulator, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> torch.Tensor:
+        ctx.sim, ctx.checkpoint = sim, sim.next_checkpoint()
+        return sim.forward(ctx.checkpoint.slot, qpos, qvel, ctrl)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_end: torch.Tensor) -> tuple[Any, ...]:
+        return (None, *ctx.sim.backward(ctx.checkpoint, g_end))
 
 
 class Simulator:
@@ -159,11 +180,9 @@ class Simulator:
             self.check_tensor(name, value, width)
         recorded = torch.is_grad_enabled() and (qpos.requires_grad or qvel.requires_grad or ctrl.requires_grad)
         if recorded:
-            slot = self._slot
-            self._slot = (slot + 1) % self.horizon
-            state = ControlStep.apply(self, slot, qpos, qvel, ctrl)
+            state = ControlStep.apply(self, qpos, qvel, ctrl)
         else:
-            state = self._forward(self.horizon, qpos, qvel, ctrl)
+            state = self.forward(self.horizon, qpos, qvel, ctrl)
         end = state.split(self._widths[:2], dim=1)
         if self._coarse is None:
             return end
@@ -197,24 +216,31 @@ class Simulator:
         if value.device != self.device:
             raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
 
-    # -- called by bridge.ControlStep ---------------------------------------------------------------------------------
+    # -- called by ControlStep ----------------------------------------------------------------------------------------
 
-    def _forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
+    def next_checkpoint(self) -> Checkpoint:
+        """The next slot of the ring, which from now on is this step's."""
+        slot = self._slot
+        self._slot = (slot + 1) % self.horizon
+        self._version[slot] += 1
+        return Checkpoint(slot, self._version[slot])
+
+    def forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
+        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl)."""
         torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
         self._last = slot
-        if slot < self.horizon:
-            self._version[slot] += 1
         self._launch("forward", slot)
         return self._end.clone()
 
-    def _backward(self, slot: int, version: int, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        if self._version[slot] != version:
+    def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The adjoints of qpos, qvel and ctrl from that of the state (N, nq + nv) after the step."""
+        if self._version[checkpoint.slot] != checkpoint.version:
             raise RuntimeError(
                 f"backward through a control step whose checkpoint was overwritten: at most {self.horizon} "
                 "differentiable steps can be alive; build the simulator with a larger horizon"
             )
         self._g_end.copy_(g_end)
-        self._launch("backward", slot)
+        self._launch("backward", checkpoint.slot)
         return self._g_start.clone().split(self._widths, dim=1)
 
     # -- launches -----------------------------------------------------------------------------------------------------
