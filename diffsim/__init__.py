@@ -13,7 +13,8 @@ import torch
 import warp as wp
 
 from diffsim.env import DiffEnv, NumpyEnv
-from diffsim.scene import PENALTY_DEFAULTS, Scene, SceneError, load_scene
+from diffsim.mjcf import load_scene
+from diffsim.scene import PENALTY_DEFAULTS, Scene, SceneError
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy
 

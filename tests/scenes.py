@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 import diffsim
-from diffsim.scene import Scene, load_scene
+from diffsim.mjcf import load_scene
+from diffsim.scene import Scene
 from diffsim.simulator import Simulator
 from diffsim.tasks import PLANAR, TASKS
 
