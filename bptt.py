@@ -319,7 +319,8 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
     env = make_env(args, num_envs, args.horizon, args.seed + rank * 1_000_003)
     eval_env = make_env(args, args.eval_episodes, horizon=1)
     distributed.join(env.device)
-    args.accuracy, args.substeps, args.integrator = args.accuracy or "default", env.sim.substeps, env.sim.integrator
+    args.accuracy = args.accuracy or "default"
+    args.integrator, args.substeps, _ = env.sim.integration
     torch.manual_seed(args.seed)
     actor, normalise = build(args, env)
     optimizer = ClippedAdam(actor, args)

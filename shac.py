@@ -357,7 +357,8 @@ def train(args: Args, checkpoint: dict[str, Any] | None) -> None:
     env = make_env(args, num_envs, args.horizon, args.seed + rank * 1_000_003)
     eval_env = make_env(args, args.eval_episodes, horizon=1)
     distributed.join(env.device)
-    args.accuracy, args.substeps, args.integrator = args.accuracy or "default", env.sim.substeps, env.sim.integrator
+    args.accuracy = args.accuracy or "default"
+    args.integrator, args.substeps, _ = env.sim.integration
     torch.manual_seed(args.seed)
     actor, normalise = build(args, env)
     critic = mlp(normalise.mean.numel(), args.critic_hidden, 1, orthogonal=True).to(env.device)

@@ -216,8 +216,8 @@ def measure_physics(args: Args, table: Table) -> None:
                     sim = diffsim.Simulator(
                         scene,
                         num_envs,
+                        task.integration("default"),
                         task.control_dt,
-                        task.substeps,
                         device=args.device,
                         dtype=DTYPES[dtype],
                         threads=count,
@@ -279,7 +279,7 @@ def measure_muscles(args: Args, table: Table) -> None:
         for num_envs, dtype in itertools.product(args.num_envs, args.dtype):
             options: dict[str, Any] = dict(device=args.device, dtype=DTYPES[dtype], threads=1)
             sims = {
-                muscles: diffsim.Simulator(s, num_envs, task.control_dt, task.substeps, **options)
+                muscles: diffsim.Simulator(s, num_envs, task.integration("default"), task.control_dt, **options)
                 for muscles, s in scenes.items()
             }
             times: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -327,8 +327,8 @@ def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[
     sim = diffsim.Simulator(
         env.scene,
         num_envs,
+        env.task.integration("default"),
         env.control_dt,
-        env.task.substeps,
         horizon,
         device=device,
         threads={"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique),

@@ -13,12 +13,13 @@ import torch
 import warp as wp
 
 from diffsim.env import DiffEnv, NumpyEnv
+from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
 from diffsim.scene import PENALTY_DEFAULTS, Scene, SceneError
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy
 
-__all__ = ["TASKS", "DiffEnv", "Scene", "SceneError", "Simulator", "load_scene", "make"]
+__all__ = ["TASKS", "DiffEnv", "Integration", "Scene", "SceneError", "Simulator", "load_scene", "make"]
 
 wp.config.log_level = wp.LOG_WARNING
 
@@ -63,16 +64,13 @@ def make(
         if not 0 <= value < math.inf:
             raise ValueError(f"penalty constant {key} is {value!r}, must be finite and not negative")
     scene = dataclasses.replace(scene, **changes)
-    preset = task.integration(accuracy)
     return DiffEnv(
         task,
         scene,
         num_envs,
+        integration=task.integration(accuracy).replaced(integrator, substeps, theta),
         seed=seed,
         horizon=horizon,
-        substeps=preset.substeps if substeps is None else substeps,
-        integrator=preset.integrator if integrator is None else integrator,
-        theta=preset.theta if theta is None else theta,
         device=device,
         dtype=dtype,
         stochastic_init=stochastic_init,

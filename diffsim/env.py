@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from diffsim.integration import Integration
 from diffsim.scene import Scene
 from diffsim.simulator import Simulator
 from diffsim.tasks import Task
@@ -27,7 +28,8 @@ class DiffEnv(VectorEnv):
     Args:
         task: task on the simulator's device and dtype.
         scene: its robot.
-        num_envs, horizon, substeps, integrator, theta, threads: see Simulator.
+        integration: default the task's "default".
+        num_envs, horizon, threads: see Simulator.
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
@@ -46,11 +48,9 @@ class DiffEnv(VectorEnv):
         scene: Scene,
         num_envs: int,
         *,
+        integration: Integration | None = None,
         seed: int | None = None,
         horizon: int = 32,
-        substeps: int | None = None,
-        integrator: str = "semi_implicit",
-        theta: float = 0.0,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         stochastic_init: bool = True,
@@ -63,11 +63,9 @@ class DiffEnv(VectorEnv):
         self.sim = Simulator(
             scene,
             num_envs,
+            integration or task.integration("default"),
             task.control_dt,
-            task.substeps if substeps is None else substeps,
             horizon,
-            integrator,
-            theta,
             device,
             dtype,
             threads,

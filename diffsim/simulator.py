@@ -12,13 +12,13 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
+from diffsim.integration import Integration, check_count
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.model import model_of, shape_of
 from diffsim.scene import Scene
 
-INTEGRATORS = ("semi_implicit", "implicit", "extrapolated")
 State = tuple[torch.Tensor, torch.Tensor]  # qpos, qvel
 WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
 # Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
@@ -60,13 +60,9 @@ class Simulator:
     Args:
         scene: what is simulated.
         num_envs: number of copies N.
+        integration: integrator, substeps and theta.
         control_dt: seconds of one control step.
-        substeps: integration steps in one control step.
         horizon: differentiable control steps that can be alive at once.
-        integrator: "semi_implicit" (Euler), "implicit" (linearly implicit in damping, friction and, scaled by theta,
-            stiffness) or "extrapolated" (from two semi-implicit steps, one of half the substeps; second order at 1.5
-            times the cost); docs/physics.md.
-        theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); used by "implicit" only.
         device: "cpu" or a CUDA device.
         dtype: torch.float32 or torch.float64.
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
@@ -87,27 +83,23 @@ class Simulator:
         self,
         scene: Scene,
         num_envs: int,
+        integration: Integration = Integration(),
         control_dt: float = 1 / 60,
-        substeps: int = 16,
         horizon: int = 1,
-        integrator: str = "semi_implicit",
-        theta: float = 0.0,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         threads: int | None = None,
         lanes: tuple[int, int] | None = None,
     ) -> None:
-        for name, value in (("num_envs", num_envs), ("substeps", substeps), ("horizon", horizon), ("threads", threads)):
-            if value is not None and (not isinstance(value, int) or value < 1):
-                raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
+        for name, value in (
+            ("num_envs", num_envs),
+            ("horizon", horizon),
+            ("threads", 1 if threads is None else threads),
+        ):
+            check_count(name, value)
+        integration.check()
         if not 0 < control_dt < math.inf:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
-        if integrator not in INTEGRATORS:
-            raise ValueError(f"unknown integrator {integrator!r}; choose from {', '.join(INTEGRATORS)}")
-        if integrator == "extrapolated" and substeps % 2:
-            raise ValueError(f"substeps is {substeps}, must be even for the extrapolated integrator")
-        if not 0 <= theta <= 1:
-            raise ValueError(f"theta is {theta!r}, must lie in [0, 1]")
         if lanes not in (None, *LANES):
             raise ValueError(f"lanes is {lanes!r}, must be one of {', '.join(map(str, LANES))}")
         if dtype not in WARP_DTYPE:
@@ -115,13 +107,12 @@ class Simulator:
         self.device = check_device(device)
         self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
-        self.control_dt, self.substeps, self.horizon = control_dt, substeps, horizon
-        self.integrator, self.theta = integrator, theta if integrator == "implicit" else 0.0
+        self.integration, self.control_dt, self.horizon = integration, control_dt, horizon
         self.seconds = {"forward": 0.0, "backward": 0.0}
 
         real, cuda = WARP_DTYPE[dtype], self.device.type == "cuda"
         team = (lanes or default_lanes(scene, num_envs)) if cuda else (1, 1)
-        shape = shape_of(scene, real, integrator == "implicit", cuda, *team)
+        shape = shape_of(scene, real, integration.integrator == "implicit", cuda, *team)
         self._kernels = {"forward": forward_kernel(shape), "backward": backward_kernel(shape)}
         self._model = model_of(scene, real, str(self.device), *team)
         self._commands: dict[tuple[str, int, int], wp.Launch] = {}
@@ -147,10 +138,10 @@ class Simulator:
         self._version = [0] * horizon
         self.nonfinite_gradients = tensor(n, of=torch.int32)
         self._coarse: Simulator | None = None
-        if integrator == "extrapolated":
-            half = substeps // 2
+        if integration.integrator == "extrapolated":
+            half = Integration("semi_implicit", integration.substeps // 2)
             self._coarse = Simulator(
-                scene, n, control_dt, half, horizon, device=device, dtype=dtype, threads=threads, lanes=lanes
+                scene, n, half, control_dt, horizon, device=device, dtype=dtype, threads=threads, lanes=lanes
             )
             self._coarse.nonfinite_gradients, self._coarse.seconds = self.nonfinite_gradients, self.seconds
             first = [*scene.qpos_adr[scene.ball == 0], *([3] if scene.floating else [])]
@@ -250,7 +241,7 @@ class Simulator:
         n = self.num_envs
         if self.device.type == "cuda":
             return [(0, n)]
-        wanted = threads or min(available_cores(), max(1, n * self.substeps * nlink // MIN_WORK_PER_THREAD))
+        wanted = threads or min(available_cores(), max(1, n * self.integration.substeps * nlink // MIN_WORK_PER_THREAD))
         bounds = [n * k // min(wanted, n) for k in range(min(wanted, n) + 1)]
         return [(a, b - a) for a, b in zip(bounds, bounds[1:], strict=False)]
 
@@ -287,11 +278,17 @@ class Simulator:
     def _arguments(self, kernel: str, slot: int, first: int) -> list[Any]:
         record = slot < self.horizon
         if self._checkpoint is None and record:
-            self._checkpoint = self._rows(self.horizon * self.substeps)
+            self._checkpoint = self._rows(self.horizon * self.integration.substeps)
         rows = self._checkpoint if record and self._checkpoint else self._rows(0)
-        row0 = slot * self.substeps if record else 0
+        row0 = slot * self.integration.substeps if record else 0
         real = WARP_DTYPE[self.dtype]
-        head = [self._model, real(self.control_dt / self.substeps), real(self.theta), self.substeps, first]
+        head = [
+            self._model,
+            real(self.control_dt / self.integration.substeps),
+            real(self.integration.theta),
+            self.integration.substeps,
+            first,
+        ]
         qpos, qvel, ctrl = self._parts(self._start[slot], 3)
         nonfinite = wp.from_torch(self._nonfinite[slot])
         if kernel == "forward":

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 import diffsim
+from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
 from diffsim.scene import Scene
 from diffsim.simulator import Simulator
@@ -335,4 +336,4 @@ def run(
 
 def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, **simulator: object) -> Array:
     """qacc: the change of velocity over one substep of one second."""
-    return run(scene, qpos, qvel, ctrl, control_dt=1.0, substeps=1, **simulator)[1] - qvel
+    return run(scene, qpos, qvel, ctrl, control_dt=1.0, integration=Integration(substeps=1), **simulator)[1] - qvel

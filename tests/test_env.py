@@ -294,4 +294,4 @@ def test_finer_substeps_converge():
         ends.append(env.qpos.clone())
     np.testing.assert_allclose((ends[0] - ends[1]).norm() / (ends[1] - ends[2]).norm(), 2.0, rtol=0.1)
     env = diffsim.make("cartpole", 2, integrator="implicit", theta=0.5)
-    assert (env.sim.integrator, env.sim.theta, env.sim.substeps) == ("implicit", 0.5, TASKS["cartpole"].substeps)
+    assert env.sim.integration == diffsim.Integration("implicit", TASKS["cartpole"].substeps, 0.5)

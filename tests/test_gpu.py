@@ -51,7 +51,7 @@ def episode(name: str, device: str, lanes: tuple[int, int] | None = None) -> dic
     weights = [torch.randn(n, width, generator=generator, **kwargs) for width in (start.scene.nq, start.scene.nv)]
     inputs = [x.to(device).detach().requires_grad_() for x in (start.qpos, start.qvel, actions)]
     sim = Simulator(
-        start.scene, n, start.control_dt, start.task.substeps, HORIZON, device=device, lanes=lanes, **kwargs
+        start.scene, n, start.sim.integration, start.control_dt, HORIZON, device=device, lanes=lanes, **kwargs
     )
     qpos, qvel, steps = inputs
     for action in steps:

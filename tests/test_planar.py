@@ -7,6 +7,7 @@ import pytest
 import torch
 from scenes import task_scene
 
+from diffsim.integration import Integration
 from diffsim.simulator import Simulator
 from diffsim.tasks import PLANAR
 
@@ -40,7 +41,7 @@ def test_swimmer_is_carried_by_its_fluid() -> None:
     scene, ends = task_scene("swimmer"), []
     for lag in (0.5 * np.pi, -0.5 * np.pi):
         for fluid in (scene, scene.without("drag")):
-            sim = Simulator(fluid, 1, 1 / 60, 10, dtype=REAL)
+            sim = Simulator(fluid, 1, Integration(substeps=10), dtype=REAL)
             qpos, qvel = torch.zeros(1, 5, dtype=REAL), torch.zeros(1, 5, dtype=REAL)
             for t in range(300):
                 wave = torch.sin(torch.tensor([[0.0, -lag]], dtype=REAL) + 2 * np.pi * t / 30)
@@ -54,7 +55,7 @@ def test_swimmer_is_carried_by_its_fluid() -> None:
 def test_walker_stands_on_its_feet_for_a_moment() -> None:
     """It drops 5 cm to the ground, which carries its weight; nothing passes through."""
     scene, task = task_scene("walker"), PLANAR["walker"](dtype=REAL)
-    sim = Simulator(scene, 1, 1 / 60, task.substeps, dtype=REAL)
+    sim = Simulator(scene, 1, task.integration("default"), dtype=REAL)
     state = task.reset(torch.full((1, 18), 0.5, dtype=REAL))
     heights = []
     for _ in range(24):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .ant import Ant
-from .base import Accuracy, Integration, Task
+from .base import Accuracy, Task
 from .cartpole import CartPole
 from .half_cheetah import HalfCheetah
 from .hopper import Hopper
@@ -14,4 +14,4 @@ from .planar import Swimmer, Walker
 TASKS: dict[str, type[Task]] = {task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU)}
 PLANAR: dict[str, type[Task]] = {task.name: task for task in (Swimmer, Walker)}  # of guided policy search
 
-__all__ = ["PLANAR", "TASKS", "Accuracy", "Integration", "Task"]
+__all__ = ["PLANAR", "TASKS", "Accuracy", "Task"]
