@@ -40,8 +40,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import diffsim
 from diffsim import graph
+from diffsim.launcher import available_cores
 from diffsim.run import fail
-from diffsim.simulator import available_cores
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402

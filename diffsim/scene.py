@@ -131,6 +131,12 @@ class Scene:
         return (np.arange(self.nlink) - 1 + (7 if self.floating else 0) + passed).astype(np.int32)
 
     @property
+    def quaternion_adr(self) -> Index:
+        """(number of quaternions,) where each begins in qpos."""
+        balls = self.qpos_adr[self.ball == 0]
+        return np.concatenate([[3], balls]).astype(np.int32) if self.floating else balls
+
+    @property
     def qpos0(self) -> Array:
         """(nq,) the reference configuration of the MJCF."""
         return np.array(self.mj_model.qpos0)

@@ -18,7 +18,8 @@ from diffsim import graph
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.model import shape_of
-from diffsim.simulator import Simulator, default_lanes
+from diffsim.launcher import default_lanes
+from diffsim.simulator import Simulator
 from diffsim.tasks import PLANAR
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU, and PyTorch sees none")

@@ -169,10 +169,10 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     def backward(
         # model
         m: Model,
+        first: int,  # environment of this launch
         h: T,
         theta: T,
         substeps: int,
-        first: int,
         # checkpoint in
         row0: int,
         ck_q: t.array3,

@@ -124,11 +124,11 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
     def forward(
         # model
         m: Model,
+        first: int,  # environment of this launch
         h: T,
         theta: T,
         substeps: int,
         # state in
-        first: int,
         qpos: t.array2,
         qvel: t.array2,
         ctrl: t.array2,
