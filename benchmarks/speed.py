@@ -40,6 +40,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import diffsim
 from diffsim import graph
+from diffsim.kernels.lanes import divide
 from diffsim.launcher import available_cores
 from diffsim.run import fail
 
@@ -332,7 +333,7 @@ def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[
         horizon,
         device=device,
         threads={"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique),
-        lanes=(1, 1) if "one thread" in technique else None,
+        division=divide(env.scene, 1) if "one thread" in technique else None,
     )
     start_qpos, start_qvel = env.qpos.clone(), env.qvel.clone()
     actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()

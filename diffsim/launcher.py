@@ -13,8 +13,9 @@ import warp as wp
 from diffsim.integration import Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.lanes import divide
-from diffsim.kernels.model import model_of, shape_of
+from diffsim.kernels.lanes import Division, divide
+from diffsim.kernels.model import model_of
+from diffsim.kernels.spec import kernel_spec
 from diffsim.scene import Scene
 
 WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -24,7 +25,6 @@ MIN_WORK_PER_THREAD = 4_000
 # Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
-LANES = [(lanes, sharers) for lanes in (1, 2, 4, 8, 16) for sharers in (1, 2, 4, 8, 16) if sharers <= lanes]
 
 
 class Launcher:
@@ -33,10 +33,10 @@ class Launcher:
     On a CPU some threads take a share of the environments each; on a GPU a launch goes to torch's current stream.
 
     Args:
-        scene, num_envs, integration, device, dtype, threads, lanes: see Simulator.
+        scene, num_envs, integration, device, dtype, threads, division: see Simulator.
 
     Attributes:
-        shape: what the kernels were generated for.
+        spec: what the kernels were generated for.
         seconds: wall seconds spent in the kernels on the CPU, {"forward": ..., "backward": ...}.
     """
 
@@ -48,17 +48,20 @@ class Launcher:
         device: torch.device,
         dtype: torch.dtype,
         threads: int | None,
-        lanes: tuple[int, int] | None,
+        division: Division | None,
     ) -> None:
         real, cuda = WARP_DTYPE[dtype], device.type == "cuda"
-        team = (lanes or default_lanes(scene, num_envs)) if cuda else (1, 1)
+        if division is None:
+            division = default_division(scene, num_envs) if cuda else divide(scene)
+        elif division.threads_per_env > 1 and not cuda:
+            raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         self.scene, self.num_envs, self.device, self.dtype = scene, num_envs, device, dtype
-        self.shape = shape_of(scene, real, integration.integrator == "implicit", cuda, *team)
+        self.spec = kernel_spec(scene, division, real, integration.integrator == "implicit", env_last=cuda)
         self.seconds = {"forward": 0.0, "backward": 0.0}
-        self._kernels = {"forward": forward_kernel(self.shape), "backward": backward_kernel(self.shape)}
-        self._model = model_of(scene, real, str(device), *team)
+        self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
+        self._model = model_of(scene, division, real, str(device))
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
-        self._block_dim = max(8 if num_envs <= 256 else 32, self.shape.lanes)
+        self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
         work = num_envs * integration.substeps * scene.nlink
         wanted = 1 if cuda else threads or min(available_cores(), max(1, work // MIN_WORK_PER_THREAD))
         count = min(wanted, num_envs)
@@ -71,7 +74,7 @@ class Launcher:
         return [
             wp.launch(
                 self._kernels[kernel],
-                dim=(end - first) * self.shape.lanes,
+                dim=(end - first) * self.spec.threads_per_env,
                 inputs=[self._model, first, *inputs],
                 device=str(self.device),
                 block_dim=self._block_dim,
@@ -96,11 +99,12 @@ class Launcher:
         self.seconds[kernel] += time.perf_counter() - start
 
 
-def default_lanes(scene: Scene, num_envs: int) -> tuple[int, int]:
-    """GPU threads per environment, and how many of them share limbs: as measured in docs/performance.md."""
-    groups = min((1, 2, 4), key=lambda lanes: (divide(scene, lanes).slots, lanes))
+def default_division(scene: Scene, num_envs: int) -> Division:
+    """Of an environment among GPU threads: as measured in docs/performance.md."""
     sharers = MUSCLE_SHARERS if "muscle" in scene.features else 1
-    return (groups * sharers, sharers) if groups * sharers * num_envs <= MAX_THREADS else (1, 1)
+    candidates = [divide(scene, groups * sharers, sharers) for groups in (1, 2, 4)]
+    best = min(candidates, key=lambda division: (division.slots, division.threads_per_env))
+    return best if best.threads_per_env * num_envs <= MAX_THREADS else divide(scene)
 
 
 def available_cores() -> int:

@@ -7,7 +7,8 @@ import math
 import torch
 
 from diffsim.integration import Integration, check_count
-from diffsim.launcher import LANES, WARP_DTYPE, Launcher
+from diffsim.kernels.lanes import Division
+from diffsim.launcher import WARP_DTYPE, Launcher
 from diffsim.scene import Scene
 from diffsim.stepper import ExtrapolatedStepper, State, Stepper
 
@@ -27,8 +28,7 @@ class Simulator:
         device: "cpu" or a CUDA device.
         dtype: torch.float32 or torch.float64.
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
-        lanes: GPU threads per environment, and how many of them have the same limbs (kernels/lanes.py): powers of two
-            up to 16; default as measured to be fastest.
+        division: of an environment among GPU threads, from kernels.lanes.divide; default as measured to be fastest.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
@@ -50,7 +50,7 @@ class Simulator:
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         threads: int | None = None,
-        lanes: tuple[int, int] | None = None,
+        division: Division | None = None,
     ) -> None:
         check_count("num_envs", num_envs)
         check_count("horizon", horizon)
@@ -59,15 +59,13 @@ class Simulator:
         integration.check()
         if not 0 < control_dt < math.inf:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
-        if lanes not in (None, *LANES):
-            raise ValueError(f"lanes is {lanes!r}, must be one of {', '.join(map(str, LANES))}")
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
         self.device = check_device(device)
         self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
         self.integration, self.control_dt, self.horizon = integration, control_dt, horizon
-        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, lanes)
+        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, division)
         stepper = ExtrapolatedStepper if integration.integrator == "extrapolated" else Stepper
         self._stepper = stepper(launcher, integration, control_dt, horizon)
         self.seconds = launcher.seconds

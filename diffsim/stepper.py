@@ -46,18 +46,18 @@ class Stepper:
     """
 
     def __init__(self, launcher: Launcher, integration: Integration, control_dt: float, horizon: int) -> None:
-        shape, n, slots = launcher.shape, launcher.num_envs, horizon + 1  # the last slot serves steps without gradient
-        h = shape.dtype(control_dt / integration.substeps)
+        spec, n, slots = launcher.spec, launcher.num_envs, horizon + 1  # the last slot serves steps without gradient
+        h = spec.dtype(control_dt / integration.substeps)
 
         def tensor(*size: int, of: torch.dtype = launcher.dtype) -> torch.Tensor:
             return torch.zeros(size, dtype=of, device=launcher.device)
 
         self._launcher, self._horizon, self._substeps = launcher, horizon, integration.substeps
-        self._scalars = [h, shape.dtype(integration.theta), integration.substeps]
+        self._scalars = [h, spec.dtype(integration.theta), integration.substeps]
         # One buffer for qpos, qvel and ctrl side by side: torch copies each in one operation, the kernels see parts.
-        self._widths = (shape.nq, shape.nv, shape.nu)
-        self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, shape.nq + shape.nv)
-        self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, shape.nq + shape.nv)
+        self._widths = (spec.nq, spec.nv, spec.nu)
+        self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
+        self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
         self._nonfinite = tensor(slots, n, of=torch.bool)
         self.nonfinite_gradients = tensor(n, of=torch.int32)
         self._checkpoint: list[wp.array] | None = None
@@ -130,10 +130,10 @@ class Stepper:
 
     def _rows(self, count: int) -> list[wp.array]:
         """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
-        shape, n, device = self._launcher.shape, self._launcher.num_envs, str(self._launcher.device)
-        widths = (shape.nq, shape.nv, shape.nv, shape.nfactor)
-        sizes = [(count, k, n) if shape.env_last else (count, n, k) for k in widths]
-        return [wp.zeros(size, dtype=shape.dtype, device=device) for size in sizes]
+        spec, n, device = self._launcher.spec, self._launcher.num_envs, str(self._launcher.device)
+        widths = (spec.nq, spec.nv, spec.nv, spec.nfactor)
+        sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
+        return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
 
     def _parts(self, buffer: torch.Tensor, count: int) -> list[Any]:
         """The kernels' views of qpos, qvel and, if `count` is 3, ctrl."""

@@ -16,7 +16,8 @@ import diffsim
 from diffsim.integration import INTEGRATORS, Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.model import shape_of
+from diffsim.kernels.lanes import divide
+from diffsim.kernels.spec import kernel_spec
 from diffsim.simulator import Simulator
 from diffsim.tasks import TASKS
 
@@ -311,9 +312,9 @@ def test_cartpole_upright_and_hanging():
 def source(scene):
     """Warp's C++ of the scene's forward and backward kernel."""
     wp.init()
-    shape, text = shape_of(scene, wp.float64, implicit=False, env_last=False), ""
+    spec, text = kernel_spec(scene, divide(scene), wp.float64, implicit=False, env_last=False), ""
     for build in (forward_kernel, backward_kernel):
-        module = build(shape).module
+        module = build(spec).module
         module.load("cpu")
         (path,) = (Path(wp.config.kernel_cache_dir) / module.get_module_identifier()).glob("*.cpp")
         text += path.read_text()

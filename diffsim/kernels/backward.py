@@ -26,15 +26,16 @@ from diffsim.kernels.drag import drag_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
-from diffsim.kernels.model import Shape, module_options, types
+from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec, module_options
 
 
 @cache
-def backward_kernel(shape: Shape) -> wp.Kernel:
-    t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
-    T, vec3, vec6, mat3, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
+def backward_kernel(spec: KernelSpec) -> wp.Kernel:
+    t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
+    T, vec3, vec6, mat3, quat, Model = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
     vec6s = wp.array(dtype=vec6)
     join, force_at, point_velocity, momentum = sp.join, sp.force_at, sp.point_velocity, sp.momentum
     exp_quat, to_tangent, from_tangent = sp.exp_quat, sp.to_tangent, sp.from_tangent
@@ -43,19 +44,19 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
     contact = contact_law(T)
     touches, contact_force = contact.touches, contact.contact_force
     contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
-    muscle = muscle_law(shape, adjoint=True)
+    muscle = muscle_law(spec, adjoint=True)
     measure, hill, add_pull_adjoint = muscle.measure, muscle.hill, muscle.add_pull_adjoint
-    uses = shape.features
+    uses = spec.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
     DRAG, drag = "drag" in uses, drag_law(T)
     drag_wrench, drag_adjoint = drag.drag_wrench, drag.drag_adjoint
-    NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
+    NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
-    INERT, FIRST = shape.inert, 0 if FLOATING else 1 + shape.inert  # the first link with inertia
-    VADR, NBALL, BALL_SPRING = shape.dof0 - 1, shape.nball, shape.nball > 0 and "stiffness" in uses
-    BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
-    LANES, SHARERS, TRUNK, SLOTS = shape.lanes, shape.sharers, shape.trunk, shape.slots
-    sums = lane_sums(T, LANES, SHARERS)
+    INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
+    VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in uses
+    BASE = 7 * (spec.nlink - 1)  # where the base's factor begins
+    THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
+    sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
 
     @wp.func
     def exp_adjoint(r: vec3, g: vec3):
@@ -165,7 +166,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
 
     add_sharers, add_limbs, add = summed(sums.sharers, SLOTS - 1), summed(sums.limbs, TRUNK), sums.all.add
 
-    @wp.kernel(module="unique", module_options=module_options(shape))
+    @wp.kernel(module="unique", module_options=module_options(spec))
     def backward(
         # model
         m: Model,
@@ -193,12 +194,12 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         nonfinite_gradients: wp.array(dtype=int),
     ):
         tid = wp.tid()
-        e = first + tid / LANES
-        lane = tid % LANES
+        e = first + tid / THREADS_PER_ENV
+        lane = tid % THREADS_PER_ENV
         slots = int(SLOTS)
         n = int(SLOTS)
         at = lane * SLOTS
-        if wp.static(LANES > 1):
+        if wp.static(THREADS_PER_ENV > 1):
             n = m.count[lane]
         R = wp.zeros(shape=SLOTS, dtype=mat3)
         x = wp.zeros(shape=SLOTS, dtype=vec3)
@@ -305,7 +306,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             W[0] = vec6()
             for j in range(1, slots + 1):
                 i = slots - j
-                if wp.static(LANES > SHARERS):
+                if wp.static(THREADS_PER_ENV > SHARERS):
                     if i == TRUNK:
                         add_limbs(W)
                 if i > 0 and i < n:
@@ -359,7 +360,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 add_sharers(adj_p)
             for j in range(1, slots + 1):
                 i = slots - j
-                if wp.static(LANES > SHARERS):
+                if wp.static(THREADS_PER_ENV > SHARERS):
                     if i == TRUNK:
                         add_limbs(adj_a)
                         add_limbs(adj_v)
@@ -433,7 +434,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 k = m.muscle[entry]
                 if not wp.isfinite(g_pull[k]):
                     broken = T(1.0)
-        if wp.static(LANES > 1):
+        if wp.static(THREADS_PER_ENV > 1):
             broken = add(broken)
         finite = broken == T(0.0)
         contained = nonfinite[e]

@@ -20,19 +20,20 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import Shape, types
+from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
 
 SHORTEST = 1e-6  # m
 
 
 @cache
-def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
-    t, sp = types(shape.dtype), spatial(shape.dtype)
-    T, vec3, vec4, vec6, Model, array = shape.dtype, t.vec3, t.vec4, t.vec6, t.Model, t.array
+def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
+    t, sp = types(spec.dtype), spatial(spec.dtype)
+    T, vec3, vec4, vec6, Model, array = spec.dtype, t.vec3, t.vec4, t.vec6, t.Model, t.array
     join, point_velocity = sp.join, sp.point_velocity
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
-    HILL = "hill" in shape.features
+    HILL = "hill" in spec.features
 
     @wp.func
     def outward(R: t.mat3, x: vec3, torque: vec3, force: vec3):
