@@ -43,9 +43,8 @@ from diffsim.ilqr import (
 )
 from diffsim.run import Mark, Run, fail, flag, read_arguments
 from diffsim.simulator import check_device
-from diffsim.tasks import PLANAR
+from diffsim.tasks import TASKS
 
-TASKS = diffsim.TASKS | PLANAR
 # Those of Figure 2
 Variant = Literal["full", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
 

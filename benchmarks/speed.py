@@ -43,6 +43,7 @@ from diffsim import graph
 from diffsim.kernels.lanes import divide
 from diffsim.launcher import available_cores
 from diffsim.run import fail
+from diffsim.tasks import SHAC_TASKS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -54,7 +55,7 @@ Part = Literal["physics", "muscles", "scaling", "training", "compile", "picture"
 
 @dataclass
 class Args:
-    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
+    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = SHAC_TASKS
     """tasks"""
     num_envs: tuple[int, ...] = (64, 256)
     """batch sizes of the physics table (training uses the task's own)"""

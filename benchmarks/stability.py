@@ -39,6 +39,7 @@ import diffsim
 from diffsim import Integration
 from diffsim.run import fail
 from diffsim.scene import Scene
+from diffsim.tasks import SHAC_TASKS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -65,7 +66,7 @@ NEEDS_GROUND = ("contact stiffness x", "contact damping x", "friction", "drop (m
 
 @dataclass
 class Args:
-    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
+    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = SHAC_TASKS
     """tasks"""
     parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long")
     """tables to measure"""

@@ -17,7 +17,7 @@ from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
 from diffsim.scene import Scene
 from diffsim.simulator import Simulator
-from diffsim.tasks import PLANAR, TASKS
+from diffsim.tasks import TASKS
 
 Array = NDArray[np.float64]
 
@@ -157,7 +157,7 @@ def parse(mjcf: str) -> Scene:
 
 @cache
 def task_scene(name: str) -> Scene:
-    return load_scene(Path(diffsim.__file__).parent / "assets" / (TASKS | PLANAR)[name].asset)
+    return load_scene(Path(diffsim.__file__).parent / "assets" / TASKS[name].asset)
 
 
 @cache

@@ -142,7 +142,7 @@ def test_blow_up_ends_the_episode_without_early_termination_too():
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"name": "walker"}, "walker.*cartpole, hopper, half_cheetah, ant, humanoid"),
+        ({"name": "runner"}, "runner.*cartpole, hopper, half_cheetah, ant, humanoid, humanoid_mtu, swimmer, walker"),
         ({"num_envs": 0}, "num_envs.*0.*at least 1"),
         ({"num_envs": 2.5}, "num_envs"),
         ({"horizon": 0}, "horizon.*0"),

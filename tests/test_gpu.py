@@ -21,13 +21,12 @@ from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
 from diffsim.launcher import default_division
 from diffsim.simulator import Simulator
-from diffsim.tasks import PLANAR
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU, and PyTorch sees none")
 HORIZON = 32
 
 
-@pytest.mark.parametrize("name", [*diffsim.TASKS, *PLANAR])
+@pytest.mark.parametrize("name", diffsim.TASKS)
 def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> None:
     """And they hold no code for what the scene lacks."""
     scene = task_scene(name)

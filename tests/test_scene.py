@@ -18,6 +18,8 @@ def test_features_of_the_tasks(name):
         "half_cheetah": {"hinge", "slide", "limit", "damping", "motor", "contact", "stiffness"},
         "ant": {"floating", "hinge", "limit", "damping", "motor", "contact"},
         "humanoid": {"floating", "hinge", "limit", "damping", "motor", "contact", "stiffness"},
+        "swimmer": {"hinge", "slide", "limit", "motor", "drag"},
+        "walker": {"hinge", "slide", "limit", "damping", "motor", "contact"},
         "humanoid_mtu": {"floating", "ball", "hinge", "limit", "damping", "contact", "stiffness", "muscle"},
     }
     assert task_scene(name).features == expected[name]
