@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from diffsim.scene import MUSCLE_MODELS, PENALTY_DEFAULTS, Array, Scene, SceneError
+from diffsim.scene import PENALTY_DEFAULTS, Array, Scene, SceneError
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -197,13 +197,6 @@ class _Reader:
         segments = sorted((s for row in rows for s in row["segments"]), key=lambda s: (s[0], s[2]))
         text = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_TEXT, "muscle_model")
         model = m.text_data[m.text_adr[text] :].partition(b"\0")[0].decode() if text >= 0 else "linear"
-        if model not in MUSCLE_MODELS:
-            raise self._error(f"text muscle_model is {model!r}; choose from {', '.join(MUSCLE_MODELS)}")
-        for a, row in enumerate(rows):
-            if model == "hill" and row["segments"] and np.isnan(row["hill"]).any():
-                raise self._error(
-                    f"{self._name(mujoco.mjtObj.mjOBJ_ACTUATOR, a)}: muscle_model 'hill' needs a <muscle>"
-                )
         return {
             "motor_link": np.array([row["link"] for row in rows], np.int32),
             "gear": np.array([row["scale"] * (row["high"] - row["low"]) / 2 for row in rows]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from typing import Any
 
 import mujoco
@@ -51,7 +52,7 @@ class Scene:
             Of a muscle the link is 0, and this is the maximum force times the activation.
         segment_link, segment_position, segment_muscle: (ns, 2), (ns, 2, 3), (ns,) the pieces of the muscles' paths that
             join two links: the links, the end points in their frames, and whose path it is; sorted by links.
-        hill: (nu, 9) numbers of the Hill-type model (kernels/muscle.py), NaN where not a <muscle>.
+        hill: (nu, 9) numbers of the Hill-type model (kernels/hill.py), NaN where not a <muscle>.
         muscle_model: "linear" (the paper's: force = maximum force times activation) or "hill".
         contact_link, contact_position, contact_radius: (nc,), (nc, 3), (nc,) spheres that may touch the ground.
         k_n, k_d, k_t, mu, k_limit, d_limit: penalty constants, see PENALTY_DEFAULTS.
@@ -103,10 +104,13 @@ class Scene:
     viscosity: float = 0.0
 
     def __post_init__(self) -> None:
+        file = os.path.basename(self.path)
         if self.muscle_model not in MUSCLE_MODELS:
-            raise ValueError(f"unknown muscle_model {self.muscle_model!r}; choose from {', '.join(MUSCLE_MODELS)}")
-        if self.muscle_model == "hill" and np.isnan(self.hill[self.segment_muscle]).any():
-            raise ValueError("muscle_model 'hill' needs MuJoCo's <muscle> as the actuator of every muscle")
+            raise SceneError(f"{file}: muscle_model is {self.muscle_model!r}; choose from {', '.join(MUSCLE_MODELS)}")
+        plain = self.segment_muscle[np.isnan(self.hill[self.segment_muscle]).any(1)]
+        if self.muscle_model == "hill" and len(plain):
+            name = self.mj_model.actuator(int(plain[0])).name or f"number {plain[0]}"
+            raise SceneError(f"{file}: actuator {name!r}: muscle_model 'hill' needs a <muscle>")
 
     @property
     def nlink(self) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import BALL, HINGE, acting_states, parse, run, task_scene
+from scenes import BALL, HINGE, acting_states, leg_scene, parse, run, task_scene
 
 import diffsim
 from diffsim.integration import INTEGRATORS, Integration
@@ -329,16 +329,17 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "slide": r"\(var_m\)\.slide\b",
     "hinge": r"\bsin\(",
     "motor": r"\(var_m\)\.motor_slot\b",
-    "ball": r"\(var_m\)\.(ball_link|qpos_adr|inboard|outboard)\b",
-    "muscle": r"\(var_m\)\.(npair|pair_\w+|segment_\w+)\b",
+    "ball": r"\(var_m\)\.(ball_\w+|qpos_adr|inboard|outboard)\b",
+    "muscle": r"\(var_m\)\.(pair_\w+|segment_\w+)\b",
+    "drag": r"\(var_m\)\.drag_\w+\b",
     "hill": r"\(var_m\)\.hill\b",
     "floating": r"\bquat",  # or a ball; every ball here is on a floating base
 }
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", [*TASKS, "linear", "hill"])
 def test_kernels_hold_the_code_of_the_features_and_no_other(name):
-    scene = task_scene(name)
+    scene = task_scene(name) if name in TASKS else leg_scene(name)
     text = source(scene)
     for feature, pattern in CODE.items():
         assert bool(re.search(pattern, text)) == (feature in scene.features), feature

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import re
 
 import mujoco
 import numpy as np
@@ -143,6 +144,16 @@ def test_lengths_are_mujocos_ten_length(rng):
 
 def test_muscle_on_the_world_pulls_as_mujocos(rng):
     check_against_mujoco(parse(CRANE), torch.float64, rng)
+
+
+@pytest.mark.parametrize("text, model", [("", "linear"), ('<text name="muscle_model" data="hill"/>', "hill")])
+def test_an_mjcf_asks_for_hill_type_muscles(text, model, rng):
+    """The same <muscle> pulls with MuJoCo's curves where the file says so, with its maximum force alone elsewhere."""
+    muscle = '<muscle name="winch" tendon="rope" force="9" lengthrange=".5 3" range="0.6 1.5"/>'
+    mjcf = re.sub("<motor.*/>", muscle, CRANE).replace("<worldbody>", f"<custom> {text} </custom> <worldbody>")
+    scene = parse(mjcf)
+    assert scene.muscle_model == model and ("hill" in scene.features) == (model == "hill")
+    check_against_mujoco(scene, torch.float64, rng)
 
 
 # Against the plain NumPy reference

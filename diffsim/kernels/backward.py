@@ -23,6 +23,7 @@ import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
+from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
@@ -45,7 +46,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     touches, contact_force = contact.touches, contact.contact_force
     contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
     muscle = muscle_law(spec, adjoint=True)
-    measure, hill, add_pull_adjoint = muscle.measure, muscle.hill, muscle.add_pull_adjoint
+    measure, add_pull_adjoint, hill = muscle.measure, muscle.add_pull_adjoint, hill_law(T).hill
     uses = spec.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
     DRAG, drag = "drag" in uses, drag_law(T)

@@ -14,6 +14,7 @@ import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
+from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
@@ -37,7 +38,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     joint = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses)
     passive_force, passive_gain = joint.passive_force, joint.passive_gain
     muscle = muscle_law(spec, adjoint=False)
-    add_pull, measure, hill = muscle.add_pull, muscle.measure, muscle.hill
+    add_pull, measure, hill = muscle.add_pull, muscle.measure, hill_law(T).hill
     DRAG, drag_wrench = "drag" in uses, drag_law(T).drag_wrench
     NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
