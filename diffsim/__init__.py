@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -15,7 +13,7 @@ import warp as wp
 from diffsim.env import DiffEnv, NumpyEnv
 from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
-from diffsim.scene import PENALTY_DEFAULTS, Scene, SceneError
+from diffsim.scene import Scene, SceneError
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy
 
@@ -57,16 +55,9 @@ def make(
     device = check_device(device)
     task = TASKS[name](device, dtype)
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
-    changes: dict[str, Any] = dict(penalty or {})
-    for key, value in changes.items():
-        if key not in PENALTY_DEFAULTS:
-            raise ValueError(f"unknown penalty constant {key!r}; choose from {', '.join(PENALTY_DEFAULTS)}")
-        if not 0 <= value < math.inf:
-            raise ValueError(f"penalty constant {key} is {value!r}, must be finite and not negative")
-    scene = dataclasses.replace(scene, **changes)
     return DiffEnv(
         task,
-        scene,
+        scene.with_penalty(penalty or {}),
         num_envs,
         integration=task.integration(accuracy).replaced(integrator, substeps, theta),
         seed=seed,

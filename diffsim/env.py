@@ -41,6 +41,9 @@ class DiffEnv(VectorEnv):
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    qpos: Tensor
+    qvel: Tensor
+    _obs: Tensor
 
     def __init__(
         self,
@@ -85,9 +88,6 @@ class DiffEnv(VectorEnv):
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
-        self.qpos, self.qvel, self._obs = (torch.empty(0),) * 3
-        self._starts, self._time = (torch.empty(0),) * 3, 0
-        self._recorded = 0  # differentiable steps since the window began
         self._restart()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
@@ -217,7 +217,7 @@ class DiffEnv(VectorEnv):
     def _restart(self) -> None:
         self.episode_step.zero_()
         self._episode_return.zero_()
-        self._recorded = 0
+        self._recorded = 0  # differentiable steps since the window began
         self.sim.rewind()
         qpos, qvel, obs = self._draw(1)
         self.qpos, self.qvel, self._obs = qpos[0], qvel[0], obs[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -28,6 +28,14 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     return _Reader(model, file).scene()
 
 
+class Sphere(NamedTuple):
+    """What may touch the ground, in the frame of its link."""
+
+    link: int
+    centre: Array
+    radius: float
+
+
 class _Reader:
     """Walks a compiled MjModel once, body by body."""
 
@@ -41,7 +49,7 @@ class _Reader:
 
     def scene(self) -> Scene:
         m = self.m
-        self._reject_unsupported()
+        self._check_supported()
         floating = bool(m.njnt and (m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
         if not floating:
             self._add_link(parent=0)
@@ -78,54 +86,67 @@ class _Reader:
     def _error(self, text: str) -> SceneError:
         return SceneError(f"{self.file.name}: {text}")
 
-    def _name(self, kind: mujoco.mjtObj, index: int) -> str:
+    def _refused(self, kind: mujoco.mjtObj, index: int, why: str) -> SceneError:
         label = str(kind).rsplit("mjOBJ_", 1)[-1].lower()
-        return f"{label} {mujoco.mj_id2name(self.m, kind, index) or f'number {index}'!r}"
+        return self._error(f"{label} {mujoco.mj_id2name(self.m, kind, index) or f'number {index}'!r}: {why}")
 
     def _any(self, field: str, index: int) -> bool:
         """Whether a field that only newer versions of MuJoCo have is set."""
         return bool(np.any(getattr(self.m, field)[index])) if hasattr(self.m, field) else False
 
-    def _reject_unsupported(self) -> None:
-        m, obj, joint = self.m, mujoco.mjtObj, mujoco.mjtJoint
-        for kind, count in ((obj.mjOBJ_EQUALITY, m.neq), (obj.mjOBJ_PAIR, m.npair)):
+    def _check_supported(self) -> None:
+        m, kind = self.m, mujoco.mjtObj
+        for what, count in ((kind.mjOBJ_EQUALITY, m.neq), (kind.mjOBJ_PAIR, m.npair)):
             if count:
-                raise self._error(f"{self._name(kind, 0)}: not simulated")
-        for d in range(m.ntendon):
-            name, begin = self._name(obj.mjOBJ_TENDON, d), m.tendon_adr[d]
-            if (m.wrap_type[begin : begin + m.tendon_num[d]] != mujoco.mjtWrap.mjWRAP_SITE).any():
-                raise self._error(f"{name}: only spatial tendons through sites, without pulleys or wrapping geoms")
-            for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited"):
-                if self._any(f"tendon_{field}", d):
-                    raise self._error(f"{name}: {field} of a tendon is not simulated")
+                raise self._refused(what, 0, "not simulated")
+        for tendon in range(m.ntendon):
+            self._check_tendon(tendon)
+        for body in range(m.nbody):
+            if m.body_gravcomp[body] or m.body_mocapid[body] >= 0:
+                raise self._refused(kind.mjOBJ_BODY, body, "gravcomp and mocap are not simulated")
+        for joint in range(m.njnt):
+            self._check_joint(joint)
         if np.any(m.opt.wind):
             raise self._error("option wind: only a fluid at rest is simulated")
-        for b in range(m.nbody):
-            welded = 0 < b and m.body_mass[b] > 0 and not m.body_jntnum[b]
-            if (m.opt.density or m.opt.viscosity) and welded and m.body_weldid[b]:
-                raise self._error(
-                    f"{self._name(obj.mjOBJ_BODY, b)}: in a fluid each body needs a joint; merge its geoms"
-                )
-            if m.body_gravcomp[b] or m.body_mocapid[b] >= 0:
-                raise self._error(f"{self._name(obj.mjOBJ_BODY, b)}: gravcomp and mocap are not simulated")
-        for g in range(m.ngeom):
-            if (m.opt.density or m.opt.viscosity) and m.geom_fluid[g, 0]:
-                raise self._error(f"{self._name(obj.mjOBJ_GEOM, g)}: fluidshape ellipsoid is not simulated")
-        for j in range(m.njnt):
-            name, dof = self._name(obj.mjOBJ_JOINT, j), m.jnt_dofadr[j]
-            if m.jnt_actfrclimited[j]:
-                raise self._error(f"{name}: actuatorfrcrange is not simulated")
-            if self._any("dof_dampingpoly", dof) or self._any("jnt_stiffnesspoly", j):
-                raise self._error(f"{name}: damping and stiffness are linear here, one number each")
-            if m.jnt_type[j] == joint.mjJNT_BALL and m.jnt_limited[j]:
-                raise self._error(f"{name}: the limit of a ball joint is not simulated")
-            if m.dof_frictionloss[dof]:
-                raise self._error(f"{name}: frictionloss is not simulated")
-            if m.jnt_type[j] == joint.mjJNT_FREE:
-                if m.dof_armature[dof] or m.dof_damping[dof] or m.jnt_stiffness[j]:
-                    raise self._error(f"{name}: a free joint has no armature, damping or stiffness here")
-                if j or m.body_parentid[m.jnt_bodyid[j]]:
-                    raise self._error(f"{name}: one free joint, of the first moving body, is simulated")
+        if m.opt.density or m.opt.viscosity:
+            self._check_fluid()
+
+    def _check_tendon(self, tendon: int) -> None:
+        m, kind = self.m, mujoco.mjtObj.mjOBJ_TENDON
+        path = m.wrap_type[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]
+        if (path != mujoco.mjtWrap.mjWRAP_SITE).any():
+            raise self._refused(kind, tendon, "only spatial tendons through sites, without pulleys or wrapping geoms")
+        for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited"):
+            if self._any(f"tendon_{field}", tendon):
+                raise self._refused(kind, tendon, f"{field} of a tendon is not simulated")
+
+    def _check_joint(self, joint: int) -> None:
+        m, dof = self.m, self.m.jnt_dofadr[joint]
+        free, ball = (m.jnt_type[joint] == kind for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))
+        polynomial = self._any("dof_dampingpoly", dof) or self._any("jnt_stiffnesspoly", joint)
+        passive = m.dof_armature[dof] or m.dof_damping[dof] or m.jnt_stiffness[joint]
+        for wrong, why in (
+            (m.jnt_actfrclimited[joint], "actuatorfrcrange is not simulated"),
+            (polynomial, "damping and stiffness are linear here, one number each"),
+            (ball and m.jnt_limited[joint], "the limit of a ball joint is not simulated"),
+            (m.dof_frictionloss[dof], "frictionloss is not simulated"),
+            (free and passive, "a free joint has no armature, damping or stiffness here"),
+            (
+                free and (joint or m.body_parentid[m.jnt_bodyid[joint]]),
+                "one free joint, of the first moving body, is simulated",
+            ),
+        ):
+            if wrong:
+                raise self._refused(mujoco.mjtObj.mjOBJ_JOINT, joint, why)
+
+    def _check_fluid(self) -> None:
+        m, kind = self.m, mujoco.mjtObj
+        for body in range(1, m.nbody):
+            if m.body_mass[body] > 0 and not m.body_jntnum[body] and m.body_weldid[body]:
+                raise self._refused(kind.mjOBJ_BODY, body, "in a fluid each body needs a joint; merge its geoms")
+        for geom in range(m.ngeom):
+            if m.geom_fluid[geom, 0]:
+                raise self._refused(kind.mjOBJ_GEOM, geom, "fluidshape ellipsoid is not simulated")
 
     def _add_link(self, parent: int, joint: int = -1, ball: int = -1, **values: Any) -> int:
         m = self.m
@@ -166,7 +187,7 @@ class _Reader:
             rotation, position = np.eye(3), np.zeros(3)
         else:
             if joints and link < 0:
-                raise self._error(f"{self._name(mujoco.mjtObj.mjOBJ_BODY, body)}: a second base beside a floating one")
+                raise self._refused(mujoco.mjtObj.mjOBJ_BODY, body, "a second base beside a floating one")
             for joint in joints:
                 anchor = np.array(m.jnt_pos[joint])
                 position = position + rotation @ anchor
@@ -212,7 +233,7 @@ class _Reader:
         m = self.m
         extras = m.actuator_forcelimited[a] or self._any("actuator_damping", a) or self._any("actuator_armature", a)
         if extras or not fits:
-            raise self._error(f"{self._name(mujoco.mjtObj.mjOBJ_ACTUATOR, a)}: only {allowed}")
+            raise self._refused(mujoco.mjtObj.mjOBJ_ACTUATOR, a, f"only {allowed}")
 
     def _is_motor(self, a: int) -> bool:
         m = self.m
@@ -275,8 +296,8 @@ class _Reader:
         for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
             link, rotation, position = self.body[m.site_bodyid[site]]
             if link < 0:
-                name = self._name(mujoco.mjtObj.mjOBJ_SITE, site)
-                raise self._error(f"{name}: a muscle of a floating robot cannot hold on to the world")
+                why = "a muscle of a floating robot cannot hold on to the world"
+                raise self._refused(mujoco.mjtObj.mjOBJ_SITE, site, why)
             points.append((link, position + rotation @ m.site_pos[site]))
         constant, segments = 0.0, []
         for (i, a), (j, b) in zip(points, points[1:], strict=False):
@@ -293,23 +314,22 @@ class _Reader:
         static = [g for g in range(m.ngeom) if m.body_weldid[m.geom_bodyid[g]] == 0]
         moving = [g for g in range(m.ngeom) if m.body_weldid[m.geom_bodyid[g]] != 0]
         touched = [s for s in static if any(self._collide(s, g) for g in moving)]
-        spheres: list[tuple[int, Array, float]] = []
+        spheres: list[Sphere] = []
         height = 0.0
         for plane in touched:
-            name = self._name(mujoco.mjtObj.mjOBJ_GEOM, plane)
             if m.geom_type[plane] != mujoco.mjtGeom.mjGEOM_PLANE or len(touched) > 1:
-                raise self._error(f"{name}: contact is simulated with one ground plane only")
+                raise self._refused(mujoco.mjtObj.mjOBJ_GEOM, plane, "contact is simulated with one ground plane only")
             if not np.allclose(data.geom_xmat[plane].reshape(3, 3)[:, 2], [0.0, 0.0, 1.0]):
-                raise self._error(f"{name}: the ground plane must be horizontal")
+                raise self._refused(mujoco.mjtObj.mjOBJ_GEOM, plane, "the ground plane must be horizontal")
             height = float(data.geom_xpos[plane, 2])
             for g in moving:
                 if self._collide(plane, g):
                     spheres += self._spheres(g)
         spheres = self._outer_spheres(spheres)
         return {
-            "contact_link": np.array([s[0] for s in spheres], np.int32),
-            "contact_position": np.array([s[1] for s in spheres]).reshape(-1, 3),
-            "contact_radius": np.array([s[2] for s in spheres]),
+            "contact_link": np.array([sphere.link for sphere in spheres], np.int32),
+            "contact_position": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
+            "contact_radius": np.array([sphere.radius for sphere in spheres]),
             "ground_height": height,
         }
 
@@ -319,40 +339,39 @@ class _Reader:
         low, high = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
         return bool(masks) and (int(low) << 16) + int(high) not in m.exclude_signature
 
-    def _spheres(self, geom: int) -> list[tuple[int, Array, float]]:
+    def _spheres(self, geom: int) -> list[Sphere]:
         m, kind = self.m, mujoco.mjtGeom
         link, rotation, position = self.body[m.geom_bodyid[geom]]
         axes = rotation @ _matrix(m.geom_quat[geom])
         centre = position + rotation @ m.geom_pos[geom]
         size = m.geom_size[geom]
         if m.geom_type[geom] == kind.mjGEOM_SPHERE:
-            return [(link, centre, size[0])]
+            return [Sphere(link, centre, size[0])]
         if m.geom_type[geom] == kind.mjGEOM_CAPSULE:
-            return [(link, centre + s * size[1] * axes[:, 2], size[0]) for s in (-1.0, 1.0)]
+            return [Sphere(link, centre + s * size[1] * axes[:, 2], size[0]) for s in (-1.0, 1.0)]
         if m.geom_type[geom] == kind.mjGEOM_BOX:
             signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
-            return [(link, centre + axes @ (s * size), 0.0) for s in signs]
-        raise self._error(
-            f"{self._name(mujoco.mjtObj.mjOBJ_GEOM, geom)}: only spheres, capsules and boxes may touch the ground; "
-            "set contype and conaffinity to 0 if it is only drawn"
-        )
+            return [Sphere(link, centre + axes @ (s * size), 0.0) for s in signs]
+        why = "only spheres, capsules and boxes may touch the ground; set contype and conaffinity to 0 if only drawn"
+        raise self._refused(mujoco.mjtObj.mjOBJ_GEOM, geom, why)
 
-    def _outer_spheres(self, spheres: list[tuple[int, Array, float]]) -> list[tuple[int, Array, float]]:
+    def _outer_spheres(self, spheres: list[Sphere]) -> list[Sphere]:
         """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""
 
-        def seen_from_parent(link: int, centre: Array) -> tuple[int, Array]:
+        def seen_from_parent(sphere: Sphere) -> Sphere:
             # A centre on the hinge's anchor does not move in the parent's frame.
+            link, centre = sphere.link, sphere.centre
             while link > 0 and not self.links[link]["slide"] and np.linalg.norm(centre) < 1e-6:
                 centre, link = self.links[link]["position"], self.links[link]["parent"]
-            return link, centre
+            return Sphere(link, centre, sphere.radius)
 
-        kept: list[tuple[int, Array, float]] = []
-        for link, centre, radius in sorted(spheres, key=lambda s: -s[2]):
-            home, place = seen_from_parent(link, centre)
-            others = [(*seen_from_parent(sphere[0], sphere[1]), sphere[2]) for sphere in kept]
-            if not any(o == home and np.linalg.norm(p - place) + radius <= r + 1e-6 for o, p, r in others):
-                kept.append((link, centre, radius))
-        return sorted(kept, key=lambda s: s[0])
+        kept: list[Sphere] = []
+        for sphere in sorted(spheres, key=lambda sphere: -sphere.radius):
+            link, place, radius = seen_from_parent(sphere)
+            others = [other for other in map(seen_from_parent, kept) if other.link == link]
+            if not any(np.linalg.norm(o.centre - place) + radius <= o.radius + 1e-6 for o in others):
+                kept.append(sphere)
+        return sorted(kept, key=lambda sphere: sphere.link)
 
     def _penalties(self) -> dict[str, Any]:
         return {name: self._numeric(name, default) for name, default in PENALTY_DEFAULTS.items()}

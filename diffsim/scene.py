@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -204,6 +205,20 @@ class Scene:
         force = 0.5 * self.density * np.stack((y * z, x * z, x * y), 1)
         torque = self.density / 64 * np.stack((x * (y**4 + z**4), y * (x**4 + z**4), z * (x**4 + y**4)), 1)
         return axes, viscous, force, torque
+
+    def with_penalty(self, constants: Mapping[str, float]) -> Scene:
+        """A copy with some penalty constants replaced, see PENALTY_DEFAULTS.
+
+        Raises:
+            ValueError: an unknown constant, or one that is negative or not finite.
+        """
+        for name, value in constants.items():
+            if name not in PENALTY_DEFAULTS:
+                raise ValueError(f"unknown penalty constant {name!r}; choose from {', '.join(PENALTY_DEFAULTS)}")
+            if not 0 <= value < np.inf:
+                raise ValueError(f"penalty constant {name} is {value!r}, must be finite and not negative")
+        changes: dict[str, Any] = dict(constants)
+        return dataclasses.replace(self, **changes)
 
     def without(self, *features: str) -> Scene:
         """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping", "muscle", "drag".

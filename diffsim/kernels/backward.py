@@ -39,7 +39,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     T, vec3, vec6, mat3, quat, Model = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
     vec6s = wp.array(dtype=vec6)
     join, force_at, point_velocity, momentum = sp.join, sp.force_at, sp.point_velocity, sp.momentum
-    exp_quat, to_tangent, from_tangent = sp.exp_quat, sp.to_tangent, sp.from_tangent
+    exp_quat, exp_adjoint, log_adjoint = sp.exp_quat, sp.exp_adjoint, sp.log_adjoint
+    to_tangent, from_tangent = sp.to_tangent, sp.from_tangent
     load, link_of, place_links, sphere_state = kin.load, kin.link_of, kin.place_links, kin.sphere_state
     qpos_adr, load_quat, load_quat_row, place_balls = kin.qpos_adr, kin.load_quat, kin.load_quat_row, kin.place_balls
     contact = contact_law(T)
@@ -58,29 +59,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     BASE = 7 * (spec.nlink - 1)  # where the base's factor begins
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
     sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
-
-    @wp.func
-    def exp_adjoint(r: vec3, g: vec3):
-        """Adjoint of q' = q exp(r): (of r, of q), g and both in the body's tangent space: J_r(r)' g and Exp(r) g."""
-        angle = wp.length(r)
-        k1 = T(0.5) - angle * angle / T(24.0)
-        k2 = T(1.0) / T(6.0) - angle * angle / T(120.0)
-        if angle > T(2e-2):
-            k1 = (T(1.0) - wp.cos(angle)) / (angle * angle)
-            k2 = (angle - wp.sin(angle)) / (angle * angle * angle)
-        rg = wp.cross(r, g)
-        rrg = wp.cross(r, rg)
-        return g + k1 * rg + k2 * rrg, g + (T(1.0) - k2 * angle * angle) * rg + k1 * rrg
-
-    @wp.func
-    def log_adjoint(r: vec3, g: vec3):
-        """Adjoint of log(exp(r) exp(d)) with respect to d, at d = 0: the inverse of J_r(r)'."""
-        angle = wp.length(r)
-        k2 = T(1.0) / T(12.0) + angle * angle / T(720.0)
-        if angle > T(2e-2):
-            k2 = (T(1.0) - T(0.5) * angle / wp.tan(T(0.5) * angle)) / (angle * angle)
-        rg = wp.cross(r, g)
-        return g - T(0.5) * rg + k2 * wp.cross(r, rg)
 
     @wp.func
     def solve_base(ck_f: t.array3, row: int, e: int, b: vec6):
@@ -250,10 +228,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 for k in range(3):
                     gq[i + k] = gb[k]
         if wp.static(FLOATING):
-            w = vec3(load(ck_v, end, 3, e), load(ck_v, end, 4, e), load(ck_v, end, 5, e))
-            w = w + h * vec3(load(ck_a, end, 3, e), load(ck_a, end, 4, e), load(ck_a, end, 5, e))
-            rot = quat(load(ck_q, end, 4, e), load(ck_q, end, 5, e), load(ck_q, end, 6, e), load(ck_q, end, 3, e))
-            rot = wp.normalize(rot * exp_quat(h * w))
+            w = next_rate(ck_v, ck_a, end, 3, e, h)
+            rot = wp.normalize(load_quat_row(ck_q, end, 3, e) * exp_quat(h * w))
             gp = vec3(g_qpos_out[e, 0], g_qpos_out[e, 1], g_qpos_out[e, 2])
             gr = to_tangent(rot, load_quat(g_qpos_out, e, 3))
             gv = vec3(g_qvel_out[e, 0], g_qvel_out[e, 1], g_qvel_out[e, 2])
@@ -279,7 +255,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         gq[i + k] = gb_start[k]
                 place_balls(m, lane, turn, R, q)
             if wp.static(FLOATING):
-                rot = quat(load(ck_q, row, 4, e), load(ck_q, row, 5, e), load(ck_q, row, 6, e), load(ck_q, row, 3, e))
+                rot = load_quat_row(ck_q, row, 3, e)
                 v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
                 w = vec3(load(ck_v, row, 3, e), load(ck_v, row, 4, e), load(ck_v, row, 5, e))
                 vdot = vec3(load(ck_a, row, 0, e), load(ck_a, row, 1, e), load(ck_a, row, 2, e)) - m.gravity

@@ -198,7 +198,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         R[0] = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
             pos = vec3(qpos[e, 0], qpos[e, 1], qpos[e, 2])
-            rot = wp.normalize(quat(qpos[e, 4], qpos[e, 5], qpos[e, 6], qpos[e, 3]))
+            rot = wp.normalize(load_quat(qpos, e, 3))
             v = vec3(qvel[e, 0], qvel[e, 1], qvel[e, 2])
             w = vec3(qvel[e, 3], qvel[e, 4], qvel[e, 5])
 

@@ -52,10 +52,22 @@ class KernelSpec:
 
 
 def kernel_spec(scene: Scene, division: Division, dtype: type, implicit: bool, env_last: bool) -> KernelSpec:
-    threads_per_env, sharers, trunk = division.threads_per_env, division.sharers, division.trunk
-    inert = scene.inert if threads_per_env == sharers else min(scene.inert, trunk)
-    base = (scene.nlink, scene.nu, scene.carrier, scene.nball, scene.features)
-    return KernelSpec(*base, dtype, implicit, env_last, threads_per_env, sharers, trunk, division.slots, inert)
+    limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
+    return KernelSpec(
+        nlink=scene.nlink,
+        nu=scene.nu,
+        carrier=scene.carrier,
+        nball=scene.nball,
+        features=scene.features,
+        dtype=dtype,
+        implicit=implicit,
+        env_last=env_last,
+        threads_per_env=division.threads_per_env,
+        sharers=division.sharers,
+        trunk=division.trunk,
+        slots=division.slots,
+        inert=min(scene.inert, division.trunk) if limbs else scene.inert,
+    )
 
 
 def module_options(spec: KernelSpec) -> dict[str, Any]:
