@@ -43,9 +43,8 @@ from diffsim.ilqr import (
     symmetric,
 )
 from diffsim.simulator import check_device
-from diffsim.tasks import PLANAR
+from diffsim.tasks import TASKS
 
-TASKS = diffsim.TASKS | PLANAR
 # Those of Figure 2
 Variant = Literal["full", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
 
@@ -195,10 +194,9 @@ class System(Dynamics):
         self.args, self.task = args, TASKS[args.env](check_device(args.device), REAL)
         scene = diffsim.load_scene(str(files("diffsim") / "assets" / self.task.asset))
         preset = self.task.integration(args.accuracy or "default")
-        args.substeps = preset.substeps if args.substeps is None else args.substeps
-        args.integrator = args.integrator or preset.integrator
-        integration = (args.substeps, args.integrator, preset.theta)
-        super().__init__(scene, self.task.control_dt, *integration, args.device, args.threads)
+        integration = preset.replaced(args.integrator, args.substeps, None)
+        args.integrator, args.substeps, _ = integration
+        super().__init__(scene, self.task.control_dt, integration, args.device, args.threads)
         self.root_height = 0.0 if scene.floating else float(scene.mj_model.body_pos[1, 2])
         self.no_action = torch.zeros(self.nu, dtype=REAL, device=self.device)
         self.demonstration: tuple[Tensor, Tensor] | None = None  # x (T + 1, nx), u (T, nu)

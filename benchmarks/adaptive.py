@@ -26,8 +26,8 @@ from torch import Tensor
 from tradeoff import CONTROL_DT, deepest, simulator, state_errors
 
 import diffsim
+from diffsim import Integration
 from diffsim.run import fail
-from diffsim.tasks import Integration
 
 INSTANTS = 16  # of a control step at which contact is looked for
 
@@ -60,7 +60,8 @@ def motion(args: Args, name: str) -> tuple[Any, list[Tensor], Tensor, np.ndarray
     task, scene = diffsim.TASKS[name](dtype=torch.float64), diffsim.make(name, num_envs=1).scene
     policy, called = load_policy(name, args.checkpoint, args.runs)
     qpos, qvel = visited_states(name, policy, args.states)
-    sim = diffsim.Simulator(scene, args.states, CONTROL_DT / INSTANTS, task.substeps, dtype=torch.float64)
+    integration = task.integration("default")
+    sim = diffsim.Simulator(scene, args.states, integration, CONTROL_DT / INSTANTS, dtype=torch.float64)
     starts, ends, touching = [], [], []
     action = torch.zeros(args.states, scene.nu, dtype=torch.float64)
     for _ in range(args.steps):
@@ -84,7 +85,7 @@ def measure(args: Args, name: str) -> dict[str, Any]:
         return row  # nothing to compare
     quantiles = {}
     for substeps in [n for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 48) if n <= default]:
-        sim = simulator(scene, Integration("semi_implicit", 0.0, substeps), torch.float64, len(ends))
+        sim = simulator(scene, Integration("semi_implicit", substeps), torch.float64, len(ends))
         with torch.no_grad():
             found = state_errors(scene.mj_model, sim.step(*starts)[0], ends)
         quantiles[substeps] = [float(np.quantile(found[kind], 0.95)) for kind in (touching, ~touching)]

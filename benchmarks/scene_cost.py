@@ -112,7 +112,7 @@ def difference(scene: Scene, feature: str) -> float:
     """Largest over the state after a control step and its gradient, relative to each one's largest entry."""
     results = []
     for one in (scene, scene.without(feature)):
-        sim = diffsim.Simulator(one, 4, substeps=SUBSTEPS, dtype=torch.float64)
+        sim = diffsim.Simulator(one, 4, diffsim.Integration(substeps=SUBSTEPS), dtype=torch.float64)
         leaves = [x.clone().requires_grad_() for x in states(one, 4, 5.0)]
         q, v = sim.step(*leaves)
         total = q.square().sum() + v.square().sum()
@@ -126,7 +126,7 @@ def measure(args: Args) -> list[dict[str, Any]]:
     for what, counts in COUNTS.items():
         for count in counts:
             scene = chain(count) if what == "link" else chain(LINKS, what, count)
-            sim = diffsim.Simulator(scene, args.num_envs, substeps=SUBSTEPS, **options)
+            sim = diffsim.Simulator(scene, args.num_envs, diffsim.Integration(substeps=SUBSTEPS), **options)
             state = states(scene, args.num_envs, 0.0 if what == "sphere in the ground" else 5.0)
             runs = [time_diffsim(sim, state) for _ in range(args.repeats + 1)][1:]
             row: dict[str, Any] = {"of": what, "count": count, "device": args.device, "environments": args.num_envs}

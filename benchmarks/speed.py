@@ -40,8 +40,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import diffsim
 from diffsim import graph
+from diffsim.kernels.lanes import divide
+from diffsim.launcher import available_cores
 from diffsim.run import fail
-from diffsim.simulator import available_cores
+from diffsim.tasks import SHAC_TASKS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -53,7 +55,7 @@ Part = Literal["physics", "muscles", "scaling", "training", "compile", "picture"
 
 @dataclass
 class Args:
-    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
+    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = SHAC_TASKS
     """tasks"""
     num_envs: tuple[int, ...] = (64, 256)
     """batch sizes of the physics table (training uses the task's own)"""
@@ -216,8 +218,8 @@ def measure_physics(args: Args, table: Table) -> None:
                     sim = diffsim.Simulator(
                         scene,
                         num_envs,
+                        task.integration("default"),
                         task.control_dt,
-                        task.substeps,
                         device=args.device,
                         dtype=DTYPES[dtype],
                         threads=count,
@@ -279,7 +281,7 @@ def measure_muscles(args: Args, table: Table) -> None:
         for num_envs, dtype in itertools.product(args.num_envs, args.dtype):
             options: dict[str, Any] = dict(device=args.device, dtype=DTYPES[dtype], threads=1)
             sims = {
-                muscles: diffsim.Simulator(s, num_envs, task.control_dt, task.substeps, **options)
+                muscles: diffsim.Simulator(s, num_envs, task.integration("default"), task.control_dt, **options)
                 for muscles, s in scenes.items()
             }
             times: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -327,12 +329,12 @@ def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[
     sim = diffsim.Simulator(
         env.scene,
         num_envs,
+        env.task.integration("default"),
         env.control_dt,
-        env.task.substeps,
         horizon,
         device=device,
         threads={"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique),
-        lanes=(1, 1) if "one thread" in technique else None,
+        division=divide(env.scene, 1) if "one thread" in technique else None,
     )
     start_qpos, start_qvel = env.qpos.clone(), env.qvel.clone()
     actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()

@@ -36,9 +36,10 @@ from torch import Tensor
 from tradeoff import CONTROL_DT, closed_loop, label, mechanics, simulator
 
 import diffsim
+from diffsim import Integration
 from diffsim.run import fail
 from diffsim.scene import Scene
-from diffsim.tasks import Integration
+from diffsim.tasks import SHAC_TASKS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -65,7 +66,7 @@ NEEDS_GROUND = ("contact stiffness x", "contact damping x", "friction", "drop (m
 
 @dataclass
 class Args:
-    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
+    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = SHAC_TASKS
     """tasks"""
     parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long")
     """tables to measure"""
@@ -94,7 +95,7 @@ class Case:
         self.qpos, self.qvel = visited_states(name, self.policy, args.states)
         self.model = mujoco.MjModel.from_xml_path(self.scene.path)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-        fine = Integration("semi_implicit", 0.0, 64 * self.substeps)
+        fine = Integration("semi_implicit", 64 * self.substeps)
         self.reference = simulator(self.scene, fine, torch.float64, self.n)
         task = diffsim.TASKS[name](dtype=torch.float64)
         with torch.no_grad():
@@ -150,12 +151,12 @@ def measure_step(case: Case) -> list[dict[str, Any]]:
         for count in (c for c in COUNTS if c <= 4 * case.substeps):
             if integrator == "extrapolated" and count % 2:
                 continue
-            sim = simulator(case.scene, Integration(integrator, theta, count), torch.float32, case.n)
+            sim = simulator(case.scene, Integration(integrator, count, theta), torch.float32, case.n)
             q, v, bad = run(sim, case.qpos, case.qvel, case.actions)
             stable[count] = bad == 0 and case.kinetic(q, v) < limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        kind = label(Integration(integrator, theta, 1))
+        kind = label(Integration(integrator, 1, theta))
         row = {"task": case.name, "integrator": kind, "fewest substeps": fewest or f"over {counts[-1]}"}
         row["largest stable step (ms)"] = 1e3 * CONTROL_DT / fewest if fewest else ""
         rows.append(row | {"default": case.substeps})
@@ -239,7 +240,7 @@ def measure_sweeps(case: Case) -> list[dict[str, Any]]:
             scene, model, qpos, qvel, actions = setup(case, sweep, value)
             limit = case.limit(actions) if "action" in sweep else 0.0
             for integrator, theta in INTEGRATORS:
-                sim = simulator(scene, Integration(integrator, theta, case.substeps), torch.float32, case.n, horizon=8)
+                sim = simulator(scene, Integration(integrator, case.substeps, theta), torch.float32, case.n, horizon=8)
                 q, v, bad = run(sim, qpos, qvel, actions)
                 if "action" in sweep:
                     within = case.kinetic(q, v) < limit
@@ -250,7 +251,7 @@ def measure_sweeps(case: Case) -> list[dict[str, Any]]:
                     floor = (path[:, 1] - path[:, 0]).min(0)
                     within = bool((path[:, 1] - floor <= 1.1 * (before - floor) + 1e-3).all())
                 norm, lost = gradient_norm(sim, qpos, qvel, actions)
-                row = {"task": case.name, "integrator": label(Integration(integrator, theta, 1)), "sweep": sweep}
+                row = {"task": case.name, "integrator": label(Integration(integrator, 1, theta)), "sweep": sweep}
                 row |= {"value": float(value), "finite": bad == 0, "contained": bad, "energy bounded": within}
                 rows.append(row | {"gradient": norm, "gradients not finite": lost})
     return rows
@@ -283,7 +284,7 @@ def measure_horizon(case: Case) -> list[dict[str, Any]]:
     weights = list(policy.actor.mean.parameters())
     for integrator, theta in INTEGRATORS:
         sim = simulator(
-            case.scene, Integration(integrator, theta, case.substeps), torch.float32, case.n, horizon=HORIZONS[-1]
+            case.scene, Integration(integrator, case.substeps, theta), torch.float32, case.n, horizon=HORIZONS[-1]
         )
         for horizon in HORIZONS:
             before, bad = int(sim.nonfinite_gradients.sum()), 0
@@ -296,7 +297,7 @@ def measure_horizon(case: Case) -> list[dict[str, Any]]:
                 bad += int(sim.nonfinite.sum())
                 total = total + task.reward(task.observe(q, v, action), action).mean() / horizon
             gradient = torch.cat([g.flatten() for g in torch.autograd.grad(total, weights)])
-            kind = label(Integration(integrator, theta, 1))
+            kind = label(Integration(integrator, 1, theta))
             row = {"task": case.name, "integrator": kind, "horizon": horizon, "gradient": gradient.norm().item()}
             row["gradients not finite"] = int(sim.nonfinite_gradients.sum()) - before
             rows.append(row | {"contained": bad})

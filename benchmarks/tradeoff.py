@@ -43,11 +43,12 @@ from tables import fill, markdown, merge_csv, read_csv
 from torch import Tensor
 
 import diffsim
+from diffsim import Integration
 from diffsim.evaluation import evaluate
+from diffsim.integration import INTEGRATORS
 from diffsim.run import constants, fail
 from diffsim.scene import Scene
-from diffsim.simulator import INTEGRATORS
-from diffsim.tasks import Integration
+from diffsim.tasks import SHAC_TASKS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -72,7 +73,7 @@ MUJOCO = {"Euler": "tab:red", "RK4": "tab:purple", "implicitfast": "tab:brown"}
 
 @dataclass
 class Args:
-    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
+    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = SHAC_TASKS
     """tasks"""
     checkpoint: Path | None = None
     """checkpoint of shac.py whose policy decides states and actions; None: each task's in --runs, else untrained"""
@@ -108,10 +109,7 @@ class Args:
 
 
 def simulator(scene: Scene, setting: Integration, dtype: torch.dtype, num_envs: int, **options: Any) -> Any:
-    integrator, theta, substeps = setting
-    return diffsim.Simulator(
-        scene, num_envs, CONTROL_DT, substeps, integrator=integrator, theta=theta, dtype=dtype, **options
-    )
+    return diffsim.Simulator(scene, num_envs, setting, CONTROL_DT, dtype=dtype, **options)
 
 
 @torch.no_grad()
@@ -284,9 +282,7 @@ def timings(args: Args, scene: Scene, setting: Integration, dtype: str, state: A
 def policy_return(
     name: str, policy: Policy, setting: Integration, dtype: torch.dtype, penalty: dict[str, float]
 ) -> float:
-    integrator, theta, substeps = setting
-    options = dict(substeps=substeps, integrator=integrator, theta=theta, dtype=dtype, penalty=penalty)
-    env = diffsim.make(name, num_envs=64, horizon=1, **options)
+    env = diffsim.make(name, num_envs=64, horizon=1, dtype=dtype, penalty=penalty, **setting._asdict())
     policy = copy.deepcopy(policy).to(dtype)
     return evaluate(env, policy).returns.median().item()
 
@@ -302,9 +298,9 @@ def measure(args: Args, name: str) -> list[dict[str, Any]]:
     counts = sorted({max(1, round(task_type.substeps * factor)) for factor in args.factors})
     thetas = {"implicit": args.theta}
     kinds = [(name, theta) for name in args.integrators for theta in thetas.get(name, (0.0,))]
-    settings = [Integration(*kind, n) for kind in kinds for n in counts if kind[0] != "extrapolated" or n % 2 == 0]
+    settings = [Integration(i, n, theta) for i, theta in kinds for n in counts if i != "extrapolated" or n % 2 == 0]
     scene = diffsim.make(name, num_envs=1, penalty=penalty).scene
-    finest = Integration("semi_implicit", 0.0, 16 * max(counts))
+    finest = Integration("semi_implicit", 16 * max(counts))
     print(f"{called_task}: states and actions of {called}; reference {finest.substeps} substeps", flush=True)
 
     task = task_type(dtype=torch.float64)
@@ -327,7 +323,7 @@ def measure(args: Args, name: str) -> list[dict[str, Any]]:
                 row = dict(task=called_task, simulator=f"MuJoCo {integrator}", substeps=substeps, precision="float64")
                 error = state_error(model, end, flight.expected)
                 rows.append(row | {"device": "cpu", "forward (us)": microseconds, "flight 0.5 s": error})
-        finer = Integration("semi_implicit", 0.0, 4 * task_type.substeps)
+        finer = Integration("semi_implicit", 4 * task_type.substeps)
         standard = policy_return(name, policy, finer, torch.float32, penalty)
     for setting in settings:
         for dtype in args.dtype:
@@ -430,10 +426,10 @@ def draw(rows: list[dict[str, str]], name: str, path: Path) -> None:
 def presets(rows: list[dict[str, str]]) -> list[dict[str, Any]]:
     """What each preset costs and errs, in float32."""
     lines: list[dict[str, Any]] = []
-    for name, task in diffsim.TASKS.items():
+    for name in SHAC_TASKS:
         found = {}
         for accuracy in ("fast", "default", "accurate"):
-            setting = task.integration(accuracy)
+            setting = diffsim.TASKS[name].integration(accuracy)
             key = (name, label(setting), str(setting.substeps), "float32")
             found[accuracy] = next((r for r in rows if tuple(r[c] for c in KEY[:4]) == key and r["state 0.5 s"]), None)
         for accuracy, row in found.items():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -13,11 +11,13 @@ import torch
 import warp as wp
 
 from diffsim.env import DiffEnv, NumpyEnv
-from diffsim.scene import PENALTY_DEFAULTS, Scene, SceneError, load_scene
+from diffsim.integration import Integration
+from diffsim.mjcf import load_scene
+from diffsim.scene import Scene, SceneError
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy
 
-__all__ = ["TASKS", "DiffEnv", "Scene", "SceneError", "Simulator", "load_scene", "make"]
+__all__ = ["TASKS", "DiffEnv", "Integration", "Scene", "SceneError", "Simulator", "load_scene", "make"]
 
 wp.config.log_level = wp.LOG_WARNING
 
@@ -55,23 +55,13 @@ def make(
     device = check_device(device)
     task = TASKS[name](device, dtype)
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
-    changes: dict[str, Any] = dict(penalty or {})
-    for key, value in changes.items():
-        if key not in PENALTY_DEFAULTS:
-            raise ValueError(f"unknown penalty constant {key!r}; choose from {', '.join(PENALTY_DEFAULTS)}")
-        if not 0 <= value < math.inf:
-            raise ValueError(f"penalty constant {key} is {value!r}, must be finite and not negative")
-    scene = dataclasses.replace(scene, **changes)
-    preset = task.integration(accuracy)
     return DiffEnv(
         task,
-        scene,
+        scene.with_penalty(penalty or {}),
         num_envs,
+        integration=task.integration(accuracy).replaced(integrator, substeps, theta),
         seed=seed,
         horizon=horizon,
-        substeps=preset.substeps if substeps is None else substeps,
-        integrator=preset.integrator if integrator is None else integrator,
-        theta=preset.theta if theta is None else theta,
         device=device,
         dtype=dtype,
         stochastic_init=stochastic_init,

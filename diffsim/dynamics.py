@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from diffsim.integration import Integration
 from diffsim.scene import Scene
 from diffsim.simulator import Simulator, check_device
 
@@ -29,7 +30,7 @@ class Dynamics:
 
     Args:
         scene: the robot.
-        control_dt, substeps, integrator, theta, device, threads: see Simulator.
+        control_dt, integration, device, threads: see Simulator.
 
     Raises:
         ValueError: see Simulator.
@@ -42,15 +43,13 @@ class Dynamics:
         self,
         scene: Scene,
         control_dt: float,
-        substeps: int,
-        integrator: str = "semi_implicit",
-        theta: float = 0.0,
+        integration: Integration,
         device: str | torch.device = "cpu",
         threads: int | None = None,
     ) -> None:
         self.scene, self.control_dt, self.device = scene, control_dt, check_device(device)
         self.nq, self.nv, self.nu, self.nx, self.nd = scene.nq, scene.nv, scene.nu, scene.nq + scene.nv, 2 * scene.nv
-        self._options = dict(substeps=substeps, integrator=integrator, theta=theta, threads=threads)
+        self._options = dict(integration=integration, threads=threads)
         self._simulators: dict[int, Simulator] = {}
         self.steps = 0
         self.simulator(1)

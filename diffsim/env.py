@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from diffsim.integration import Integration
 from diffsim.scene import Scene
 from diffsim.simulator import Simulator
 from diffsim.tasks import Task
@@ -27,7 +28,8 @@ class DiffEnv(VectorEnv):
     Args:
         task: task on the simulator's device and dtype.
         scene: its robot.
-        num_envs, horizon, substeps, integrator, theta, threads: see Simulator.
+        integration: default the task's "default".
+        num_envs, horizon, threads: see Simulator.
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
@@ -39,6 +41,9 @@ class DiffEnv(VectorEnv):
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    qpos: Tensor
+    qvel: Tensor
+    _obs: Tensor
 
     def __init__(
         self,
@@ -46,11 +51,9 @@ class DiffEnv(VectorEnv):
         scene: Scene,
         num_envs: int,
         *,
+        integration: Integration | None = None,
         seed: int | None = None,
         horizon: int = 32,
-        substeps: int | None = None,
-        integrator: str = "semi_implicit",
-        theta: float = 0.0,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         stochastic_init: bool = True,
@@ -63,11 +66,9 @@ class DiffEnv(VectorEnv):
         self.sim = Simulator(
             scene,
             num_envs,
+            integration or task.integration("default"),
             task.control_dt,
-            task.substeps if substeps is None else substeps,
             horizon,
-            integrator,
-            theta,
             device,
             dtype,
             threads,
@@ -87,9 +88,6 @@ class DiffEnv(VectorEnv):
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
-        self.qpos, self.qvel, self._obs = (torch.empty(0),) * 3
-        self._starts, self._time = (torch.empty(0),) * 3, 0
-        self._recorded = 0  # differentiable steps since the window began
         self._restart()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
@@ -219,7 +217,7 @@ class DiffEnv(VectorEnv):
     def _restart(self) -> None:
         self.episode_step.zero_()
         self._episode_return.zero_()
-        self._recorded = 0
+        self._recorded = 0  # differentiable steps since the window began
         self.sim.rewind()
         qpos, qvel, obs = self._draw(1)
         self.qpos, self.qvel, self._obs = qpos[0], qvel[0], obs[0]

@@ -11,6 +11,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from diffsim.integration import Integration
 from diffsim.scene import Scene
 
 Array = NDArray[np.float64]
@@ -256,11 +257,10 @@ def step(
     qvel: Array,
     ctrl: Array,
     control_dt: float,
-    substeps: int,
-    integrator: str = "semi_implicit",
-    theta: float = 0.0,
+    integration: Integration,
 ) -> tuple[Array, Array]:
     """One control step of one environment."""
+    integrator, substeps, theta = integration
     h = control_dt / substeps
     for _ in range(substeps):
         implicit = h if integrator == "implicit" else 0.0

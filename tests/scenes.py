@@ -13,9 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 import diffsim
-from diffsim.scene import Scene, load_scene
+from diffsim.integration import Integration
+from diffsim.mjcf import load_scene
+from diffsim.scene import Scene
 from diffsim.simulator import Simulator
-from diffsim.tasks import PLANAR, TASKS
+from diffsim.tasks import TASKS
 
 Array = NDArray[np.float64]
 
@@ -155,7 +157,7 @@ def parse(mjcf: str) -> Scene:
 
 @cache
 def task_scene(name: str) -> Scene:
-    return load_scene(Path(diffsim.__file__).parent / "assets" / (TASKS | PLANAR)[name].asset)
+    return load_scene(Path(diffsim.__file__).parent / "assets" / TASKS[name].asset)
 
 
 @cache
@@ -334,4 +336,4 @@ def run(
 
 def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, **simulator: object) -> Array:
     """qacc: the change of velocity over one substep of one second."""
-    return run(scene, qpos, qvel, ctrl, control_dt=1.0, substeps=1, **simulator)[1] - qvel
+    return run(scene, qpos, qvel, ctrl, control_dt=1.0, integration=Integration(substeps=1), **simulator)[1] - qvel

@@ -39,7 +39,7 @@ def records(env, actions):
 def test_spaces(name):
     env = diffsim.make(name, num_envs=3, seed=0)
     sizes = {"cartpole": (5, 1), "hopper": (11, 3), "half_cheetah": (17, 6), "ant": (37, 8), "humanoid": (76, 21)}
-    sizes = (sizes | {"humanoid_mtu": (53, 152)})[name]
+    sizes = (sizes | {"humanoid_mtu": (53, 152), "swimmer": (8, 2), "walker": (17, 6)})[name]
     assert env.single_observation_space.shape == sizes[:1] and env.single_action_space.shape == sizes[1:]
     assert env.observation_space.shape == (3, sizes[0]) and env.action_space.shape == (3, sizes[1])
     assert (env.single_action_space.low == -1).all() and (env.single_action_space.high == 1).all()
@@ -294,4 +294,4 @@ def test_finer_substeps_converge():
         ends.append(env.qpos.clone())
     np.testing.assert_allclose((ends[0] - ends[1]).norm() / (ends[1] - ends[2]).norm(), 2.0, rtol=0.1)
     env = diffsim.make("cartpole", 2, integrator="implicit", theta=0.5)
-    assert (env.sim.integrator, env.sim.theta, env.sim.substeps) == ("implicit", 0.5, TASKS["cartpole"].substeps)
+    assert env.sim.integration == diffsim.Integration("implicit", TASKS["cartpole"].substeps, 0.5)

@@ -17,22 +17,23 @@ import shac
 from diffsim import graph
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.model import shape_of
-from diffsim.simulator import Simulator, default_lanes
-from diffsim.tasks import PLANAR
+from diffsim.kernels.lanes import divide
+from diffsim.kernels.spec import kernel_spec
+from diffsim.launcher import default_division
+from diffsim.simulator import Simulator
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU, and PyTorch sees none")
 HORIZON = 32
 
 
-@pytest.mark.parametrize("name", [*diffsim.TASKS, *PLANAR])
+@pytest.mark.parametrize("name", diffsim.TASKS)
 def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> None:
     """And they hold no code for what the scene lacks."""
     scene = task_scene(name)
-    shape = shape_of(scene, wp.float32, False, True, *default_lanes(scene, 64))
+    spec = kernel_spec(scene, default_division(scene, 64), wp.float32, implicit=False, env_last=True)
     functions = {"add_pull": "muscle", "measure": "hill", "place_balls": "ball", "sphere_state": "contact"}
     functions["drag_wrench"] = "drag"
-    for kernel in (forward_kernel(shape), backward_kernel(shape)):
+    for kernel in (forward_kernel(spec), backward_kernel(spec)):
         directory = tmp_path / kernel.key
         wp.compile_aot_module(kernel.module, device=None, arch=90, module_dir=directory, strip_hash=True)
         assert any(path.stat().st_size > 10_000 for path in (*directory.glob("*.cubin"), *directory.glob("*.ptx")))
@@ -42,7 +43,7 @@ def test_kernels_compile_for_a_gpu_without_one(name: str, tmp_path: Path) -> Non
             assert (function in code) == (feature in scene.features), function
 
 
-def episode(name: str, device: str, lanes: tuple[int, int] | None = None) -> dict[str, torch.Tensor]:
+def episode(name: str, device: str, team: tuple[int, int] | None = None) -> dict[str, torch.Tensor]:
     """The state after 32 control steps of random actions, and the gradients of a random function of it."""
     n, kwargs = 8, dict(dtype=torch.float64)
     start = diffsim.make(name, num_envs=n, seed=0, **kwargs)
@@ -50,9 +51,9 @@ def episode(name: str, device: str, lanes: tuple[int, int] | None = None) -> dic
     actions = torch.rand(HORIZON, n, start.scene.nu, generator=generator, **kwargs) * 2 - 1
     weights = [torch.randn(n, width, generator=generator, **kwargs) for width in (start.scene.nq, start.scene.nv)]
     inputs = [x.to(device).detach().requires_grad_() for x in (start.qpos, start.qvel, actions)]
-    sim = Simulator(
-        start.scene, n, start.control_dt, start.task.substeps, HORIZON, device=device, lanes=lanes, **kwargs
-    )
+    division = divide(start.scene, *team) if team else None
+    kwargs |= dict(device=device, division=division)
+    sim = Simulator(start.scene, n, start.sim.integration, start.control_dt, HORIZON, **kwargs)
     qpos, qvel, steps = inputs
     for action in steps:
         qpos, qvel = sim.step(qpos, qvel, action)
@@ -69,11 +70,11 @@ def episode(name: str, device: str, lanes: tuple[int, int] | None = None) -> dic
 @pytest.mark.parametrize("name", diffsim.TASKS)
 def test_gpu_agrees_with_cpu(name: str) -> None:
     reference = episode(name, "cpu")
-    for lanes in [(1, 1), (2, 1), (4, 1), (8, 4)]:
-        ours = episode(name, "cuda", lanes)
+    for team in [(1, 1), (2, 1), (4, 1), (8, 4)]:
+        ours = episode(name, "cuda", team)
         for key, tolerance in (("qpos", 1e-9), ("qvel", 1e-9), ("d0", 1e-8), ("d1", 1e-8), ("d2", 1e-8)):
             error = (ours[key] - reference[key]).norm() / reference[key].norm()
-            assert error < tolerance, (lanes, key, error)
+            assert error < tolerance, (team, key, error)
 
 
 def windows(name: str, captured: bool, poison: int | None = None) -> list[torch.Tensor]:

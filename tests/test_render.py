@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import diffsim.tasks
+from diffsim.mjcf import load_scene
 from diffsim.render import render_frames, write_video
-from diffsim.scene import load_scene
 
 ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
 HOPPER, MUSCLES = ASSETS / "hopper.xml", ASSETS / "humanoid_mtu.xml"

@@ -263,12 +263,12 @@ def test_accuracy_and_penalty_are_stored_and_can_be_replaced(tmp_path: Path) -> 
         return shac.make_env(args, 1, 1).sim
 
     sim = simulator()
-    assert (sim.integrator, sim.theta, sim.substeps) == fast
+    assert sim.integration == fast
     assert (sim.scene.k_limit, sim.scene.mu) == (50.0, 0.5)
     sim = simulator("--accuracy", "accurate")
-    assert (sim.integrator, sim.theta, sim.substeps) == accurate
+    assert sim.integration == accurate
     sim = simulator("--substeps", "16", "--integrator", "semi_implicit", "--penalty", "k_limit=100")
-    assert (sim.integrator, sim.theta, sim.substeps, sim.scene.k_limit) == ("semi_implicit", 0.0, 16, 100.0)
+    assert (sim.integration, sim.scene.k_limit) == (("semi_implicit", 16, 0.0), 100.0)
 
 
 def test_evaluation_counts_first_episodes_only() -> None:

@@ -1,4 +1,4 @@
-"""Draws docs/tasks.png, the six robots side by side at the start of an episode: python tools/draw_tasks.py"""
+"""Draws docs/tasks.png, the SHAC paper's robots side by side as an episode starts: python tools/draw_tasks.py"""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from diffsim.render import render_frames
-from diffsim.tasks import TASKS
+from diffsim.tasks import SHAC_TASKS, TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = 320  # pixels
@@ -16,8 +16,8 @@ def main() -> None:
     import imageio.v3 as imageio
 
     pictures = []
-    for task_type in TASKS.values():
-        task = task_type()
+    for name in SHAC_TASKS:
+        task = TASKS[name]()
         qpos, _ = task.reset(torch.full((1, task.num_random), 0.5))
         pictures.append(render_frames(ROOT / "diffsim" / "assets" / task.asset, qpos.numpy(), 2 * SIZE, 2 * SIZE)[0])
     strip = np.concatenate(pictures, axis=1).astype(np.float32)

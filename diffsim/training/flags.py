@@ -179,10 +179,9 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 
 def _integration(args: Flags) -> dict[str, Any]:
     try:
-        preset = TASKS[args.env].integration(args.accuracy)
+        return TASKS[args.env].integration(args.accuracy)._asdict()
     except ValueError as error:
         fail(error)
-    return dict(integrator=preset.integrator, substeps=preset.substeps, theta=preset.theta)
 
 
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:
