@@ -37,15 +37,15 @@ class Stateful(Protocol):
 
 
 class Learner(Protocol):
-    """What a script's algorithm shows to what surrounds it.
+    """What a script's algorithm shows to what surrounds it."""
 
-    Attributes:
-        modules: everything, beside environments and random numbers, that the next iteration depends on.
-        policy: the deterministic policy, observations (..., obs_dim) -> actions (..., nu), as a chain of LAYERS.
-    """
+    @property
+    def modules(self) -> Mapping[str, Stateful]:
+        """Everything, beside environments and random numbers, that the next iteration depends on."""
 
-    modules: dict[str, Stateful]
-    policy: nn.Sequential
+    @property
+    def policy(self) -> nn.Sequential:
+        """The deterministic policy, observations (..., obs_dim) -> actions (..., nu), as a chain of LAYERS."""
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,10 @@ class Evaluation:
     Attributes:
         returns: (n,) undiscounted.
         lengths: (n,) control steps.
-        speed: mean forward speed, m/s; None for a robot without ground.
+        speed: mean forward speed, m/s; None for a robot that does not travel.
         qpos: (T, n, nq) before each step; valid up to an episode's length.
         scene, control_dt: what the episodes are of, to draw them.
+        others: what else a script measured, by name.
     """
 
     returns: Tensor
@@ -36,6 +37,7 @@ class Evaluation:
     qpos: Tensor
     scene: Scene
     control_dt: float
+    others: dict[str, float] = field(default_factory=dict)
 
     @property
     def length(self) -> float:
@@ -43,20 +45,23 @@ class Evaluation:
 
     def scalars(self) -> dict[str, float]:
         values = {"eval/return": self.returns.median().item(), "eval/length": self.length}
-        return values if self.speed is None else values | {"eval/speed": self.speed}
+        values |= {} if self.speed is None else {"eval/speed": self.speed}
+        return values | {f"eval/{name}": value for name, value in self.others.items()}
 
     def __str__(self) -> str:
         r = self.returns
         speed = "" if self.speed is None else f", forward speed {self.speed:.2f} m/s"
         spread = f"mean {r.mean():.1f}, std {r.std(correction=0):.1f}, min {r.min():.1f}"
-        return f"return median {r.median():.1f}, {spread}, length {self.length:.1f}{speed}"
+        others = "".join(f", {name.replace('_', ' ')} {value:.2f}" for name, value in self.others.items())
+        return f"return median {r.median():.1f}, {spread}, length {self.length:.1f}{speed}{others}"
 
     def write_json(self, path: Path, settings: Mapping[str, Any]) -> None:
-        """Write the median return, every episode's return and length, the speed and what they were measured with."""
+        """Write the scalars, every episode's return and length, and what they were measured with."""
         values = {
             "return": self.returns.median().item(),
             "length": self.length,
             "speed": self.speed,
+            **self.others,
             "returns": self.returns.tolist(),
             "lengths": self.lengths.tolist(),
             "settings": dict(settings),
@@ -76,6 +81,11 @@ class Evaluation:
         return render.save_video(path, frames, fps=0.5 / self.control_dt)
 
 
+def travels(scene: Scene) -> bool:
+    """Whether a ground or a fluid carries the robot, whose first coordinate is then its x."""
+    return bool(scene.features & {"contact", "drag"})
+
+
 @torch.no_grad()
 def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> Evaluation:
     """The first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu)."""
@@ -90,7 +100,7 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> Evaluation:
         alive &= ~(terminated | truncated)
     path = torch.stack(qpos)
     speed = None
-    if "contact" in env.scene.features:  # the first coordinate of a robot that walks is its x
+    if travels(env.scene):
         distance = path[..., 0].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, 0]
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
     return Evaluation(returns, lengths, speed, path, env.scene, env.control_dt)

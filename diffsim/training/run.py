@@ -25,7 +25,7 @@ from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, evaluate
-from diffsim.training.flags import Flags, ParallelFlags, parse_penalty
+from diffsim.training.flags import Args, Flags, ParallelFlags, parse_penalty
 from diffsim.training.progress import EpisodeStatistics, ProgressLog
 
 L = TypeVar("L", bound=Learner)
@@ -104,14 +104,28 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> Dif
         fail(error)
 
 
-def evaluate_checkpoint(args: Flags) -> None:
-    """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video."""
+def evaluate_checkpoint(
+    args: Args,
+    learner: Callable[[Args, DiffEnv], L] | None = None,
+    method: Callable[[L], Evaluation] | None = None,
+) -> None:
+    """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video.
+
+    Args:
+        args: the script's arguments.
+        learner, method: how a restored learner is evaluated, if not by `evaluate` of its policy.
+    """
     assert args.evaluate
     torch.set_num_threads(1)
-    env, saved = make_env(args, args.eval_episodes), checkpoint.load_policy(args.evaluate)
-    evaluation = evaluate(env, saved.network.to(env.device))
+    env, state = make_env(args, args.eval_episodes), checkpoint.load(args.evaluate, args.script())
+    if learner and method:
+        restored = learner(args, env)
+        checkpoint.restore(restored, state)
+        evaluation = method(restored)
+    else:
+        evaluation = evaluate(env, checkpoint.load_policy(args.evaluate).network.to(env.device))
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    write_evaluation(args, evaluation, saved.iteration)
+    write_evaluation(args, evaluation, state["iteration"])
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int) -> None:
@@ -265,11 +279,11 @@ class Run:
         self._pending.append(Entry(self.iteration, steps, names, numbers, scalars, begin, end, self._timings))
         self._start_clock(end)
 
-    def log_evaluation(self, evaluation: Evaluation, scalars: Mapping[str, float] | None = None) -> None:
-        """Take the evaluation of the iteration that was logged last, with further scalars of it."""
+    def log_evaluation(self, evaluation: Evaluation) -> None:
+        """Take the evaluation of the iteration that was logged last."""
         entry = self._pending[-1]
         entry.evaluation = evaluation
-        entry.scalars |= evaluation.scalars() | dict(scalars or {})
+        entry.scalars |= evaluation.scalars()
         self._evaluation = self.iteration, evaluation
 
     def message(self, text: str) -> None:
@@ -398,7 +412,7 @@ class Run:
             print(f"skipped {skipped} updates, contained {states} non-finite states and {gradients} gradients")
         if self._evaluation:
             iteration, evaluation = self._evaluation
-            print(f"deterministic policy, {args.eval_episodes} episodes, iteration {iteration}: {evaluation}")
+            print(f"evaluation of iteration {iteration}, {args.eval_episodes} episodes: {evaluation}")
         print(f"written to {path}")
         if self.iteration < args.iterations:
             print(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} goes on")

@@ -14,16 +14,13 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from diffsim.dynamics import REAL, Dynamics
+from diffsim.planning.dynamics import REAL, Dynamics
 
 ALPHAS = 0.5 ** torch.arange(11, dtype=REAL)  # step sizes of the line search
 
 
 class Cost(Protocol):
     """What is minimised, of R trajectories of T steps."""
-
-    @property
-    def system(self) -> Dynamics: ...
 
     def value(self, x: Tensor, u: Tensor) -> Tensor:
         """(R, A, T) cost of each step, of A candidates x (R, A, T + 1, nx), u (R, A, T, nu) for each trajectory."""
@@ -80,27 +77,6 @@ def backward_pass(f_z: Tensor, gradient: Tensor, hessian: Tensor, mu: Tensor) ->
     return Gains(k, K, Q_uu, d1, d2, ok)
 
 
-def quadratic_after_step(
-    system: Dynamics, loss: Callable[[Tensor, Tensor], Tensor], x: Tensor, u: Tensor, f_z: Tensor
-) -> tuple[Tensor, Tensor]:
-    """What Cost.quadratic wants, of a loss of (x_{t+1}, u_t): of each action and the state that it led to.
-
-    Its derivatives come back through f_z, the Jacobian of the step, without second derivatives of the dynamics.
-    """
-    nd, nz = f_z.shape[-2:]
-    d = u.new_zeros(*u.shape[:2], nz, requires_grad=True)
-    with torch.enable_grad():
-        total = loss(system.retract(x[:, 1:], d[..., :nd]), u + d[..., nd:]).sum()
-        (g,) = torch.autograd.grad(total, d, create_graph=True)
-        rows = [torch.autograd.grad(g[..., i].sum(), d, retain_graph=True)[0] for i in range(nz)]
-    # The joint Hessian is made positive, not its blocks: the cross terms would break them again.
-    values, vectors = torch.linalg.eigh(symmetric(torch.stack(rows, -2)))
-    h = (vectors * values.clamp(min=0.0).unsqueeze(-2)) @ vectors.mT
-    actions = torch.eye(nz, dtype=f_z.dtype, device=f_z.device)[nd:].expand(*u.shape[:2], -1, -1)
-    y_z = torch.cat((f_z, actions), -2)
-    return (y_z.mT @ g.detach().unsqueeze(-1)).squeeze(-1), y_z.mT @ h @ y_z
-
-
 class Plan(NamedTuple):
     """R trajectories."""
 
@@ -129,8 +105,46 @@ def step_jacobian(system: Dynamics, x: Tensor, u: Tensor) -> Tensor:
     return system.jacobians(*flat).view(*u.shape[:2], system.nd, -1)
 
 
+def line_search(
+    system: Dynamics, cost: Cost, x: Tensor, u: Tensor, total: Tensor, gains: Gains, moving: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The largest step that wins at least a hundredth of what the quadratic model promises, for each trajectory.
+
+    Args:
+        total: (R,) cost of the trajectories x (R, T + 1, nx), u (R, T, nu).
+        moving: (R,) which ones may change.
+
+    Returns:
+        x, u and total after the step, and its size (R,): 0 where no step was good enough and all is as before.
+    """
+    alphas = ALPHAS.to(x.device)
+    xs, us, finite = follow(system, x, u, gains, alphas)
+    totals = torch.where(finite.all(-1), cost.value(xs, us).sum(-1), math.inf)
+    expected = -(alphas * gains.d1[:, None] + alphas.square() * gains.d2[:, None])
+    good = torch.isfinite(totals) & (total[:, None] - totals > 1e-2 * expected) & (expected > 0) & moving[:, None]
+    accepted, choice = good.any(1), good.int().argmax(1)
+    pick = torch.arange(len(x), device=x.device), choice
+    x = torch.where(accepted[:, None, None], xs[pick], x)
+    u = torch.where(accepted[:, None, None], us[pick], u)
+    return x, u, torch.where(accepted, totals[pick], total), torch.where(accepted, alphas[choice], 0.0)
+
+
+def raise_mu(mu: Tensor, delta: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
+    """More regularisation for some: mu grows by delta, which grows itself each time in a row."""
+    delta = torch.where(where, (delta * 1.6).clamp(min=1.6), delta)
+    return torch.where(where, (mu * delta).clamp(min=1e-6), mu), delta
+
+
+def lower_mu(mu: Tensor, delta: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
+    """Less regularisation for some, in the same way; in the end none."""
+    delta = torch.where(where, (delta / 1.6).clamp(max=1 / 1.6), delta)
+    mu = torch.where(where, mu * delta, mu)
+    return torch.where(mu < 1e-8, 0.0, mu), delta
+
+
 @torch.no_grad()
 def ilqr(
+    system: Dynamics,
     cost: Cost,
     x: Tensor,
     u: Tensor,
@@ -141,44 +155,34 @@ def ilqr(
     """Optimises R trajectories side by side, each with its own regularisation.
 
     Args:
+        system: what moves.
         cost: what is minimised.
-        x: (R, T + 1, nx) trajectories of cost.system.
+        x: (R, T + 1, nx) trajectories of the system.
         u: (R, T, nu) their actions.
         iterations: at most so many.
         mu: initial regularisation.
         show: called as show(iteration, costs (R,)) after each iteration.
     """
-    system, alphas, R = cost.system, ALPHAS.to(x.device), len(x)
-    best = cost.value(x.unsqueeze(1), u.unsqueeze(1)).sum(-1).squeeze(1)
-    mus, delta = torch.full_like(best, mu), torch.ones_like(best)
-    moving, note, fresh = torch.ones_like(best, dtype=torch.bool), ["iterations"] * R, True
+    total = cost.value(x.unsqueeze(1), u.unsqueeze(1)).sum(-1).squeeze(1)
+    mus, delta = torch.full_like(total, mu), torch.ones_like(total)
+    moving, note, fresh = torch.ones_like(total, dtype=torch.bool), ["iterations"] * len(x), True
     for iteration in range(iterations):
         if fresh:
             f_z = step_jacobian(system, x, u)
             quadratic = cost.quadratic(x, u, f_z)
         gains = backward_pass(f_z, *quadratic, mus)
-        while not bool((gains.ok | ~moving).all()):  # raise mu where Q_uu was not positive definite
-            delta = torch.where(gains.ok, delta, (delta * 1.6).clamp(min=1.6))
-            mus = torch.where(gains.ok, mus, (mus * delta).clamp(min=1e-6))
+        while not bool((gains.ok | ~moving).all()):
+            mus, delta = raise_mu(mus, delta, ~gains.ok)
             moving = moving & (mus < 1e10)
             gains = backward_pass(f_z, *quadratic, mus)
-        xs, us, finite = follow(system, x, u, gains, alphas)
-        costs = torch.where(finite.all(-1), cost.value(xs, us).sum(-1), math.inf)
-        expected = -(alphas * gains.d1[:, None] + alphas.square() * gains.d2[:, None])
-        good = torch.isfinite(costs) & (best[:, None] - costs > 1e-2 * expected) & (expected > 0) & moving[:, None]
-        accepted, choice = good.any(1), good.int().argmax(1)  # the largest step size that is good
-        pick = torch.arange(R, device=x.device), choice
-        gain = torch.where(accepted, best - costs[pick], 0.0)
-        x = torch.where(accepted[:, None, None], xs[pick], x)
-        u = torch.where(accepted[:, None, None], us[pick], u)
-        best = torch.where(accepted, costs[pick], best)
-        raised = ~accepted | (alphas[choice] <= 0.01)
-        delta = torch.where(raised, (delta * 1.6).clamp(min=1.6), (delta / 1.6).clamp(max=1 / 1.6))
-        mus = torch.where(raised, (mus * delta).clamp(min=1e-6), mus * delta)
-        mus = torch.where(mus < 1e-8, 0.0, mus)
+        before = total
+        x, u, total, step = line_search(system, cost, x, u, total, gains, moving)
+        mus, delta = raise_mu(mus, delta, step <= 0.01)
+        mus, delta = lower_mu(mus, delta, step > 0.01)
+        scale = 1 + total.abs()
         ends = {
-            "gradient": gains.d1.abs() < 1e-7 * (1 + best.abs()),
-            "cost": accepted & (gain < 1e-6 * (1 + best.abs())) & (mus < 1e-4),
+            "gradient": gains.d1.abs() < 1e-7 * scale,
+            "cost": (step > 0) & (before - total < 1e-6 * scale) & (mus < 1e-4),
             "regularisation": mus > 1e10,
         }
         for name, mask in ends.items():
@@ -186,26 +190,8 @@ def ilqr(
                 note[r] = name
             moving = moving & ~mask
         if show:
-            show(iteration, best)
-        fresh = bool(accepted.any())
+            show(iteration, total)
+        fresh = bool((step > 0).any())
         if not bool(moving.any()):
             break
-    return Plan(x, u, best, note)
-
-
-def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Generator) -> Tensor:
-    """Where to start from: (count, steps, nu) nothing, then by turns a sinusoid per motor, a random walk, white noise.
-
-    dt is the control step in seconds; rng is on the CPU, as the result.
-    """
-    t = dt * torch.arange(steps, dtype=REAL).view(-1, 1)
-    result = [torch.zeros(steps, nu, dtype=REAL)]
-    for i in range(1, count):
-        amplitude = torch.rand(1, nu, generator=rng, dtype=REAL)
-        if i % 3 == 1:
-            frequency, phase = torch.rand(2, 1, nu, generator=rng, dtype=REAL)
-            result.append(amplitude * torch.sin(2 * math.pi * (2.0 * frequency * t + phase)))
-        else:
-            white = torch.randn(steps, nu, generator=rng, dtype=REAL)
-            result.append(amplitude * (white.cumsum(0) * dt**0.5 if i % 3 == 2 else 0.5 * white))
-    return torch.stack(result[:count])
+    return Plan(x, u, total, note)

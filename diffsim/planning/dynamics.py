@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -30,7 +28,7 @@ class Dynamics:
 
     Args:
         scene: the robot.
-        control_dt, integration, device, threads: see Simulator.
+        integration, control_dt, device, threads: see Simulator.
 
     Raises:
         ValueError: see Simulator.
@@ -42,14 +40,14 @@ class Dynamics:
     def __init__(
         self,
         scene: Scene,
-        control_dt: float,
         integration: Integration,
+        control_dt: float,
         device: str | torch.device = "cpu",
         threads: int | None = None,
     ) -> None:
         self.scene, self.control_dt, self.device = scene, control_dt, check_device(device)
         self.nq, self.nv, self.nu, self.nx, self.nd = scene.nq, scene.nv, scene.nu, scene.nq + scene.nv, 2 * scene.nv
-        self._options = dict(integration=integration, threads=threads)
+        self._integration, self._threads = integration, threads
         self._simulators: dict[int, Simulator] = {}
         self.steps = 0
         self.simulator(1)
@@ -64,8 +62,15 @@ class Dynamics:
 
     def simulator(self, num_envs: int) -> Simulator:
         if num_envs not in self._simulators:
-            options = dict(self._options, control_dt=self.control_dt, device=self.device, dtype=REAL)
-            self._simulators[num_envs] = Simulator(self.scene, num_envs, **options)  # type: ignore[arg-type]
+            self._simulators[num_envs] = Simulator(
+                self.scene,
+                num_envs,
+                self._integration,
+                self.control_dt,
+                device=self.device,
+                dtype=REAL,
+                threads=self._threads,
+            )
         return self._simulators[num_envs]
 
     def basis(self, x: Tensor) -> Tensor:
@@ -174,26 +179,3 @@ class Dynamics:
         differences = ((step(d) - step(-d)) / (2 * eps)).view(n, nz, self.nd).mT
         error = torch.linalg.matrix_norm(self.jacobians(x, u, following) - differences)
         return error / torch.linalg.matrix_norm(differences)
-
-    def load(self, path: Path, steps: int) -> tuple[Tensor, Tensor]:
-        """States (steps + 1, nx) and actions (steps, nu) of an .npz of qpos, qvel and action in [-1, 1], by steps.
-
-        Raises:
-            ValueError: no such file, not of this robot, shorter than steps, or not finite.
-        """
-        if not path.is_file():
-            raise ValueError(f"no such trajectory: {path}")
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {name: torch.tensor(data[name], dtype=REAL) for name in ("qpos", "qvel", "action")}
-        except Exception as error:  # np.load raises whatever broken bytes lead it to
-            raise ValueError(f"{path} is not an .npz with qpos, qvel and action") from error
-        for name, width, rows in (("qpos", self.nq, 1), ("qvel", self.nv, 1), ("action", self.nu, 0)):
-            array = arrays[name]
-            if array.ndim != 2 or array.shape[1] != width or len(array) < steps + rows:
-                size = f"at least ({steps + rows}, {width}) for {steps} steps"
-                raise ValueError(f"{path}: {name} has shape {tuple(array.shape)}, must be {size}")
-            if not bool(torch.isfinite(array).all()):
-                raise ValueError(f"{path}: {name} holds numbers that are not finite")
-        x = torch.cat((arrays["qpos"], arrays["qvel"]), -1)[: steps + 1].to(self.device)
-        return x, torch.atanh(arrays["action"].clamp(-0.995, 0.995))[:steps].to(self.device)
