@@ -22,6 +22,8 @@ from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,
+    Decay,
+    Finite,
     Fraction,
     ObsNormalizer,
     ParallelFlags,
@@ -69,13 +71,13 @@ class Args(ParallelFlags):
     """learning rate that it reaches, linearly, after the last iteration"""
     normalize_obs: bool = True
     """normalize observations by their running mean and variance (per task)"""
-    betas: tuple[Fraction, Fraction] = (0.7, 0.95)
+    betas: tuple[Decay, Decay] = (0.7, 0.95)
     """Adam's decay rates of the gradient's first and second moment"""
     max_grad_norm: Positive = 1.0
     """gradients are clipped to this norm"""
     gamma: Fraction = 0.99
     """discount factor"""
-    initial_log_std: float = -1.0
+    initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh"""
 
     def task_defaults(self) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,
+    Finite,
     Fraction,
     Natural,
     NonNegative,
@@ -35,6 +36,7 @@ from diffsim.training import (
     episode_metrics,
     evaluate,
     evaluate_checkpoint,
+    fail,
     moments,
     parse,
 )
@@ -93,7 +95,7 @@ class Args(ParallelFlags):
     """weight of the policy's entropy, which keeps its noise from vanishing (per task)"""
     bound_coef: NonNegative = 1e-4
     """weight of the squared excess of the policy's mean beyond 1.1, where the action is clipped"""
-    initial_log_std: float = 0.0
+    initial_log_std: Finite = 0.0
     """initial log standard deviation of the policy"""
     eval_every: Natural = 500
     """evaluate the deterministic policy every this many iterations (0: only at the end)"""
@@ -103,6 +105,12 @@ class Args(ParallelFlags):
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
         return values
+
+    def check(self) -> None:
+        super().check()
+        least, largest = self.lr_bounds
+        if least > largest:
+            fail(f"--lr-bounds {least} {largest} are the wrong way round")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

@@ -24,6 +24,8 @@ from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,
+    Decay,
+    Finite,
     Fraction,
     ObsNormalizer,
     ParallelFlags,
@@ -55,7 +57,7 @@ PER_TASK = {
 class Args(ParallelFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
-    FIXED = (*ParallelFlags.FIXED, "actor_hidden", "critic_hidden", "deterministic_policy", "no_critic")
+    FIXED = (*ParallelFlags.FIXED, "actor_hidden", "critic_hidden", "deterministic_policy", "critic")
 
     horizon: Count = 32
     """control steps h of a window (1/60 s each)"""
@@ -63,8 +65,8 @@ class Args(ParallelFlags):
     """one setting for all tasks (Table 5) instead of the per-task ones"""
     deterministic_policy: bool = False
     """train a policy without noise (A.4.4)"""
-    no_critic: bool = False
-    """the ablation of section 4.3: no value stands for what comes after the window"""
+    critic: bool = True
+    """a value stands for what comes after the window; without it, the ablation of section 4.3"""
     actor_hidden: Widths = (256, 128)
     """units of the actor's hidden layers (per task)"""
     critic_hidden: Widths = (128, 128)
@@ -75,7 +77,7 @@ class Args(ParallelFlags):
     """initial learning rate of the critic (per task)"""
     final_lr: Positive = 1e-5
     """learning rate that both reach, linearly, after the last iteration"""
-    betas: tuple[Fraction, Fraction] = (0.7, 0.95)
+    betas: tuple[Decay, Decay] = (0.7, 0.95)
     """Adam's decay rates of the gradient's first and second moment"""
     max_grad_norm: Positive = 1.0
     """gradients of actor and critic are clipped to this norm"""
@@ -89,7 +91,7 @@ class Args(ParallelFlags):
     """passes over a window's samples to fit the critic"""
     critic_minibatches: Count = 4
     """minibatches of a pass, contiguous in time"""
-    initial_log_std: float = -1.0
+    initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh"""
 
     def task_defaults(self) -> dict[str, Any]:
@@ -206,7 +208,7 @@ class SHAC:
         """Fit the critic to the window's TD(lambda) returns (Eq. 6), and let the target critic follow."""
         args = self.args
         losses = [torch.zeros_like(self.critic_optimizer.skipped)]
-        for _ in range(0 if args.no_critic else args.critic_iterations):
+        for _ in range(args.critic_iterations if args.critic else 0):
             losses = []
             batches = self.obs.chunk(args.critic_minibatches), self.value.chunk(args.critic_minibatches)
             for obs, value in zip(*batches, strict=True):
@@ -220,7 +222,7 @@ class SHAC:
 
     def next_values(self, rollout: Rollout) -> Tensor:
         """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
-        if self.args.no_critic:
+        if not self.args.critic:
             return torch.zeros_like(rollout.reward)
         values = self.target(self.actor.normalizer(rollout.next_obs)).squeeze(-1)
         return torch.where(rollout.terminated, torch.zeros_like(values), values)

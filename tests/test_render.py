@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import diffsim.tasks
-from diffsim.mjcf import load_scene
-from diffsim.render import render_frames, write_video
+from diffsim.render import render_frames, save_video
+from diffsim.scene import load_scene
 
 ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
 HOPPER, MUSCLES = ASSETS / "hopper.xml", ASSETS / "humanoid_mtu.xml"
@@ -61,9 +61,9 @@ def test_mistakes_are_named() -> None:
     with pytest.raises(ValueError, match="no camera 'side' in this scene; it has: track"):
         render_frames(HOPPER, np.zeros((1, 6)), camera="side")
     with pytest.raises(ValueError, match="'.avi'"):
-        write_video("a.avi", np.zeros((1, 4, 4, 3), np.uint8))
+        save_video("a.avi", np.zeros((1, 4, 4, 3), np.uint8))
     with pytest.raises(ValueError, match="at least one frame"):
-        write_video("a.gif", np.zeros((0, 4, 4, 3), np.uint8))
+        save_video("a.gif", np.zeros((0, 4, 4, 3), np.uint8))
 
 
 def test_without_a_library_of_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,13 +79,13 @@ def test_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     imageio = pytest.importorskip("imageio.v3")
     frames = np.zeros((60, 16, 16, 3), np.uint8)
     frames += np.arange(0, 240, 4, dtype=np.uint8)[:, None, None, None]
-    path = write_video(tmp_path / "new" / "video.gif", frames, fps=60.0)
+    path = save_video(tmp_path / "new" / "video.gif", frames, fps=60.0)
     read = imageio.imread(path)
     assert len(read) == 30  # every second frame
     np.testing.assert_array_equal(read[3, 0, 0], frames[6, 0, 0])
     assert imageio.immeta(path)["duration"] == pytest.approx(1000 / 30, abs=5)  # ms
     monkeypatch.setattr("diffsim.render.find_spec", lambda name: None if name == "imageio_ffmpeg" else object())
-    assert write_video(tmp_path / "video.mp4", frames) == tmp_path / "video.gif"
+    assert save_video(tmp_path / "video.mp4", frames) == tmp_path / "video.gif"
     monkeypatch.setattr("diffsim.render.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match="pip install"):
-        write_video(tmp_path / "video.mp4", frames)
+        save_video(tmp_path / "video.mp4", frames)

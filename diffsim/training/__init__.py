@@ -11,6 +11,8 @@ from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import (
     Count,
+    Decay,
+    Finite,
     Flags,
     Fraction,
     Natural,
@@ -28,7 +30,9 @@ from diffsim.training.run import Run, episode_metrics, evaluate_checkpoint
 __all__ = [
     "ClippedAdam",
     "Count",
+    "Decay",
     "Evaluation",
+    "Finite",
     "Flags",
     "Fraction",
     "Learner",

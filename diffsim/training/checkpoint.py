@@ -33,7 +33,7 @@ LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
 class Stateful(Protocol):
     def state_dict(self) -> dict[str, Any]: ...
 
-    def load_state_dict(self, state: Any) -> Any: ...
+    def load_state_dict(self, state: dict[str, Any], /) -> object: ...
 
 
 class Learner(Protocol):
@@ -85,16 +85,17 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
         fail(f"no such checkpoint: {path}")
     try:
         with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums that it writes
-            if archive.testzip() is None:
-                state = torch.load(path, map_location="cpu", weights_only=True)
-                if state["format"] != FORMAT:
-                    fail(f"{path} has format {state['format']} of another version of diffsim; this one reads {FORMAT}")
-                if script not in (None, state["script"]):
-                    fail(f"{path} is a checkpoint of {state['script']}.py, not of {script}.py")
-                return state
+            if archive.testzip() is not None:
+                raise ValueError
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        form = state["format"]
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
-        pass
-    fail(f"{path} is not a whole checkpoint")
+        fail(f"{path} is not a whole checkpoint" + (f" of {script}.py" if script else ""))
+    if form != FORMAT:
+        fail(f"{path} is a checkpoint of format {form}, and this version reads format {FORMAT}")
+    if script not in (None, state["script"]):
+        fail(f"{path} is a checkpoint of {state['script']}.py, not of {script}.py")
+    return state
 
 
 def load_policy(path: Path) -> SavedPolicy:

@@ -10,8 +10,9 @@ import math
 import sys
 import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -24,28 +25,24 @@ from diffsim.training.errors import fail
 
 @dataclass(frozen=True)
 class Range:
-    """What a number on the command line may be."""
+    """What a finite number on the command line may be."""
 
-    least: float = -math.inf
-    most: float = math.inf
-    positive: bool = False
+    words: str
+    holds: Callable[[float], bool]
 
     def complaint(self, value: float) -> str | None:
         if not math.isfinite(value):
             return f"must be finite, not {value}"
-        if self.positive and value <= 0:
-            return f"must be positive, not {value}"
-        if value < self.least or value > self.most:
-            bound = f"at least {self.least:g}" if self.most == math.inf else f"in [{self.least:g}, {self.most:g}]"
-            return f"must be {bound}, not {value}"
-        return None
+        return None if self.holds(value) else f"must be {self.words}, not {value}"
 
 
-Count = Annotated[int, Range(1)]
-Natural = Annotated[int, Range(0)]
-Positive = Annotated[float, Range(positive=True)]
-NonNegative = Annotated[float, Range(0)]
-Fraction = Annotated[float, Range(0, 1)]
+Count = Annotated[int, Range("at least 1", lambda value: value >= 1)]
+Natural = Annotated[int, Range("at least 0", lambda value: value >= 0)]
+Finite = Annotated[float, Range("finite", math.isfinite)]
+Positive = Annotated[float, Range("positive", lambda value: value > 0)]
+NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
+Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]
+Decay = Annotated[float, Range("in [0, 1)", lambda value: 0 <= value < 1)]
 Widths = tuple[Count, ...]
 
 
@@ -168,8 +165,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args.device = distributed.choose_device(args.device)
         defaults = dataclasses.replace(kind(), **_integration(args), **args.task_defaults())
         args = _cli(kind, argv, defaults)
-    args.device = distributed.choose_device(args.device)
-    _check_ranges(args)
+        args.device = distributed.choose_device(args.device)
+    check_ranges(args)
     args.check()
     if args.run_dir is None:
         name = f"{args.env}__{args.script()}__{args.seed}__{int(time.time())}"
@@ -187,12 +184,17 @@ def _integration(args: Flags) -> dict[str, Any]:
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:
     """The arguments of --resume or --evaluate: the checkpoint's, then the command line's."""
     saved = checkpoint.load(path, kind.script())
-    defaults = kind(**saved["args"])
+    try:
+        defaults = kind(**saved["args"])
+    except TypeError:
+        unknown = ", ".join(flag(name) for name in saved["args"] if not hasattr(kind, name))
+        fail(f"{path} was written by a {kind.script()}.py with other flags: {unknown}")
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained
     if any(word.partition("=")[0] == "--accuracy" for word in argv):  # a preset replaces the saved numbers
         defaults = dataclasses.replace(defaults, **_integration(dataclasses.replace(defaults, accuracy=given.accuracy)))
     args = _cli(kind, argv, defaults)
+    args.device = distributed.choose_device(args.device)
     for name in kind.FIXED:
         if getattr(args, name) != getattr(defaults, name):
             fail(f"{path} has {flag(name)} {getattr(defaults, name)}, not {getattr(args, name)}")
@@ -209,23 +211,25 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
     """One pass of tyro, which shows what each class of the hierarchy declares as a group of its own."""
-    groups, seen = dict[str, Any](), set[str]()
+    fields, groups, seen = list[tuple[str, Any]](), list[Any](), set[str]()
     for owner in (base for base in kind.__mro__ if dataclasses.is_dataclass(base)):
         hints, texts = get_type_hints(owner, include_extras=True), _help_texts(owner)
         own = [name for name in texts if name not in seen]
         seen.update(own)
         if own:
-            fields = [(name, Annotated[hints[name], tyro.conf.arg(help=texts[name])]) for name in own]
-            group = dataclasses.make_dataclass(owner.__name__, fields)
+            flags = [(name, Annotated[hints[name], tyro.conf.arg(help=texts[name])]) for name in own]
+            group = dataclasses.make_dataclass(owner.__name__, flags, namespace={"__doc__": owner.__doc__})
             title = kind.script() if owner is kind else owner.__name__.removesuffix("Flags").lower()
-            groups[title] = group(**{name: getattr(defaults, name) for name in own})
-    every = dataclasses.make_dataclass(kind.__name__, [(title, type(group)) for title, group in groups.items()])
+            fields.append((f"group{len(groups)}", Annotated[group, tyro.conf.arg(name=title)]))
+            groups.append(group(**{name: getattr(defaults, name) for name in own}))
+    every = dataclasses.make_dataclass(kind.__name__, fields)
     description = sys.modules[kind.__module__].__doc__
-    config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-    parsed = tyro.cli(every, args=argv, description=description, default=every(**groups), config=config)
-    return kind(**{name: value for title in groups for name, value in vars(getattr(parsed, title)).items()})
+    config = (tyro.conf.OmitArgPrefixes,)
+    parsed = tyro.cli(every, args=argv, description=description, default=every(*groups), config=config)
+    return kind(**{name: value for group in vars(parsed).values() for name, value in vars(group).items()})
 
 
+@cache
 def _help_texts(owner: type) -> dict[str, str]:
     """The string below each field that a class itself declares."""
     (node,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
@@ -236,7 +240,8 @@ def _help_texts(owner: type) -> dict[str, str]:
     return texts
 
 
-def _check_ranges(args: Flags) -> None:
+def check_ranges(args: object) -> None:
+    """End the script where a number of a dataclass of flags is not in the range that its type asks for."""
     for name, hint in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
         for number, allowed in _ranges(hint, value):

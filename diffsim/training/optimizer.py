@@ -63,10 +63,11 @@ class ClippedAdam:
         return norm
 
     def state_dict(self) -> dict[str, Any]:
-        return {"adam": self.adam.state_dict(), "lr": self.lr, "skipped": self.skipped}
+        """The moments, the learning rate and the count; not what the constructor is given."""
+        return {"adam": self.adam.state_dict()["state"], "lr": self.lr, "skipped": self.skipped}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.adam.load_state_dict(state["adam"])
-        self.adam.param_groups[0]["lr"] = self.lr
+        self.adam.load_state_dict(self.adam.state_dict() | {"state": state["adam"]})
+        self.adam.param_groups[0]["lr"] = self.lr  # not a copy of it
         self.lr.copy_(state["lr"])
         self.skipped.copy_(state["skipped"])

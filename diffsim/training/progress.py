@@ -52,7 +52,8 @@ class ProgressFile:
         if iteration > 0 and path.is_file():
             with path.open(newline="") as file:
                 reader = csv.DictReader(file)
-                rows = [row for row in reader if int(row["iteration"]) <= iteration]
+                # A crash may leave rows of later iterations, and half of a line.
+                rows = [row for row in reader if None not in row.values() and int(row["iteration"]) <= iteration]
                 self.columns = list(reader.fieldnames or self.columns)
         self._rewrite(rows)
 

@@ -104,6 +104,15 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> Dif
         fail(error)
 
 
+def check_writable(directory: Path) -> None:
+    """End the script if nothing can be written to a directory, which need not exist; leaves nothing behind."""
+    try:
+        existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        fail(f"cannot write to run directory {directory}: {error.strerror}")
+
+
 def evaluate_checkpoint(
     args: Args,
     learner: Callable[[Args, DiffEnv], L] | None = None,
@@ -115,7 +124,8 @@ def evaluate_checkpoint(
         args: the script's arguments.
         learner, method: how a restored learner is evaluated, if not by `evaluate` of its policy.
     """
-    assert args.evaluate
+    assert args.evaluate and args.run_dir
+    check_writable(args.run_dir)
     torch.set_num_threads(1)
     env, state = make_env(args, args.eval_episodes), checkpoint.load(args.evaluate, args.script())
     if learner and method:
@@ -340,10 +350,7 @@ class Run:
         existing = path / "checkpoint.pt"
         if existing.exists() and (args.resume is None or not args.resume.samefile(existing)):
             fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
-        try:
-            tempfile.TemporaryFile(dir=next(p for p in (path, *path.absolute().parents) if p.exists())).close()
-        except OSError as error:
-            fail(f"cannot write to run directory {path}: {error.strerror}")
+        check_writable(path)
         if args.track:
             try:
                 import wandb  # noqa: F401
