@@ -37,7 +37,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim.planning import REAL, ilqr
-from diffsim.training import checkpoint, fail, load_learner, parse_penalty
+from diffsim.training import checkpoint, fail, load_policy, parse_penalty
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT))
@@ -121,7 +121,7 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
         fail("--record needs --actor, a checkpoint of any script")
     env = environment(actor, stochastic_init=False, early_termination=False)
     env.episode_length = steps + 1  # no reset within the recording
-    policy, (obs, _) = load_learner(actor, env).policy, env.reset()
+    policy, (obs, _) = load_policy(actor).network, env.reset()
     states, actions = [(env.qpos, env.qvel)], []
     for _ in range(steps):
         actions.append(policy(obs).clamp(-1, 1))
@@ -185,14 +185,15 @@ def time_ilqr(env: str = "hopper", horizon: int = 500, repeats: int = 5) -> list
 
 
 def load_search(path: Path) -> gps.Search:
-    search = load_learner(path, environment(path))
-    assert isinstance(search, gps.Search)
+    state = checkpoint.load(path, "gps")
+    search = gps.Search(gps.Args(**state["args"]), environment(path))
+    checkpoint.restore(search, state)
     return search
 
 
 def controllers(search: gps.Search) -> dict[str, Act]:
     """The policy's mean; the DDP controller; and the DDP controller of the nearest state (TBDP), in scaled tangents."""
-    system, policy, guide = search.system, search.policy, search.guides[0]
+    system, policy, guide = search.system, search.network, search.guides[0]
     path = guide.x[:-1]
     scale = system.difference(path, path[:1]).std(0).clamp(min=1e-3)
     if search.args.env != "cartpole":
@@ -241,7 +242,7 @@ def generalisation(search: gps.Search, count: int) -> list[Row]:
 def paths(search: gps.Search, count: int = 10) -> list[Row]:
     """Where plan, guiding samples and the noisy policy's trajectories go: the first two coordinates."""
     guides = search.guides[0].sample(search.system, search.noise(count))[0]
-    policy = search.roll_out(search.policy.theta, search.noise(count)).x
+    policy = search.roll_out(search.network.theta, search.noise(count)).x
     rows = []
     for name, x in (("plan", search.guides[0].x[None]), ("guides", guides), ("policy", policy)):
         for i, trajectory in enumerate(x[..., :2].tolist()):

@@ -19,7 +19,8 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.planning import LinearGaussian
-from diffsim.training import evaluate, load_learner
+from diffsim.training import evaluate, load_policy
+from diffsim.training.checkpoint import load, restore
 from diffsim.training.lbfgs import maximise
 
 SMALL = (
@@ -45,7 +46,7 @@ def make_search(env: str, flags: str = "") -> gps.Search:
 
 
 def a_policy(rng: np.random.Generator, env: str = "cartpole") -> tuple[gps.Policy, Tensor]:
-    policy = make_search(env, "--hidden 5").policy
+    policy = make_search(env, "--hidden 5").network
     nu, inputs = len(policy.sigma), len(policy.observed)
     policy.obs_mean, policy.obs_std = normal(rng, inputs), 1 + normal(rng, inputs).abs()
     policy.u_std, policy.sigma = torch.full((nu,), 2.0).double(), torch.full((nu,), 0.5).double()
@@ -178,9 +179,10 @@ def checkpoint(trained: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def search(trained: Path) -> gps.Search:
-    learner = load_learner(trained / "checkpoint.pt", environment("cartpole", 1))
-    assert isinstance(learner, gps.Search)
-    return learner
+    state = load(trained / "checkpoint.pt", "gps")
+    search = gps.Search(gps.Args(**state["args"]), environment("cartpole", 1))
+    restore(search, state)
+    return search
 
 
 @pytest.fixture(scope="module")
@@ -207,19 +209,20 @@ def test_reward_of_the_paper() -> None:
 
 
 def test_policy_has_the_papers_1256_parameters() -> None:
-    policy = make_search("walker").policy  # 18 inputs in the paper, 17 here
+    policy = make_search("walker").network  # 18 inputs in the paper, 17 here
     assert len(policy.initial(torch.Generator())) == 1256 - 50
 
 
 def test_policy_does_not_look_at_the_action_before(rng: np.random.Generator) -> None:
     policy, theta = a_policy(rng, "ant")
-    obs = torch.tensor(rng.normal(size=(4, 37)), dtype=torch.float32)
+    policy.obs_mean[29:] = 0.0  # as in all that it is fitted to
+    obs = normal(rng, 4, 37)
     other = obs.clone()
     other[:, 29:] += 1.0
-    action = policy(obs)
-    assert torch.equal(policy(other), action) and action.dtype == torch.float32
+    network = policy.deterministic()
+    assert torch.equal(network(other), network(obs))
     obs[:, 29:] = 0.0
-    torch.testing.assert_close(action, policy.mean(theta, obs.double()).tanh().float())
+    torch.testing.assert_close(network(obs), policy.mean(theta, obs).tanh())
 
 
 @pytest.mark.parametrize("bounds, start", [((1e-6, 1e-2), 1e-4), (None, 0.0)])
@@ -228,8 +231,8 @@ def test_schedule_of_the_regulariser(
 ) -> None:
     """Lines 10 to 16: a better policy is kept, and w_r falls; otherwise w_r grows, and the best is sampled again."""
     search.args.regularizer_bounds = bounds or (1e-6, 1e-2)
-    search.args.variant, search.w_r, best = "full" if bounds else "unregularized", start, search.policy.theta
-    monkeypatch.setattr(search, "optimise", lambda S: (search.policy.theta + 1e-3, {}))
+    search.args.variant, search.w_r, best = "full" if bounds else "unregularized", start, search.network.theta
+    monkeypatch.setattr(search, "optimise", lambda S: (search.network.theta + 1e-3, {}))
     seen = []
     for better in (True, True, True, False, False, False, False, False, False, True):
         monkeypatch.setattr(search, "estimate", lambda theta, active, better=better: (better, {}))
@@ -237,7 +240,7 @@ def test_schedule_of_the_regulariser(
         assert metrics["gps/accepted"] == better
         assert metrics["gps/regularizer"] == pytest.approx(seen[-1] if seen else start)
         best = best + 1e-3 if better else best
-        torch.testing.assert_close(search.policy.theta, best)
+        torch.testing.assert_close(search.network.theta, best)
         torch.testing.assert_close(search.generators[search.best], best)
         seen.append(search.w_r)
     assert drawn == search.control_steps
@@ -288,7 +291,7 @@ def test_pretraining_learns_from_the_states_that_a_network_visited(
         starts.append(theta)
         return theta + 1.0
 
-    monkeypatch.setattr(search.policy, "fit", fit)
+    monkeypatch.setattr(search.network, "fit", fit)
     monkeypatch.setattr(search, "label", lambda guide, lessons, samples: (samples.obs[:, 0], samples.u[:, 0]))
     search.guide_return, search.args.gate = (0.0, 0.0), 3  # out of reach
     search.pretrain(*search.wide_samples(), said.append)
@@ -299,7 +302,7 @@ def test_pretraining_learns_from_the_states_that_a_network_visited(
 
 def test_active_set(search: gps.Search) -> None:
     """All guiding samples, the newest of the best policy, and a planted sample of high weight."""
-    other = search.policy.theta + 0.01
+    other = search.network.theta + 0.01
     planted = int(search.append(search.draw(other, len(search.generators)), other)[-1])
     S = search.set
     log_q = S.log_q.clone()
@@ -318,7 +321,7 @@ def test_densities_of_the_set_are_those_of_its_generators(search: gps.Search) ->
         torch.testing.assert_close(S.log_q[:, j], search.log_density(generator, S), rtol=1e-9, atol=1e-9)
     own = S.log_q[torch.arange(len(S.u)), S.source, -1]
     assert (own >= S.log_q[:, :, -1].median(1).values).double().mean() > 0.9
-    torch.testing.assert_close(search.policy.theta, search.generators[search.best])
+    torch.testing.assert_close(search.network.theta, search.generators[search.best])
 
 
 # The script
@@ -359,13 +362,15 @@ def test_evaluation(trained: Path, rows: list[dict[str, str]], tmp_path: Path, s
     assert gps.evaluate(search).qpos.shape == (30, 3, 2)
 
 
-def test_the_policy_acts_in_environments_as_it_does_in_the_search(trained: Path) -> None:
+def test_the_policy_acts_in_environments_as_it_does_in_the_search(trained: Path, search: gps.Search) -> None:
     env = diffsim.make("cartpole", 2, horizon=1, dtype=torch.float64, stochastic_init=False)
     env.episode_length = 30
-    learner = load_learner(trained / "checkpoint.pt", env)
-    assert isinstance(learner, gps.Search)
-    S = learner.roll_out(learner.policy.theta, 0 * learner.noise(1))
-    torch.testing.assert_close(evaluate(env, learner.policy).returns, S.native.sum(1).expand(2))
+    S = search.roll_out(search.network.theta, 0 * search.noise(1))
+    returns = S.native.sum(1).expand(2)
+    torch.testing.assert_close(evaluate(env, search.policy).returns, returns)
+    torch.testing.assert_close(
+        evaluate(env, load_policy(trained / "checkpoint.pt").network.double()).returns, returns, rtol=1e-4, atol=0
+    )
 
 
 def test_an_evaluation_ends_where_the_robot_falls() -> None:
@@ -373,7 +378,7 @@ def test_an_evaluation_ends_where_the_robot_falls() -> None:
     search = make_search("hopper", "--horizon 400 --eval-episodes 2 --hidden 1")
     nothing = [torch.zeros(0).double()] * 3
     search.guides = [LinearGaussian(search.system.start(), *nothing, *nothing[:2])]
-    search.policy.u_std, search.policy.sigma = torch.zeros(3).double(), torch.full((3,), 0.1).double()
+    search.network.u_std, search.network.sigma = torch.zeros(3).double(), torch.full((3,), 0.1).double()
     evaluation = gps.evaluate(search)
     env = diffsim.make("hopper", 2, horizon=1, dtype=torch.float64, stochastic_init=False)
     noise = search.noise(3, torch.Generator().manual_seed(gps.EVALUATION_SEED))[1:]

@@ -28,4 +28,4 @@ def test_steps_observations_and_rewards_are_the_environments(name: str) -> None:
 def test_robot_and_integration_are_the_environments() -> None:
     env = diffsim.make("hopper", 1, accuracy="fast", substeps=4, penalty={"k_n": 1e5})
     system = System(env, threads=1)
-    assert system.scene.k_n == 1e5 and system.simulator(1).substeps == 4
+    assert system.scene.k_n == 1e5 and system.simulator(1).integration.substeps == 4
