@@ -671,10 +671,10 @@ def evaluate(search: Search) -> Evaluation:
     returns, lengths, x = (S.native * alive).sum(1), alive.sum(1), S.x[..., 0]
     distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
     speed = (distance / (lengths * system.control_dt)).mean().item() if travels(system.scene) else None
-    qpos = S.x[:, :-1, : system.nq].transpose(0, 1)
+    qpos, action = S.x[:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
     others = dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
     others |= dict(without_noise=without_noise, plan=search.plan_return, guides=search.guide_return[0])
-    return Evaluation(returns, lengths, speed, qpos, system.scene, system.control_dt, others)
+    return Evaluation(returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
 
 
 def train(args: Args) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 
 import gymnasium
 import torch
-import warp as wp
 
+from diffsim import startup  # first: it starts Warp and MuJoCo
 from diffsim.env import DiffEnv, NumpyEnv
 from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
@@ -18,8 +18,6 @@ from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy
 
 __all__ = ["TASKS", "DiffEnv", "Integration", "Scene", "SceneError", "Simulator", "load_scene", "make"]
-
-wp.config.log_level = wp.LOG_WARNING
 
 
 def make(
@@ -48,11 +46,12 @@ def make(
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
 
     Raises:
-        ValueError: an argument out of range, with what is allowed.
+        ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
     """
     if name not in TASKS:
         raise ValueError(f"unknown task {name!r}; choose from {', '.join(TASKS)}")
     device = check_device(device)
+    startup.check_kernel_cache()
     task = TASKS[name](device, dtype)
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
     return DiffEnv(

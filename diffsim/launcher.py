@@ -10,6 +10,7 @@ from typing import Any
 import torch
 import warp as wp
 
+from diffsim import startup
 from diffsim.integration import Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
@@ -61,6 +62,7 @@ class Launcher:
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self.seconds = {"forward": 0.0, "backward": 0.0}
         self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
+        startup.announce_compilation(self._kernels.values(), scene.name)
         self._model = model_of(scene, division, real, str(device))
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)

@@ -6,7 +6,7 @@ The physics knows nothing of this package.
 from __future__ import annotations
 
 from diffsim.training import distributed
-from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, load_policy
+from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, export_policy, load_policy
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import (
@@ -25,7 +25,7 @@ from diffsim.training.flags import (
 )
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.run import Run, episode_metrics, evaluate_checkpoint
+from diffsim.training.run import Run, episode_metrics, evaluate_checkpoint, make_policy_env
 
 __all__ = [
     "ClippedAdam",
@@ -49,8 +49,10 @@ __all__ = [
     "episode_metrics",
     "evaluate",
     "evaluate_checkpoint",
+    "export_policy",
     "fail",
     "load_policy",
+    "make_policy_env",
     "moments",
     "parse",
     "parse_penalty",

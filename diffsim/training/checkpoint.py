@@ -106,6 +106,12 @@ def load_policy(path: Path) -> SavedPolicy:
     return SavedPolicy(network, state["script"], state["args"], state["iteration"])
 
 
+def export_policy(path: Path, output: Path) -> None:
+    """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB."""
+    state = load(path)
+    torch.save({name: state[name] for name in ("format", "script", "args", "iteration", "policy")}, output)
+
+
 def restore(learner: Learner, state: Mapping[str, Any]) -> None:
     """Load the weights and statistics of a checkpoint into a learner of the same sizes."""
     for name, module in learner.modules.items():

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim import render
@@ -27,6 +29,7 @@ class Evaluation:
         lengths: (n,) control steps.
         speed: mean forward speed, m/s; None for a robot that does not travel.
         qpos: (T, n, nq) before each step; valid up to an episode's length.
+        action: (T, n, nu) of each step.
         scene, control_dt: what the episodes are of, to draw them.
         others: what else a script measured, by name.
     """
@@ -35,6 +38,7 @@ class Evaluation:
     lengths: Tensor
     speed: float | None
     qpos: Tensor
+    action: Tensor
     scene: Scene
     control_dt: float
     others: dict[str, float] = field(default_factory=dict)
@@ -69,16 +73,20 @@ class Evaluation:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(values, indent=2, default=str) + "\n")
 
+    def median_episode(self, seconds: float = render.VIDEO_SECONDS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """qpos (T, nq) and action (T, nu) of the first seconds of the episode of median return."""
+        episode = self.returns.argsort()[(len(self.returns) - 1) // 2]
+        steps = min(int(self.lengths[episode]), max(1, round(seconds / self.control_dt)))
+        return self.qpos[:steps, episode].cpu().numpy(), self.action[:steps, episode].cpu().numpy()
+
     def save_video(self, path: Path) -> Path:
-        """Film the episode of median return, every other control step; returns the file written, an mp4 or a gif.
+        """Film the first 10 s of the episode of median return, as .mp4 or .gif; returns the file.
 
         Raises:
-            ImportError, OSError, RuntimeError: what is missing to draw or to write, see render.py.
+            OSError, RuntimeError: what is missing to draw or to write, see render.film.
         """
-        episode = self.returns.argsort()[(len(self.returns) - 1) // 2]
-        qpos = self.qpos[: self.lengths[episode] : 2, episode].cpu().numpy()
-        frames = render.render_frames(self.scene, qpos, width=480, height=360)
-        return render.save_video(path, frames, fps=0.5 / self.control_dt)
+        qpos, action = self.median_episode()
+        return render.film(path, self.scene, qpos, self.control_dt, action)
 
 
 def travels(scene: Scene) -> bool:
@@ -87,14 +95,16 @@ def travels(scene: Scene) -> bool:
 
 
 @torch.no_grad()
-def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> Evaluation:
+def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED) -> Evaluation:
     """The first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu)."""
-    obs, _ = env.reset(seed=SEED)
+    obs, _ = env.reset(seed=seed)
     alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    returns, lengths, qpos = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long), []
+    returns, lengths = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long)
+    qpos, actions = [], []
     while alive.any():
         qpos.append(env.qpos)
-        obs, reward, terminated, truncated, _ = env.step(policy(obs))
+        actions.append(policy(obs))
+        obs, reward, terminated, truncated, _ = env.step(actions[-1])
         returns += torch.where(alive, reward, torch.zeros_like(reward))
         lengths += alive
         alive &= ~(terminated | truncated)
@@ -103,4 +113,4 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> Evaluation:
     if travels(env.scene):
         distance = path[..., 0].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, 0]
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
-    return Evaluation(returns, lengths, speed, path, env.scene, env.control_dt)
+    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt)

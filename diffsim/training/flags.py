@@ -18,6 +18,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 
 import tyro
 
+from diffsim import render
 from diffsim.tasks import TASKS
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
@@ -91,7 +92,7 @@ class RunFlags:
     evaluate: Path | None = None
     """checkpoint to evaluate without training, e.g. with other --substeps; writes evaluation.json to --run-dir"""
     capture_video: bool = False
-    """write a video of the last evaluation's median episode"""
+    """write video.mp4: the first 10 s of the last evaluation's median episode"""
     track: bool = False
     """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
@@ -168,6 +169,12 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args.device = distributed.choose_device(args.device)
     check_ranges(args)
     args.check()
+    if args.capture_video and distributed.rank() == 0:
+        try:
+            render.check_opengl()
+            render.check_video("video.mp4")
+        except RuntimeError as error:
+            fail(f"--capture-video: {error}")
     if args.run_dir is None:
         name = f"{args.env}__{args.script()}__{args.seed}__{int(time.time())}"
         args.run_dir = path.parent if path else Path("runs") / name
@@ -184,6 +191,8 @@ def _integration(args: Flags) -> dict[str, Any]:
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:
     """The arguments of --resume or --evaluate: the checkpoint's, then the command line's."""
     saved = checkpoint.load(path, kind.script())
+    if given.resume and "modules" not in saved:
+        fail(f"{path} holds a policy alone, which can be evaluated but not resumed")
     try:
         defaults = kind(**saved["args"])
     except TypeError:

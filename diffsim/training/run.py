@@ -22,7 +22,7 @@ import diffsim
 from diffsim.env import DiffEnv
 from diffsim.simulator import check_device
 from diffsim.training import checkpoint, distributed, graph
-from diffsim.training.checkpoint import Learner
+from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import Args, Flags, ParallelFlags, parse_penalty
@@ -104,6 +104,13 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> Dif
         fail(error)
 
 
+def make_policy_env(saved: SavedPolicy, num_envs: int, **changes: Any) -> DiffEnv:
+    """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
+    names = {field.name for field in dataclasses.fields(Flags)} & saved.args.keys()
+    args = Flags(**{name: saved.args[name] for name in names} | {"device": "cpu", "threads": 0} | changes)
+    return make_env(args, num_envs)
+
+
 def check_writable(directory: Path) -> None:
     """End the script if nothing can be written to a directory, which need not exist; leaves nothing behind."""
     try:
@@ -147,7 +154,7 @@ def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int) -> Non
     if args.capture_video:
         try:
             print(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
-        except (ImportError, OSError, RuntimeError) as error:
+        except (OSError, RuntimeError) as error:
             fail(error)
 
 
