@@ -8,16 +8,30 @@ from typing import Any
 
 import gymnasium
 import torch
+from gymnasium.vector import AutoresetMode
 
 from diffsim import startup  # first: it starts Warp and MuJoCo
-from diffsim.env import DiffEnv, NumpyEnv
+from diffsim.env import DiffEnv
 from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
+from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.scene import Scene, SceneError
+from diffsim.screen import RenderMode
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy
 
-__all__ = ["TASKS", "DiffEnv", "Integration", "Scene", "SceneError", "Simulator", "load_scene", "make"]
+__all__ = [
+    "TASKS",
+    "DiffEnv",
+    "Integration",
+    "NumpyEnv",
+    "NumpyVectorEnv",
+    "Scene",
+    "SceneError",
+    "Simulator",
+    "load_scene",
+    "make",
+]
 
 
 def make(
@@ -35,6 +49,8 @@ def make(
     stochastic_init: bool = True,
     early_termination: bool = True,
     threads: int | None = None,
+    max_episode_steps: int | None = None,
+    render_mode: RenderMode | None = None,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -66,6 +82,8 @@ def make(
         stochastic_init=stochastic_init,
         early_termination=early_termination,
         threads=threads,
+        max_episode_steps=max_episode_steps,
+        render_mode=render_mode,
     )
 
 
@@ -73,10 +91,20 @@ def _make_one(name: str, **arguments: Any) -> NumpyEnv:
     return NumpyEnv(make(name, num_envs=1, horizon=1, **arguments))
 
 
-for _name in TASKS:
-    gymnasium.register(
-        id=f"diffsim/{_name.title().replace('_', '')}-v0",
-        entry_point="diffsim:_make_one",
-        vector_entry_point="diffsim:make",
-        kwargs={"name": _name},
-    )
+def _make_numpy(
+    name: str, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, **arguments: Any
+) -> NumpyVectorEnv:
+    return NumpyVectorEnv(make(name, num_envs, horizon=1, **arguments), autoreset_mode)
+
+
+# Two ids of each task: gymnasium.make makes the same environment of both, gymnasium.make_vec one on tensors and one in
+# NumPy, which has an id of its own because many libraries take an id and no further argument.
+for _name, _task in TASKS.items():
+    for _suffix, _vector in (("", "make"), ("-numpy", "_make_numpy")):
+        gymnasium.register(
+            id=f"diffsim/{_name.title().replace('_', '')}{_suffix}-v0",
+            entry_point="diffsim:_make_one",
+            vector_entry_point=f"diffsim:{_vector}",
+            max_episode_steps=_task.episode_length,
+            kwargs={"name": _name},
+        )

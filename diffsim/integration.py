@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import NamedTuple
 
 INTEGRATORS = ("semi_implicit", "implicit", "extrapolated")
@@ -31,20 +32,22 @@ class Integration(NamedTuple):
             new = new._replace(substeps=substeps)
         return new if theta is None else new._replace(theta=theta)
 
-    def check(self) -> None:
-        """Raise ValueError, with what is allowed, if it cannot be integrated so."""
+    def check(self) -> Integration:
+        """Itself, with substeps a plain int; raises ValueError, with what is allowed, if it cannot be integrated so."""
         if self.integrator not in INTEGRATORS:
             raise ValueError(f"unknown integrator {self.integrator!r}; choose from {', '.join(INTEGRATORS)}")
-        check_count("substeps", self.substeps)
-        if self.integrator == "extrapolated" and self.substeps % 2:
+        substeps = check_count("substeps", self.substeps)
+        if self.integrator == "extrapolated" and substeps % 2:
             raise ValueError(f"substeps is {self.substeps}, must be even for the extrapolated integrator")
         if not 0 <= self.theta <= 1:
             raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
         if self.theta and self.integrator != "implicit":
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
+        return self._replace(substeps=substeps)
 
 
-def check_count(name: str, value: int) -> None:
-    """Raise ValueError unless value is an integer of at least 1."""
-    if not isinstance(value, int) or value < 1:
+def check_count(name: str, value: int) -> int:
+    """The value as an int, be it NumPy's; raises ValueError unless it is an integer of at least 1. True is none."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
+    return int(value)

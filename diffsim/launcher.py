@@ -114,3 +114,18 @@ def default_division(scene: Scene, num_envs: int) -> Division:
 def available_cores() -> int:
     """Cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_memory(what: str, num_envs: int, bytes_each: int, device: torch.device) -> None:
+    """Raise ValueError if what is to be allocated, so many bytes per environment, is more than the device has."""
+    if device.type == "cuda":
+        there = torch.cuda.get_device_properties(device).total_memory
+    elif hasattr(os, "sysconf"):
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    else:  # Windows does not tell
+        return
+    if num_envs * bytes_each > there:
+        raise ValueError(
+            f"num_envs is {num_envs:,}: the {what} would take {num_envs * bytes_each / 2**30:,.0f} GiB, but {device} "
+            f"has {there / 2**30:,.0f} GiB, enough for fewer than {there // bytes_each:,} environments"
+        )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import NoReturn
 
 import torch
 
 from diffsim.integration import Integration, check_count
 from diffsim.kernels.lanes import Division
-from diffsim.launcher import WARP_DTYPE, Launcher
+from diffsim.launcher import WARP_DTYPE, Launcher, check_memory
 from diffsim.scene import Scene
 from diffsim.stepper import ExtrapolatedStepper, State, Stepper
 
@@ -52,16 +53,17 @@ class Simulator:
         threads: int | None = None,
         division: Division | None = None,
     ) -> None:
-        check_count("num_envs", num_envs)
-        check_count("horizon", horizon)
+        num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         if threads is not None:
-            check_count("threads", threads)
-        integration.check()
+            threads = check_count("threads", threads)
+        integration = integration.check()
         if not 0 < control_dt < math.inf:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
         self.device = check_device(device)
+        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu)
+        check_memory("states and actions", num_envs, numbers * dtype.itemsize, self.device)
         self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
         self.integration, self.control_dt, self.horizon = integration, control_dt, horizon
@@ -96,6 +98,12 @@ class Simulator:
     def rewind(self) -> None:
         """Let the next differentiable step use the first checkpoint: the start of a new window."""
         self._stepper.rewind()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a simulator, and so an environment, cannot be pickled or copied, because it holds compiled kernels: make "
+            "another one, and load the environment's state_dict() into it"
+        )
 
     def check_tensor(self, name: str, value: torch.Tensor, width: int) -> None:
         """Raise ValueError unless value is a (num_envs, width) tensor of the simulator's dtype on its device."""

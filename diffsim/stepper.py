@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from diffsim.integration import Integration
-from diffsim.launcher import Launcher
+from diffsim.launcher import Launcher, check_memory
 
 State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 
@@ -31,8 +30,11 @@ class ControlStep(torch.autograd.Function):
         return stepper.forward(ctx.checkpoint.slot, qpos, qvel, ctrl)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, g_end: torch.Tensor) -> tuple[Any, ...]:
+        if torch.is_grad_enabled():  # create_graph=True; without this, second derivatives would lack their larger part
+            raise RuntimeError(
+                "a simulated step has a first derivative only, so no create_graph=True: take finite differences of it"
+            )
         return (None, *ctx.stepper.backward(ctx.checkpoint, g_end))
 
 
@@ -131,6 +133,8 @@ class Stepper:
         """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
         spec, n, device = self._launcher.spec, self._launcher.num_envs, str(self._launcher.device)
         widths = (spec.nq, spec.nv, spec.nv, spec.nfactor)
+        numbers = count * sum(widths)
+        check_memory("checkpoints", n, numbers * self._launcher.dtype.itemsize, self._launcher.device)
         sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
         return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
 
