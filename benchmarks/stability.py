@@ -122,7 +122,7 @@ def stored(scene: Scene, model: mujoco.MjModel, qpos: Tensor) -> Array:
     joints = qpos[:, scene.qpos_adr[links]].numpy()
     beyond = np.maximum(scene.lower[links] - joints, 0) + np.maximum(joints - scene.upper[links], 0)
     ground = (np.minimum(motions.heights(model, qpos), 0) ** 2).sum(1) if scene.ncontact else 0.0
-    return 0.5 * scene.k_limit * (beyond**2).sum(1) + 0.5 * scene.k_n * ground
+    return 0.5 * (scene.k_limit[links] * beyond**2).sum(1) + 0.5 * scene.k_n * ground
 
 
 def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, Tensor, Tensor, Tensor]:

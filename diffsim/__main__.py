@@ -2,6 +2,7 @@
 
 python -m diffsim                                  tasks, devices, versions, and hints about usual troubles
 python -m diffsim demo [TASK] [--output FILE]      film a policy that comes with the package; needs no display
+python -m diffsim check ROBOT.xml                  what of an MJCF file is used, approximated and refused
 python -m diffsim export CHECKPOINT OUTPUT         the policy of a checkpoint alone, in a small file
 """
 
@@ -20,7 +21,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from diffsim import TASKS, load_scene, render, startup
+from diffsim import TASKS, check, load_scene, render, startup
 from diffsim.launcher import available_cores
 
 POLICIES = files("diffsim") / "policies"
@@ -32,16 +33,22 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m diffsim", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    commands = parser.add_subparsers(dest="command", metavar="{demo,export}")
+    commands = parser.add_subparsers(dest="command", metavar="{demo,check,export}")
     film = commands.add_parser("demo", help="film a policy that comes with the package")
     film.add_argument("task", nargs="?", default="ant", help="which task (default: ant)")
     film.add_argument("--output", type=Path, default=Path("demo.mp4"), help=".mp4 or .gif (default: demo.mp4)")
+    robot = commands.add_parser("check", help="say what of an MJCF file is used, approximated and refused")
+    robot.add_argument("robot", type=Path)
     copy = commands.add_parser("export", help="write the policy of a checkpoint alone")
     copy.add_argument("checkpoint", type=Path)
     copy.add_argument("output", type=Path)
     args = parser.parse_args(argv)
     if args.command == "demo":
         demo(args.task, args.output)
+    elif args.command == "check":
+        text, fits = check.report(args.robot)
+        print(text)
+        sys.exit(0 if fits else 1)
     elif args.command == "export":
         export(args.checkpoint, args.output)
     else:
@@ -155,9 +162,9 @@ def find_troubles() -> list[str]:
             hints.append(f"torch sees no GPU: the driver may be older than CUDA {torch.version.cuda}, see nvidia-smi")
     elif torch.cuda.is_available() and not wp.is_cuda_available():
         hints.append("torch sees a GPU and Warp does not: the driver is too old for Warp, see nvidia-smi")
-    for check in (startup.check_kernel_cache, render.check_opengl, lambda: render.check_video("demo.mp4")):
+    for works in (startup.check_kernel_cache, render.check_opengl, lambda: render.check_video("demo.mp4")):
         try:
-            check()
+            works()
         except (RuntimeError, ValueError) as error:
             hints.append(str(error))
     return hints

@@ -1,7 +1,8 @@
-"""MJCF -> Scene, by way of MuJoCo's compiler; what is not simulated is refused by name."""
+"""MJCF -> Scene, by way of MuJoCo's compiler; obstacles.py refuses what is not simulated."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,14 +10,18 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from diffsim.scene import PENALTY_DEFAULTS, Array, Scene, SceneError
+from diffsim.approximations import approximations
+from diffsim.ground import disabled_flags, ground_pairs, pair_law
+from diffsim.obstacles import floating, is_motor, obstacles, text
+from diffsim.penalty import contact_constants, limit_constants, mobilities
+from diffsim.scene import Array, Scene, SceneError
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Read an MJCF file.
 
     Raises:
-        SceneError: the file is missing or broken, or holds an element that is not simulated (named in the message).
+        SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
     """
     file = Path(path)
     if not file.is_file():
@@ -25,15 +30,45 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
         raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
-    return _Reader(model, file).scene()
+    _obey_flags(model)
+    if found := obstacles(model):
+        lines = found if len(found) == 1 else [f"{len(found)} things keep it from being simulated:", *found]
+        raise SceneError(f"{file.name}: " + "\n  ".join(lines))
+    scene = _Reader(model, file).scene()
+    return dataclasses.replace(scene, approximations=approximations(scene))
+
+
+def _obey_flags(m: mujoco.MjModel) -> None:
+    """Take out of the compiled model what <flag ...="disable"/> switches off."""
+    off = disabled_flags(m)
+    if "constraint" in off:
+        off |= {"contact", "equality", "frictionloss", "limit"}
+    if "passive" in off:
+        off |= {"spring", "damper"}
+    gone = {
+        "contact": (m.geom_contype, m.geom_conaffinity),
+        "damper": (m.dof_damping, m.tendon_damping),
+        "equality": (m.eq_active0,),
+        "frictionloss": (m.dof_frictionloss, m.tendon_frictionloss),
+        "gravity": (m.opt.gravity,),
+        "limit": (m.jnt_limited, m.tendon_limited),
+        "spring": (m.jnt_stiffness, m.tendon_stiffness),
+    }
+    for flag in off & gone.keys():
+        for values in gone[flag]:
+            values[:] = 0
+    if {"spring", "damper"} <= off:
+        m.opt.density = m.opt.viscosity = 0
+        m.body_gravcomp[:] = 0
 
 
 class Sphere(NamedTuple):
-    """What may touch the ground, in the frame of its link."""
+    """What may touch the ground, in the frame of its link; geom says what it is part of."""
 
     link: int
     centre: Array
     radius: float
+    geom: int
 
 
 class _Reader:
@@ -44,20 +79,17 @@ class _Reader:
         self.file = file
         self.links: list[dict[str, Any]] = []
         self.joint_link: dict[int, int] = {}
+        self.k_limit, self.d_limit = self._limits()
         # Of each body: its link (-1: fixed to the world of a floating scene) and its pose in the link's frame.
         self.body: list[tuple[int, Array, Array]] = [(-1, np.eye(3), np.zeros(3))]
 
     def scene(self) -> Scene:
         m = self.m
-        self._check_supported()
-        floating = bool(m.njnt and (m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
-        if not floating:
+        if not floating(m):
             self._add_link(parent=0)
             self.body[0] = (0, np.eye(3), np.zeros(3))
         for body in range(1, m.nbody):
             self._read_body(body)
-        if not self.links or (len(self.links) == 1 and not floating):
-            raise self._error("no joint: there is nothing to simulate")
         columns: dict[str, Any] = {key: np.array([link[key] for link in self.links]) for key in self.links[0]}
         mass = columns.pop("mass")
         com = columns.pop("moment") / np.where(mass > 0, mass, 1.0)[:, None]
@@ -68,7 +100,7 @@ class _Reader:
             name=self.file.stem,
             path=str(self.file),
             mj_model=m,
-            floating=floating,
+            floating=floating(m),
             nq=m.nq,
             nv=m.nv,
             mass=mass,
@@ -79,74 +111,8 @@ class _Reader:
             viscosity=float(m.opt.viscosity),
             **columns,
             **self._actuators(),
-            **self._contacts(),
-            **self._penalties(),
+            **self._contacts(float(mass.sum())),
         )
-
-    def _error(self, text: str) -> SceneError:
-        return SceneError(f"{self.file.name}: {text}")
-
-    def _refused(self, kind: mujoco.mjtObj, index: int, why: str) -> SceneError:
-        label = str(kind).rsplit("mjOBJ_", 1)[-1].lower()
-        return self._error(f"{label} {mujoco.mj_id2name(self.m, kind, index) or f'number {index}'!r}: {why}")
-
-    def _any(self, field: str, index: int) -> bool:
-        """Whether a field that only newer versions of MuJoCo have is set."""
-        return bool(np.any(getattr(self.m, field)[index])) if hasattr(self.m, field) else False
-
-    def _check_supported(self) -> None:
-        m, kind = self.m, mujoco.mjtObj
-        for what, count in ((kind.mjOBJ_EQUALITY, m.neq), (kind.mjOBJ_PAIR, m.npair)):
-            if count:
-                raise self._refused(what, 0, "not simulated")
-        for tendon in range(m.ntendon):
-            self._check_tendon(tendon)
-        for body in range(m.nbody):
-            if m.body_gravcomp[body] or m.body_mocapid[body] >= 0:
-                raise self._refused(kind.mjOBJ_BODY, body, "gravcomp and mocap are not simulated")
-        for joint in range(m.njnt):
-            self._check_joint(joint)
-        if np.any(m.opt.wind):
-            raise self._error("option wind: only a fluid at rest is simulated")
-        if m.opt.density or m.opt.viscosity:
-            self._check_fluid()
-
-    def _check_tendon(self, tendon: int) -> None:
-        m, kind = self.m, mujoco.mjtObj.mjOBJ_TENDON
-        path = m.wrap_type[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]
-        if (path != mujoco.mjtWrap.mjWRAP_SITE).any():
-            raise self._refused(kind, tendon, "only spatial tendons through sites, without pulleys or wrapping geoms")
-        for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited"):
-            if self._any(f"tendon_{field}", tendon):
-                raise self._refused(kind, tendon, f"{field} of a tendon is not simulated")
-
-    def _check_joint(self, joint: int) -> None:
-        m, dof = self.m, self.m.jnt_dofadr[joint]
-        free, ball = (m.jnt_type[joint] == kind for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))
-        polynomial = self._any("dof_dampingpoly", dof) or self._any("jnt_stiffnesspoly", joint)
-        passive = m.dof_armature[dof] or m.dof_damping[dof] or m.jnt_stiffness[joint]
-        for wrong, why in (
-            (m.jnt_actfrclimited[joint], "actuatorfrcrange is not simulated"),
-            (polynomial, "damping and stiffness are linear here, one number each"),
-            (ball and m.jnt_limited[joint], "the limit of a ball joint is not simulated"),
-            (m.dof_frictionloss[dof], "frictionloss is not simulated"),
-            (free and passive, "a free joint has no armature, damping or stiffness here"),
-            (
-                free and (joint or m.body_parentid[m.jnt_bodyid[joint]]),
-                "one free joint, of the first moving body, is simulated",
-            ),
-        ):
-            if wrong:
-                raise self._refused(mujoco.mjtObj.mjOBJ_JOINT, joint, why)
-
-    def _check_fluid(self) -> None:
-        m, kind = self.m, mujoco.mjtObj
-        for body in range(1, m.nbody):
-            if m.body_mass[body] > 0 and not m.body_jntnum[body] and m.body_weldid[body]:
-                raise self._refused(kind.mjOBJ_BODY, body, "in a fluid each body needs a joint; merge its geoms")
-        for geom in range(m.ngeom):
-            if m.geom_fluid[geom, 0]:
-                raise self._refused(kind.mjOBJ_GEOM, geom, "fluidshape ellipsoid is not simulated")
 
     def _add_link(self, parent: int, joint: int = -1, ball: int = -1, **values: Any) -> int:
         m = self.m
@@ -168,6 +134,8 @@ class _Reader:
             "spring_ref": m.qpos_spring[adr] if scalar else 0.0,  # a ball's is the identity in every MJCF
             "lower": m.jnt_range[joint, 0] if limited else -np.inf,
             "upper": m.jnt_range[joint, 1] if limited else np.inf,
+            "k_limit": self.k_limit[dof] if limited else 0.0,
+            "d_limit": self.d_limit[dof] if limited else 0.0,
             "mass": 0.0,
             "moment": np.zeros(3),
             "inertia": np.zeros((3, 3)),
@@ -186,8 +154,6 @@ class _Reader:
             link = self._add_link(parent=0, joint=joints[0])
             rotation, position = np.eye(3), np.zeros(3)
         else:
-            if joints and link < 0:
-                raise self._refused(mujoco.mjtObj.mjOBJ_BODY, body, "a second base beside a floating one")
             for joint in joints:
                 anchor = np.array(m.jnt_pos[joint])
                 position = position + rotation @ anchor
@@ -216,8 +182,6 @@ class _Reader:
             for a in range(m.nu)
         ]
         segments = sorted((s for row in rows for s in row["segments"]), key=lambda s: (s[0], s[2]))
-        text = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_TEXT, "muscle_model")
-        model = m.text_data[m.text_adr[text] :].partition(b"\0")[0].decode() if text >= 0 else "linear"
         return {
             "motor_link": np.array([row["link"] for row in rows], np.int32),
             "gear": np.array([row["scale"] * (row["high"] - row["low"]) / 2 for row in rows]),
@@ -226,38 +190,17 @@ class _Reader:
             "segment_position": np.array([ends for _, ends, _ in segments]).reshape(-1, 2, 3),
             "segment_muscle": np.array([muscle for _, _, muscle in segments], np.int32),
             "hill": np.array([row["hill"] for row in rows]).reshape(-1, 9),
-            "muscle_model": model,
+            "muscle_model": text(m, "muscle_model", "linear"),
         }
-
-    def _check_actuator(self, a: int, fits: bool, allowed: str) -> None:
-        m = self.m
-        extras = m.actuator_forcelimited[a] or self._any("actuator_damping", a) or self._any("actuator_armature", a)
-        if extras or not fits:
-            raise self._refused(mujoco.mjtObj.mjOBJ_ACTUATOR, a, f"only {allowed}")
-
-    def _is_motor(self, a: int) -> bool:
-        m = self.m
-        return (
-            m.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_NONE
-            and m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
-            and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
-        )
 
     def _motor(self, a: int) -> dict[str, Any]:
         m = self.m
         joint, axis = m.actuator_trnid[a, 0], 0
-        fits = m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and self._is_motor(a)
-        kind = m.jnt_type[joint] if fits else mujoco.mjtJoint.mjJNT_FREE
-        if kind == mujoco.mjtJoint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
+        ball = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
+        if ball:  # a torque about one axis of the turned body's frame
             axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
-            fits = not np.delete(m.actuator_gear[a, :3], axis).any()
-        self._check_actuator(
-            a,
-            fits and kind != mujoco.mjtJoint.mjJNT_FREE,
-            "motors with a gear and a ctrlrange on a hinge, a slide or one axis of a ball joint, or muscles on tendons",
-        )
         low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
-        link = self.joint_link[joint] + (axis - 2 if kind == mujoco.mjtJoint.mjJNT_BALL else 0)
+        link = self.joint_link[joint] + (axis - 2 if ball else 0)
         scale = m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
         return {"link": link, "scale": scale, "low": low, "high": high, "segments": [], "hill": [np.nan] * 9}
 
@@ -265,23 +208,11 @@ class _Reader:
         m = self.m
         strength = self._numeric("muscle_strength", 1.0)
         low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (0.0, 1.0)
-        gain, motor = m.actuator_gainprm[a, :9], self._is_motor(a)
+        gain = m.actuator_gainprm[a, :9]
         scale = -strength * m.actuator_gear[a, 0] * gain[0]
-        muscle = (
-            m.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_MUSCLE
-            and m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE
-            and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_MUSCLE
-            and np.array_equal(gain, m.actuator_biasprm[a, :9])
-        )
-        self._check_actuator(
-            a,
-            (motor and min(scale * low, scale * high) >= 0)
-            or (muscle and m.actuator_gear[a, 0] == 1 and 0 <= low < high <= 1),
-            "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon",
-        )
         constant, segments = self._path(m.actuator_trnid[a, 0], a)
         hill = [np.nan] * 9
-        if muscle:
+        if not is_motor(m, a):
             start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
             scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
             near, far = m.actuator_lengthrange[a]
@@ -295,9 +226,6 @@ class _Reader:
         points: list[tuple[int, Array]] = []
         for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
             link, rotation, position = self.body[m.site_bodyid[site]]
-            if link < 0:
-                why = "a muscle of a floating robot cannot hold on to the world"
-                raise self._refused(mujoco.mjtObj.mjOBJ_SITE, site, why)
             points.append((link, position + rotation @ m.site_pos[site]))
         constant, segments = 0.0, []
         for (i, a), (j, b) in zip(points, points[1:], strict=False):
@@ -307,37 +235,36 @@ class _Reader:
                 segments.append(((i, j) if i < j else (j, i), np.array([a, b] if i < j else [b, a]), actuator))
         return constant, segments
 
-    def _contacts(self) -> dict[str, Any]:
+    def _contacts(self, mass: float) -> dict[str, Any]:
         m = self.m
         data = mujoco.MjData(m)
         mujoco.mj_kinematics(m, data)
-        static = [g for g in range(m.ngeom) if m.body_weldid[m.geom_bodyid[g]] == 0]
-        moving = [g for g in range(m.ngeom) if m.body_weldid[m.geom_bodyid[g]] != 0]
-        touched = [s for s in static if any(self._collide(s, g) for g in moving)]
-        spheres: list[Sphere] = []
+        pairs = ground_pairs(m)
+        spheres = self._outer_spheres([sphere for _, geom in pairs for sphere in self._spheres(geom)])
+        points = []  # the lowest one of each sphere in the reference pose
+        for sphere in spheres:
+            body = m.geom_bodyid[sphere.geom]
+            _, rotation, position = self.body[body]
+            centre = data.xpos[body] + data.xmat[body].reshape(3, 3) @ rotation.T @ (sphere.centre - position)
+            points.append((body, centre - [0.0, 0.0, sphere.radius]))
+        constants = dict.fromkeys(("k_n", "k_d", "k_t", "mu"), 0.0)
         height = 0.0
-        for plane in touched:
-            if m.geom_type[plane] != mujoco.mjtGeom.mjGEOM_PLANE or len(touched) > 1:
-                raise self._refused(mujoco.mjtObj.mjOBJ_GEOM, plane, "contact is simulated with one ground plane only")
-            if not np.allclose(data.geom_xmat[plane].reshape(3, 3)[:, 2], [0.0, 0.0, 1.0]):
-                raise self._refused(mujoco.mjtObj.mjOBJ_GEOM, plane, "the ground plane must be horizontal")
-            height = float(data.geom_xpos[plane, 2])
-            for g in moving:
-                if self._collide(plane, g):
-                    spheres += self._spheres(g)
-        spheres = self._outer_spheres(spheres)
-        return {
+        if spheres:
+            height = float(data.geom_xpos[pairs[0][0], 2])
+            lowest = min(range(len(points)), key=lambda k: round(float(points[k][1][2]), 9))
+            law = pair_law(m, pairs[0][0], spheres[lowest].geom)
+            constants = contact_constants(mass, mobilities(m, points), law.solref)
+            constants["mu"] = law.friction if law.condim > 1 else 0.0
+            named = {name: self._numeric(name, value) for name, value in constants.items()}
+            if constants["k_n"] > 0:  # a file that names k_n alone keeps the damping ratio
+                constants["k_d"] *= named["k_n"] / constants["k_n"]
+            constants = named | {"k_d": self._numeric("k_d", constants["k_d"])}
+        return constants | {
             "contact_link": np.array([sphere.link for sphere in spheres], np.int32),
             "contact_position": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
             "contact_radius": np.array([sphere.radius for sphere in spheres]),
             "ground_height": height,
         }
-
-    def _collide(self, a: int, b: int) -> bool:
-        m = self.m
-        masks = m.geom_contype[a] & m.geom_conaffinity[b] or m.geom_contype[b] & m.geom_conaffinity[a]
-        low, high = sorted((m.geom_bodyid[a], m.geom_bodyid[b]))
-        return bool(masks) and (int(low) << 16) + int(high) not in m.exclude_signature
 
     def _spheres(self, geom: int) -> list[Sphere]:
         m, kind = self.m, mujoco.mjtGeom
@@ -346,14 +273,11 @@ class _Reader:
         centre = position + rotation @ m.geom_pos[geom]
         size = m.geom_size[geom]
         if m.geom_type[geom] == kind.mjGEOM_SPHERE:
-            return [Sphere(link, centre, size[0])]
+            return [Sphere(link, centre, size[0], geom)]
         if m.geom_type[geom] == kind.mjGEOM_CAPSULE:
-            return [Sphere(link, centre + s * size[1] * axes[:, 2], size[0]) for s in (-1.0, 1.0)]
-        if m.geom_type[geom] == kind.mjGEOM_BOX:
-            signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
-            return [Sphere(link, centre + axes @ (s * size), 0.0) for s in signs]
-        why = "only spheres, capsules and boxes may touch the ground; set contype and conaffinity to 0 if only drawn"
-        raise self._refused(mujoco.mjtObj.mjOBJ_GEOM, geom, why)
+            return [Sphere(link, centre + s * size[1] * axes[:, 2], size[0], geom) for s in (-1.0, 1.0)]
+        signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
+        return [Sphere(link, centre + axes @ (s * size), 0.0, geom) for s in signs]
 
     def _outer_spheres(self, spheres: list[Sphere]) -> list[Sphere]:
         """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""
@@ -363,25 +287,26 @@ class _Reader:
             link, centre = sphere.link, sphere.centre
             while link > 0 and not self.links[link]["slide"] and np.linalg.norm(centre) < 1e-6:
                 centre, link = self.links[link]["position"], self.links[link]["parent"]
-            return Sphere(link, centre, sphere.radius)
+            return Sphere(link, centre, sphere.radius, sphere.geom)
 
         kept: list[Sphere] = []
         for sphere in sorted(spheres, key=lambda sphere: -sphere.radius):
-            link, place, radius = seen_from_parent(sphere)
-            others = [other for other in map(seen_from_parent, kept) if other.link == link]
-            if not any(np.linalg.norm(o.centre - place) + radius <= o.radius + 1e-6 for o in others):
+            seen = seen_from_parent(sphere)
+            others = [other for other in map(seen_from_parent, kept) if other.link == seen.link]
+            if not any(np.linalg.norm(o.centre - seen.centre) + seen.radius <= o.radius + 1e-6 for o in others):
                 kept.append(sphere)
         return sorted(kept, key=lambda sphere: sphere.link)
 
-    def _penalties(self) -> dict[str, Any]:
-        return {name: self._numeric(name, default) for name, default in PENALTY_DEFAULTS.items()}
+    def _limits(self) -> tuple[Array, Array]:
+        """k_limit, d_limit (nv,); a file that names k_limit alone keeps the damping ratio."""
+        k, d = limit_constants(self.m)
+        k_limit = np.array([self._numeric("k_limit", x) for x in k])
+        ratio = np.sqrt(np.divide(k_limit, k, out=np.ones_like(k), where=k > 0))
+        return k_limit, np.array([self._numeric("d_limit", x) for x in d * ratio])
 
     def _numeric(self, name: str, default: float) -> float:
         index = mujoco.mj_name2id(self.m, mujoco.mjtObj.mjOBJ_NUMERIC, name)
-        value = float(self.m.numeric_data[self.m.numeric_adr[index]]) if index >= 0 else default
-        if not (np.isfinite(value) and value >= 0):
-            raise self._error(f"numeric {name!r} is {value}, must be finite and not negative")
-        return value
+        return float(self.m.numeric_data[self.m.numeric_adr[index]]) if index >= 0 else default
 
 
 def _matrix(quaternion: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,14 +13,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
-# Defaults of the penalty constants, each overridden by <custom><numeric name="..."/></custom> in the MJCF.
-PENALTY_DEFAULTS = {
-    "k_n": 2e4,  # contact stiffness, N/m (Eq. 3)
-    "k_d": 1e3,  # contact damping, N s/m per metre of depth (Eq. 3)
-    "k_t": 1e3,  # friction stiffness, N s/m (Eq. 3)
-    "mu": 0.9,  # coefficient of friction (Eq. 3)
-    "k_limit": 1e3,  # joint limit stiffness, N/m or N m/rad (Eq. 4)
-    "d_limit": 0.0,  # joint limit damping, active beyond the limit only
+# Constants of contact (Eq. 3) and limits (Eq. 4), with their units. <custom><numeric name="k_n" data="2e4"/></custom>
+# in the MJCF sets one, penalty.py those that the file does not name.
+PENALTY_CONSTANTS = {
+    "k_n": "N/m",
+    "k_d": "N s/m^2",
+    "k_t": "N s/m",
+    "mu": "",
+    "k_limit": "N/m or N m/rad",
+    "d_limit": "N s/m or N m s/rad",
 }
 
 MUSCLE_MODELS = ("linear", "hill")
@@ -49,6 +49,7 @@ class Scene:
         joint_ref: q at the reference configuration (MJCF `ref`).
         mass, com, inertia: kg, (3,) m in the link's frame, (3, 3) kg m^2 about the centre of mass, link axes.
         armature, damping, stiffness, spring_ref, lower, upper: of the joint; bounds are infinite where unlimited.
+        k_limit, d_limit: stiffness and damping of the joint's limits (Eq. 4).
         motor_link, gear, motor_bias: (nu,) joint force = gear * ctrl + motor_bias for ctrl in [-1, 1] over ctrlrange.
             Of a muscle the link is 0, and this is the maximum force times the activation.
         segment_link, segment_position, segment_muscle: (ns, 2), (ns, 2, 3), (ns,) the pieces of the muscles' paths that
@@ -56,8 +57,9 @@ class Scene:
         hill: (nu, 9) numbers of the Hill-type model (kernels/hill.py), NaN where not a <muscle>.
         muscle_model: "linear" (the paper's: force = maximum force times activation) or "hill".
         contact_link, contact_position, contact_radius: (nc,), (nc, 3), (nc,) spheres that may touch the ground.
-        k_n, k_d, k_t, mu, k_limit, d_limit: penalty constants, see PENALTY_DEFAULTS.
+        k_n, k_d, k_t, mu: stiffness, damping and friction of contact (Eq. 3).
         density, viscosity: of the fluid around the robot, kg/m^3 and kg/(m s).
+        approximations: what the file asks for and is simulated only roughly, a sentence each.
     """
 
     name: str
@@ -82,6 +84,8 @@ class Scene:
     spring_ref: Array
     lower: Array
     upper: Array
+    k_limit: Array
+    d_limit: Array
     motor_link: Index
     gear: Array
     motor_bias: Array
@@ -99,19 +103,15 @@ class Scene:
     k_d: float
     k_t: float
     mu: float
-    k_limit: float
-    d_limit: float
     density: float = 0.0
     viscosity: float = 0.0
+    approximations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        file = os.path.basename(self.path)
         if self.muscle_model not in MUSCLE_MODELS:
-            raise SceneError(f"{file}: muscle_model is {self.muscle_model!r}; choose from {', '.join(MUSCLE_MODELS)}")
-        plain = self.segment_muscle[np.isnan(self.hill[self.segment_muscle]).any(1)]
-        if self.muscle_model == "hill" and len(plain):
-            name = self.mj_model.actuator(int(plain[0])).name or f"number {plain[0]}"
-            raise SceneError(f"{file}: actuator {name!r}: muscle_model 'hill' needs a <muscle>")
+            raise ValueError(f"muscle_model is {self.muscle_model!r}; choose from {', '.join(MUSCLE_MODELS)}")
+        if self.muscle_model == "hill" and np.isnan(self.hill[self.segment_muscle]).any():
+            raise ValueError("muscle_model 'hill' needs a <muscle> for every actuator of a tendon")
 
     @property
     def nlink(self) -> int:
@@ -156,7 +156,7 @@ class Scene:
             "slide": bool(self.slide[1:].any()),
             "ball": self.nball > 0,
             "contact": self.ncontact > 0,
-            "limit": bool(limited.any()) and (self.k_limit > 0 or self.d_limit > 0),
+            "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0))).any()),
             "stiffness": bool(self.stiffness.any()),
             "damping": bool(self.damping.any()),
             "motor": bool((self.motor_link > 0).any()),
@@ -207,17 +207,19 @@ class Scene:
         return axes, viscous, force, torque
 
     def with_penalty(self, constants: Mapping[str, float]) -> Scene:
-        """A copy with some penalty constants replaced, see PENALTY_DEFAULTS.
+        """A copy with some of PENALTY_CONSTANTS replaced, those of limits at every joint.
 
         Raises:
             ValueError: an unknown constant, or one that is negative or not finite.
         """
         for name, value in constants.items():
-            if name not in PENALTY_DEFAULTS:
-                raise ValueError(f"unknown penalty constant {name!r}; choose from {', '.join(PENALTY_DEFAULTS)}")
+            if name not in PENALTY_CONSTANTS:
+                raise ValueError(f"unknown penalty constant {name!r}; choose from {', '.join(PENALTY_CONSTANTS)}")
             if not 0 <= value < np.inf:
                 raise ValueError(f"penalty constant {name} is {value!r}, must be finite and not negative")
-        changes: dict[str, Any] = dict(constants)
+        changes: dict[str, Any] = {
+            name: np.full(self.nlink, value) if name.endswith("_limit") else value for name, value in constants.items()
+        }
         return dataclasses.replace(self, **changes)
 
     def without(self, *features: str) -> Scene:

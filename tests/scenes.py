@@ -148,6 +148,31 @@ HINGE = """
 </mujoco>"""
 
 
+FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
+
+
+def robot(body: str, rest: str = "", world: str = FLOOR) -> str:
+    return f'<mujoco><compiler angle="radian"/><worldbody>{world}{body}</worldbody>{rest}</mujoco>'
+
+
+def pendulum(joint: str = "", inside: str = "", rest: str = "", world: str = FLOOR) -> str:
+    """A sphere on a hinge."""
+    body = f'<body name="arm"><joint name="hinge" {joint}/><geom type="sphere" size="0.1" pos="0 0 -1"/>{inside}</body>'
+    return robot(body, rest, world)
+
+
+MUSCLE = 'name="biceps" tendon="string" force="5" lengthrange="1 2"'
+
+
+def tendon(more: str = "", spring: str = "", joint: str = "<joint/>", actuator: str = "", custom: str = "") -> str:
+    """A string from the world's site w to the body's site b."""
+    body = (
+        f'<site name="w"/><body>{joint}<geom name="g" size="0.1"/><site name="a" pos="1 0 0"/><site name="b"/></body>'
+    )
+    path = f'<spatial name="string" {spring}><site site="w"/><site site="a"/>{more}<site site="b"/></spatial>'
+    return robot(body, f"<tendon>{path}</tendon><actuator>{actuator}</actuator><custom>{custom}</custom>")
+
+
 def parse(mjcf: str) -> Scene:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"

@@ -1,4 +1,4 @@
-"""MJCF to Scene: what is read, and what is refused by name."""
+"""MJCF to Scene: what is read."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import mujoco
 import numpy as np
 import pytest
 import reference
-from scenes import BALL, SHOULDER, free_states, leg_scene, parse, task_scene, tree_scene
+from scenes import (
+    BALL,
+    MUSCLE,
+    SHOULDER,
+    free_states,
+    leg_scene,
+    parse,
+    pendulum,
+    robot,
+    task_scene,
+    tendon,
+    tree_scene,
+)
 
 from diffsim.mjcf import load_scene
-from diffsim.scene import PENALTY_DEFAULTS, SceneError
-
-FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
-
-
-def robot(body: str, rest: str = "", world: str = FLOOR) -> str:
-    return f'<mujoco><compiler angle="radian"/><worldbody>{world}{body}</worldbody>{rest}</mujoco>'
-
-
-def pendulum(joint: str = "", inside: str = "", rest: str = "", world: str = FLOOR) -> str:
-    """A sphere on a hinge."""
-    body = f'<body name="arm"><joint name="hinge" {joint}/><geom type="sphere" size="0.1" pos="0 0 -1"/>{inside}</body>'
-    return robot(body, rest, world)
+from diffsim.scene import SceneError
 
 
 def test_welded_bodies_are_merged():
@@ -187,15 +187,6 @@ def test_unlimited_joint_has_infinite_bounds():
     assert scene.lower[1] == -np.inf and scene.upper[1] == np.inf and "limit" not in scene.features
 
 
-def test_penalty_constants():
-    scene = parse(pendulum())
-    assert {name: getattr(scene, name) for name in PENALTY_DEFAULTS} == PENALTY_DEFAULTS
-    given = {name: 10.0 + i for i, name in enumerate(PENALTY_DEFAULTS)}
-    numerics = "".join(f'<numeric name="{name}" data="{value}"/>' for name, value in given.items())
-    scene = parse(pendulum(rest=f"<custom>{numerics}<numeric name='other' data='5'/></custom>"))
-    assert {name: getattr(scene, name) for name in PENALTY_DEFAULTS} == given
-
-
 def test_muscles():
     """Segments between two links, by pairs of links; the rest of a path has a constant length."""
     scene = leg_scene("hill")
@@ -219,146 +210,6 @@ def test_strength_of_muscles():
     np.testing.assert_allclose([scene.gear[0], scene.motor_bias[0], scene.hill[0, -1]], [0.9, 0.9, 1.8])
     half = tendon(actuator=f'<muscle {MUSCLE} ctrllimited="true" ctrlrange="0 0.5"/>')
     np.testing.assert_allclose([parse(half).gear[0], parse(half).motor_bias[0]], [1.25, 1.25])
-
-
-MUSCLE = 'name="biceps" tendon="string" force="5" lengthrange="1 2"'
-
-
-def tendon(more: str = "", spring: str = "", joint: str = "<joint/>", actuator: str = "", custom: str = "") -> str:
-    """A string from the world's site w to the body's site b."""
-    body = (
-        f'<site name="w"/><body>{joint}<geom name="g" size="0.1"/><site name="a" pos="1 0 0"/><site name="b"/></body>'
-    )
-    path = f'<spatial name="string" {spring}><site site="w"/><site site="a"/>{more}<site site="b"/></spatial>'
-    return robot(body, f"<tendon>{path}</tendon><actuator>{actuator}</actuator><custom>{custom}</custom>")
-
-
-MESH = """<asset><mesh name="tetra" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>"""
-UNSUPPORTED = {
-    "mesh in contact": (pendulum(inside='<geom name="hull" type="mesh" mesh="tetra"/>', rest=MESH), "hull"),
-    "ellipsoid in contact": (pendulum(inside='<geom name="egg" type="ellipsoid" size="1 2 3"/>'), "egg"),
-    "cylinder in contact": (pendulum(inside='<geom name="can" type="cylinder" size="1 2"/>'), "can"),
-    "tilted ground": (pendulum(world='<geom name="slope" type="plane" size="1 1 1" euler="0.1 0 0"/>'), "slope"),
-    "ground that is a box": (pendulum(world='<geom name="table" type="box" size="1 1 1"/>'), "table"),
-    "two grounds": (
-        pendulum(world=FLOOR + '<geom name="second" type="plane" size="1 1 1" pos="0 0 1"/>'),
-        "floor|second",
-    ),
-    "equality": (
-        robot(
-            '<body name="a"><freejoint/><geom size="0.1"/></body>',
-            '<equality><weld name="glue" body1="a" body2="world"/></equality>',
-        ),
-        "glue",
-    ),
-    "fixed tendon": (
-        pendulum(rest='<tendon><fixed name="string"><joint joint="hinge" coef="1"/></fixed></tendon>'),
-        "string",
-    ),
-    "tendon around a geom": (tendon('<geom geom="g"/>'), "string"),
-    "pulley": (tendon('<pulley divisor="2"/><site site="a"/>'), "string"),
-    "elastic tendon": (tendon(spring='stiffness="3"'), "string.*stiffness"),
-    "tendon with a damper": (tendon(spring='damping="3"'), "string.*damping"),
-    "muscle that pushes": (tendon(actuator='<motor name="pusher" tendon="string"/>'), "pusher.*never push"),
-    "position actuator on a tendon": (tendon(actuator='<position name="servo" tendon="string" kp="1"/>'), "servo"),
-    "muscle with a gear": (tendon(actuator=f'<muscle gear="2" {MUSCLE}/>'), "biceps.*gear"),
-    "muscle on the world beside a floating base": (tendon(joint="<freejoint/>", actuator=f"<muscle {MUSCLE}/>"), "'w'"),
-    "unknown model of muscles": (tendon(custom='<text name="muscle_model" data="rubber"/>'), "rubber.*linear, hill"),
-    "Hill-type model of a plain actuator": (
-        tendon(
-            actuator='<motor name="rope" tendon="string" gear="-1" ctrlrange="0 1" ctrllimited="true"/>',
-            custom='<text name="muscle_model" data="hill"/>',
-        ),
-        "rope.*<muscle>",
-    ),
-    "contact pair": (
-        pendulum(
-            inside='<geom name="a" size="0.1"/>',
-            rest='<contact><pair name="couple" geom1="a" geom2="floor"/></contact>',
-        ),
-        "couple",
-    ),
-    "position actuator": (pendulum(rest='<actuator><position name="servo" joint="hinge" kp="5"/></actuator>'), "servo"),
-    "velocity actuator": (pendulum(rest='<actuator><velocity name="drive" joint="hinge"/></actuator>'), "drive"),
-    "motor with a filter": (
-        pendulum(rest='<actuator><general name="slow" joint="hinge" dyntype="filter" dynprm="1"/></actuator>'),
-        "slow",
-    ),
-    "motor with a force range": (
-        pendulum(rest='<actuator><motor name="weak" joint="hinge" forcerange="-1 1"/></actuator>'),
-        "weak",
-    ),
-    "motor on a free joint": (
-        robot(
-            '<body><freejoint name="root"/><geom size="0.1"/></body>',
-            '<actuator><motor name="rocket" joint="root"/></actuator>',
-        ),
-        "rocket",
-    ),
-    "joint with a force range": (pendulum('actuatorfrcrange="-1 1"'), "hinge"),
-    "motor with damping": (
-        pendulum(rest='<actuator><motor name="stiff" joint="hinge" damping="1"/></actuator>'),
-        "stiff|damping",
-    ),
-    "motor with armature": (
-        pendulum(rest='<actuator><motor name="heavy" joint="hinge" armature="1"/></actuator>'),
-        "heavy|armature",
-    ),
-    "ball joint with a limit": (
-        robot('<body><joint name="hip" type="ball" range="0 1" limited="true"/><geom size="0.1"/></body>'),
-        "hip",
-    ),
-    "motor on a ball joint about a slanted axis": (
-        robot(
-            '<body><joint name="hip" type="ball"/><geom size="0.1"/></body>',
-            '<actuator><motor name="twist" joint="hip" gear="1 1 0"/></actuator>',
-        ),
-        "twist.*one axis of a ball joint",
-    ),
-    "free joint with damping": (robot('<body><joint name="r" type="free" damping="1"/><geom size="0.1"/></body>'), "r"),
-    "free joint with armature": (
-        robot('<body><joint name="r" type="free" armature="1"/><geom size="0.1"/></body>'),
-        "r",
-    ),
-    "dry friction": (pendulum('frictionloss="1"'), "hinge"),
-    "damping polynomial": (pendulum('damping="1 2"'), "hinge|damping"),
-    "stiffness polynomial": (pendulum('stiffness="1 2"'), "hinge|stiffness"),
-    "gravity compensation": (robot('<body name="kite" gravcomp="1"><freejoint/><geom size="0.1"/></body>'), "kite"),
-    "two floating bodies": (
-        robot(
-            '<body name="one"><freejoint name="one"/><geom size="0.1"/></body>'
-            '<body name="two"><freejoint name="two"/><geom size="0.1"/></body>'
-        ),
-        "two",
-    ),
-    "fixed beside floating": (
-        robot('<body><freejoint/><geom size="0.1"/></body><body name="post"><joint/><geom size="0.1"/></body>'),
-        "post",
-    ),
-    "floating beside fixed": (
-        robot('<body><joint/><geom size="0.1"/></body><body><freejoint name="loose"/><geom size="0.1"/></body>'),
-        "loose",
-    ),
-    "wind": (pendulum(rest='<option viscosity="1" wind="1 0 0"/>'), "wind"),
-    "ellipsoid in a fluid": (
-        pendulum(inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'),
-        "hull",
-    ),
-    "welded in a fluid": (
-        pendulum(inside='<body name="fin"><geom size="0.1"/></body>', rest='<option density="1"/>'),
-        "fin",
-    ),
-    "no joint": (robot('<body><geom size="0.1"/></body>'), "no joint"),
-    "negative penalty": (pendulum(rest='<custom><numeric name="k_n" data="-1"/></custom>'), "k_n"),
-}
-
-
-@pytest.mark.parametrize("what", UNSUPPORTED)
-def test_what_is_not_simulated_is_named(what):
-    mjcf, culprit = UNSUPPORTED[what]
-    with pytest.raises(SceneError, match=culprit) as error:
-        parse(mjcf)
-    assert "\n" not in str(error.value) and "robot.xml" in str(error.value)
 
 
 def test_missing_and_broken_files(tmp_path):

@@ -307,7 +307,8 @@ def test_motors_penalties_and_options(name: str) -> None:
         np.testing.assert_allclose(model.actuator_gear[:, 0], GEAR[name])
         np.testing.assert_array_equal(model.actuator_ctrlrange, [[-1, 1]] * model.nu)
     assert model.actuator_ctrllimited.all()
-    assert {model.numeric(i).name: model.numeric(i).data.item() for i in range(model.nnumeric)} == PENALTIES[name]
+    numerics = {model.numeric(i).name: model.numeric(i).data.item() for i in range(model.nnumeric)}
+    assert numerics == PENALTIES[name] | {"d_limit": 0}
     np.testing.assert_allclose(model.opt.timestep * SIZES[name][0], 1 / 60)
     np.testing.assert_array_equal(model.opt.gravity, [0, 0, -9.81])
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER

@@ -353,7 +353,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     qi = q[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
-                    gain = passive_gain(m, k, qi)
+                    gain = passive_gain(m, k, qi, qd[i])
                     kv = gain[1]
                     if wp.static(IMPLICIT):
                         kv = kv + theta * h * gain[0]

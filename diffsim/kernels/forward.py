@@ -275,7 +275,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     qi = q[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
-                        gain = passive_gain(m, k, qi)
+                        gain = passive_gain(m, k, qi, qd[i])
                         d = d - theta * h * h * gain[0] - h * gain[1]
                     di = T(1.0) / d
                     ui = motor[i] + passive_force(m, k, qi, qd[i]) - wp.dot(S[i], P[i])

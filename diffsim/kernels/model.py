@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from diffsim.kernels.lanes import Division
-from diffsim.scene import PENALTY_DEFAULTS, Scene
+from diffsim.scene import Scene
 
 
 @cache
@@ -45,6 +45,8 @@ def types(dtype: type) -> SimpleNamespace:
         spring_ref: wp.array(dtype=dtype)
         lower: wp.array(dtype=dtype)
         upper: wp.array(dtype=dtype)
+        k_limit: wp.array(dtype=dtype)
+        d_limit: wp.array(dtype=dtype)
         motor_slot: wp.array(dtype=int)  # of each lane's each motor, 0 where another lane has its link
         motor_lane: wp.array(dtype=int)  # the lane that writes its gradient
         gear: wp.array(dtype=dtype)
@@ -73,8 +75,6 @@ def types(dtype: type) -> SimpleNamespace:
         k_d: dtype
         k_t: dtype
         mu: dtype
-        k_limit: dtype
-        d_limit: dtype
 
     return SimpleNamespace(
         dtype=dtype,
@@ -180,7 +180,7 @@ class _Writer:
         )
 
     def put_joints(self) -> None:
-        names = ("armature", "damping", "stiffness", "spring_ref", "lower", "upper")
+        names = ("armature", "damping", "stiffness", "spring_ref", "lower", "upper", "k_limit", "d_limit")
         self.put(**{name: (getattr(self.scene, name)[self.link], self.dtype) for name in names})
 
     def put_motors_and_muscles(self) -> None:
@@ -210,7 +210,7 @@ class _Writer:
         )
 
     def put_contacts(self) -> None:
-        """Spheres by lane, then by slot, and the penalty constants."""
+        """Spheres by lane, then by slot, and the constants of contact."""
         scene, d = self.scene, self.division
         rows = [
             (lane * d.slots + self.slot[lane, scene.contact_link[k]], k)
@@ -223,7 +223,7 @@ class _Writer:
             contact_position=(scene.contact_position[sphere], self.t.vec3),
             contact_radius=(scene.contact_radius[sphere], self.dtype),
         )
-        for name in PENALTY_DEFAULTS:
+        for name in ("k_n", "k_d", "k_t", "mu"):
             setattr(self.model, name, self.dtype(getattr(scene, name)))
 
 
