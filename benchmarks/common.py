@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -27,14 +28,14 @@ RESULTS, DOCS = ROOT / "results", ROOT / "docs"
 TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu"]
 TASKS: tuple[TaskName, ...] = get_args(TaskName)  # of the SHAC paper
 Tasks = Annotated[tuple[TaskName, ...], tyro.conf.arg(aliases=["--env-id"])]
-F = TypeVar("F", bound="Flags")
-T = TypeVar("T", bound="TaskFlags")
+F = TypeVar("F", bound="CommonFlags")
 
 
 @dataclass
-class Flags:
+class CommonFlags:
     """What every benchmark takes."""
 
+    env: Tasks = TASKS  # tasks
     device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
     output: Path | None = None  # directory of the csv files (default: results/cpu or, by the GPU, e.g. results/h100)
     figures: Path | None = None  # of the pictures (default: docs/figures, docs/figures/h100, or that of --output)
@@ -43,11 +44,6 @@ class Flags:
     @property
     def directory(self) -> Path:
         return self.output.resolve() if self.output else RESULTS / machine(self.device)
-
-    @property
-    def in_tree(self) -> bool:
-        """Whether the results are among those that the pages show."""
-        return self.directory.parent == RESULTS
 
     def csv(self, name: str) -> Path:
         return self.directory / f"{name}.csv"
@@ -63,36 +59,31 @@ class Flags:
 
     def machines(self, name: str) -> dict[str, Path]:
         """The csv files of a name by their machines: all of the tree of results, or the one outside of it."""
-        paths = sorted(RESULTS.glob(f"*/{name}.csv")) if self.in_tree else [self.csv(name)]
+        paths = sorted(RESULTS.glob(f"*/{name}.csv")) if self.directory.parent == RESULTS else [self.csv(name)]
         return {path.parent.name: path for path in paths if path.is_file()}
 
     def picture(self, name: str) -> Path:
-        gpu = self.directory.name.replace("cpu", "")
-        return (self.figures or (DOCS / "figures" / gpu if self.in_tree else self.directory)) / f"{name}.png"
+        default = DOCS / "figures" / self.directory.name.replace("cpu", "")
+        return (self.figures or (default if self.directory.parent == RESULTS else self.directory)) / f"{name}.png"
 
     def link(self, name: str) -> str:
         """A picture's address in a page."""
         return os.path.relpath(self.picture(name), DOCS)
 
-    def publish(self, name: str, text: str, pages: Mapping[str, str] | str) -> None:
-        """Print a table, and put it between a page's marks: the machine's page, or one page for all machines."""
+    def publish(self, name: str, text: str, page: str, everywhere: bool = False) -> None:
+        """Print a table, and fill the part of a page that has its name; of one GPU's results it is {name}_{machine}."""
         print(text)
-        page = pages if isinstance(pages, str) else pages.get(self.directory.name)
-        if page and self.in_tree:
+        name = name if everywhere or self.directory.name == "cpu" else f"{name}_{self.directory.name}"
+        if self.directory.parent == RESULTS and f"<!-- {name} -->" in (DOCS / page).read_text():
             tables.fill(DOCS / page, name, text)
-
-
-@dataclass
-class TaskFlags(Flags):
-    env: Tasks = TASKS  # tasks
 
 
 def machine(device: str) -> str:
     """cpu, or a GPU's short name: "NVIDIA H100 80GB HBM3" is h100."""
     if not device.startswith("cuda"):
         return "cpu"
-    words = torch.cuda.get_device_name(device).lower().split()
-    return next((word.partition("-")[0] for word in words if any(map(str.isdigit, word))), words[-1])
+    name = torch.cuda.get_device_name(device).lower()
+    return found[0] if (found := re.search(r"[a-z]*\d+", name)) else name
 
 
 def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = None) -> F:
@@ -109,7 +100,7 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
 
 
 def measured(
-    args: T, name: str, measure: Callable[[T, TaskName], Iterable[Row]], key: Sequence[str]
+    args: F, name: str, measure: Callable[[F, TaskName], Iterable[Row]], key: Sequence[str]
 ) -> list[dict[str, str]]:
     """All rows of a csv file; those of the tasks asked for are measured, and it has each as soon as it is there."""
     for env in () if args.draw_only else args.env:
@@ -118,8 +109,6 @@ def measured(
             args.merge(name, [row], key)
     return sorted(args.read(name), key=lambda row: TASKS.index(row["task"].split()[0]))
 
-
-# Pictures -------------------------------------------------------------------------------------------------------------
 
 Numbers = Sequence[float] | np.ndarray
 
@@ -139,8 +128,7 @@ class Panel(NamedTuple):
     x: str = ""
     y: str = ""
     log: str = ""  # the logarithmic axes: x, y or xy
-    zero: bool = False  # the axes begin there
-    end: float | None = None  # of the x axis
+    zero: bool = False  # the y axis begins there
 
 
 @functools.cache
@@ -151,7 +139,7 @@ def can_draw() -> bool:
     return False
 
 
-def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] = (3.4, 2.9), title: str = "") -> None:
+def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] = (3.4, 2.9)) -> None:
     """Draw rows of panels, each of a size in inches. Without matplotlib it says so, once, and draws nothing."""
     if not grid[0] or not can_draw():
         return
@@ -164,7 +152,7 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
     for axis, panel in zip(axes.flat, chain(*grid), strict=True):
         for line in panel.lines:
             (drawn,) = axis.plot(line.x, line.y, line.style, linewidth=line.width, markersize=4)
-            legend.setdefault(line.label, drawn)
+            legend |= {line.label: drawn} if line.label else {}
             for x, y, note in zip(line.x, line.y, line.notes, strict=False):
                 axis.annotate(note, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6)
         axis.set(xlabel=panel.x, ylabel=panel.y)
@@ -172,16 +160,10 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
         axis.set_title(panel.title, fontsize=10)
         if panel.zero:
             axis.set_ylim(bottom=0)
-        if panel.zero or panel.end:
-            axis.set_xlim(0, panel.end)
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
-    legend.pop("", None)
     columns = max(1, round(len(grid[0]) * size[0] / 1.8))
-    if legend:
-        figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
-    if title:
-        figure.suptitle(title, fontsize=10)
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     print(path)

@@ -2,12 +2,11 @@
 
     python benchmarks/landscape.py --env humanoid ant           train, keep six policies on the way, measure, draw
     python benchmarks/landscape.py --env ant --time-limit 500   stop training in time; the same command goes on
-    python benchmarks/landscape.py --env cartpole --iterations 4 8 --trajectories 4 --points 11 --side 5 --horizon 60
 
 A policy that SHAC has learned is changed along one weight, and along two random directions. BPTT's loss is minus the
 mean reward of an episode of --horizon steps up to its end (a fallen robot gains no more), SHAC's is Eq. 5 over a window
 of 32 steps from states that the policy visits. Every variation of the policy meets the same start states and the same
-noise, all at once in one batch. The last line is a short look.
+noise, all at once in one batch.
 
 Writes landscape_*.csv, landscape_*.png and their part of the page docs/experiments.md. A csv that exists is kept:
 delete it to measure it anew.
@@ -17,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -26,7 +24,7 @@ import numpy as np
 import torch
 from common import TASKS, Line, Panel, TaskName, Tasks, can_draw, plot
 from motions import Array, shac
-from runner import Case, RunFlags, Runner, parse
+from runner import Case, Runner, ScriptFlags, parse
 from tables import ROOT, Row, markdown
 from torch import Tensor
 from torch.func import functional_call, vmap
@@ -44,7 +42,7 @@ State = tuple[Tensor, Tensor]
 
 
 @dataclass
-class Args(RunFlags):
+class Args(ScriptFlags):
     env: Tasks = ("humanoid", "ant")  # tasks
     seed: int = 1  # of the training, of start states, noise and directions
     iterations: tuple[Count, ...] = (50, 200, 500, 1000, 1500, 2000)  # of SHAC, for a look; landscapes: the last
@@ -131,7 +129,7 @@ class Look:
                 value = self.losses(loss, env, {name: self.weights[name] + move for name, move in moves.items()})
                 slopes += torch.autograd.grad(value.sum(), chunk) if slope else ()
             found.append(value.detach())
-        return torch.cat(found).cpu().numpy(), torch.cat(slopes).cpu().numpy() if slope else np.empty(0)
+        return torch.cat(found).cpu().numpy(), torch.cat(slopes).cpu().numpy() if slope else np.empty((len(steps), 0))
 
     def gradient(self, loss: Loss) -> dict[str, Tensor]:
         """Of the loss with respect to the policy's parameters, on the CPU."""
@@ -158,9 +156,9 @@ class Look:
         return directions
 
 
-def gradients(look: Look) -> dict[str, object]:
+def gradients(iteration: int, look: Look) -> Row:
     """Norm and quantiles of the sizes of the entries of both gradients."""
-    sizes = dict[str, object]()
+    sizes: dict[str, object] = {"iteration": iteration}
     for loss in LOSSES:
         gradient = torch.cat([tensor.flatten() for tensor in look.gradient(loss).values()])
         finite = gradient[gradient.isfinite()].double()
@@ -177,19 +175,15 @@ def landscape(look: Look, name: str) -> list[Row]:
     axis = torch.linspace(-1, 1, count, device=look.args.device)
     steps = axis.unsqueeze(1) if line else torch.cartesian_prod(axis, axis)
     directions = look.one_weight() if line else look.random_directions()
-    bptt, ours = look.vary("bptt", directions, steps), look.vary("shac", directions, steps, slope=line)
-    table = (
-        [*steps.T.cpu().numpy(), bptt[0], ours[0], *ours[1].T] if line else [*steps.T.cpu().numpy(), bptt[0], ours[0]]
-    )
+    bptt, _ = look.vary("bptt", directions, steps)
+    ours, slope = look.vary("shac", directions, steps, slope=line)
     columns = ("step", "bptt", "shac", "shac_gradient") if line else ("k1", "k2", "bptt", "shac")
+    table = [*steps.T.cpu().numpy(), bptt, ours, *slope.T]
     return [dict(zip(columns, (f"{value:.7g}" for value in row), strict=True)) for row in zip(*table, strict=True)]
 
 
 def measure(args: Args, runner: Runner, task: TaskName) -> None:
-    """Write those csv files of a task that there are not, as far as the time limit allows.
-
-    There is one training, stopped and resumed; its checkpoint is kept after each of the given iterations.
-    """
+    """Train once, stop at each of the given iterations to keep the checkpoint, and write the csv files that lack."""
     missing = [name for name in FILES if not args.csv(f"landscape_{task}_{name}").is_file()]
     folder = args.runs / f"{task}__{args.seed}"
     case = Case(folder, task, args.seed, "shac", ("--iterations", str(args.iterations[-1]), "--eval-every", "0"))
@@ -208,11 +202,7 @@ def measure(args: Args, runner: Runner, task: TaskName) -> None:
     for name in missing:
         if runner.time_is_up:
             return
-        rows: Sequence[Row] = (
-            [{"iteration": k, **gradients(look)} for k, look in zip(args.iterations, looks, strict=True)]
-            if name == "gradients"
-            else landscape(looks[-1], name)
-        )
+        rows = list(map(gradients, args.iterations, looks)) if name == "gradients" else landscape(looks[-1], name)
         args.write(f"landscape_{task}_{name}", rows)
         print(f"{task}, {name}: done", flush=True)
 
@@ -260,13 +250,13 @@ def section(args: Args, task: TaskName) -> str:
         rows.append({"": loss, "local extrema along one weight": extrema, "way up and down / range": way})
     difference = np.gradient(line["shac"], line["step"])
     correlation = np.corrcoef(difference[1:-1], line["shac_gradient"][1:-1])[0, 1]
-    names = ["iteration", *(f"{loss}_{what}" for loss in LOSSES for what in ("norm", "q0.5", "q0.99", "q1"))]
+    names = ["iteration", *(f"{loss}_{what}" for loss in LOSSES for what in ("norm", "q1"))]
     weight, surface, gradients = (args.link(f"landscape_{task}_{name}") for name in ("weight", "surface", "gradients"))
     return (
         f"### {task}\n\n{markdown(rows)}\n"
         f"Analytic against finite-difference gradient of SHAC along the weight: correlation {correlation:.3f}.\n\n"
         f"![one weight]({weight})\n![surface]({surface})\n\n"
-        f"{markdown(sizes, names)}\nq: quantiles of the entries' sizes.\n\n![gradients]({gradients})\n\n"
+        f"{markdown(sizes, names)}\n![gradients]({gradients})\n\n"
     )
 
 
@@ -281,7 +271,7 @@ def main(args: Args) -> None:
                 draw(one, task)
                 text += section(one, task)
     if text:
-        args.publish("landscape", text, "experiments.md")
+        args.publish("landscape", text, "experiments.md", everywhere=True)
 
 
 if __name__ == "__main__":

@@ -22,13 +22,13 @@ from typing import Literal
 
 import numpy as np
 from common import TASKS, Line, Panel, TaskName, plot
-from runner import COLUMNS, Case, Curve, RunFlags, Runner, curve, folders, parse, passing, seed, summary
+from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, parse, passing, seed, summary
 from tables import ROOT, Row, markdown, read_csv
 
 from diffsim.training import Count, fail
 
 POINTS = 100  # kept of each run
-PPO, STIFF = "ppo_baseline", ("--penalty", "k_n=1e5", "k_d=1e4")  # on which published SHAC's hopper falls to 1,603
+PPO = "ppo_baseline"
 # The return to which learners are compared, those whose passing is timed, and those published of SHAC and PPO: Georgiev
 # et al. 2024, "Adaptive Horizon Actor-Critic", 10 seeds, best point of the curve; AHAC has 6,964 on humanoid_mtu.
 # fmt: off
@@ -43,10 +43,7 @@ RETURNS: dict[TaskName, tuple[int, tuple[int, ...], dict[str, int]]] = {
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
-    "shac_stiff":          ("shac", *STIFF),
-    "shac_stiff_fast":     ("shac", *STIFF, "--accuracy", "fast"),
-    "shac_stiff_accurate": ("shac", *STIFF, "--accuracy", "accurate"),
-    "shac_stiff_implicit": ("shac", *STIFF, "--integrator", "implicit"),
+    "shac_stiff":          ("shac", "--penalty", "k_n=1e5", "k_d=1e4"),  # published SHAC's hopper falls to 1,603
     "shac_explicit_8":     ("shac", "--integrator", "semi_implicit", "--substeps", "8"),
     "shac_explicit_12":    ("shac", "--integrator", "semi_implicit", "--substeps", "12"),
     "shac_implicit_16":    ("shac", "--integrator", "implicit", "--substeps", "16"),
@@ -84,27 +81,14 @@ LEARNER_PAGES = {"shac": "shac.md", PPO: "ppo.md", "bptt": "bptt.md"}
 KEPT = ("return", "each seed", "explicit, substeps x4", "kept")
 RESULT_COLUMNS = ("task", "seeds", *KEPT[:2], "published", "training (s)", "return passes", "kept")
 SETTINGS = ("integrator", "substeps", "seeds", "iterations", "training (s)")
-# The gate: 97 % of the return is kept.
-GATE_COLUMNS = (
-    "machine",
-    "task",
-    "learner",
-    *SETTINGS[:-1],
-    *KEPT,
-    "gate",
-    "in the reference",
-)
+GATE_COLUMNS = ("machine", "task", "learner", *SETTINGS, *KEPT, "gate", "in the reference")  # the gate: 97 % is kept
 MUSCLE_COLUMNS = ("machine", "learner", *SETTINGS, *KEPT[:2], "speed (m/s)", "falls per episode", "return passes")
 
 
 @dataclass
-class Args(RunFlags):
-    algorithm: str = (
-        "shac"  # learner: a script in the repository's root, without .py, or a variant, e.g. shac_no_critic
-    )
-    experiment: Name | None = None
-    """several learners at once: Figures 4 and 7 of the SHAC paper, two more of the kind, its Figures 6, 8 and 9; SHAC
-    at each accuracy; and on humanoid_mtu"""
+class Args(ScriptFlags):
+    algorithm: str = "shac"  # learner: a script in the repository's root, without .py, or a variant, e.g. shac_1024
+    experiment: Name | None = None  # several learners beside each other, among them those of the paper's Figures 4 to 9
     seeds: tuple[int, ...] = (1, 2, 3)  # seeds of each
     jobs: Count = 1  # runs at a time; they share the device, which slows each of them down
     evaluate_only: bool = False  # train nothing: evaluate the runs there are, finished or not
@@ -143,32 +127,23 @@ def table(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> lis
     for env in tasks:
         found = {learner: runs for learner in learners if (runs := curves(args, learner, env))}
         target, _, published = RETURNS[env]
-        ends, passed = dict[str, list[list[float]]](), dict[str, list[float]]()
-        for learner, runs in found.items():
-            ends[learner] = [[run[x][-1] for run in runs] for x in ("control_steps", "seconds")]
-            passed[learner] = [median(passing(runs, target, x)) for x in ("control_steps", "seconds")]
         for learner, runs in found.items() if len(found) > 1 else ():
             best = [np.nanmax(run["return"]) for run in runs]
-            final = [values[-1] for run in runs if len(values := run["eval_return"][~np.isnan(run["eval_return"])])]
-            (total, training), (steps, seconds) = map(median, ends[learner]), passed[learner]
-            never = steps == math.inf
+            last = [values[-1] for run in runs if len(values := run["eval_return"][~np.isnan(run["eval_return"])])]
+            ends = [[run[x][-1] for run in runs] for x in ("control_steps", "seconds")]
+            steps, seconds = (median(passing(runs, target, x)) for x in ("control_steps", "seconds"))
+            spread = f" ± {pstdev(best):.0f}" if len(runs) > 1 else ""
             row: dict[str, object] = {"task": env, "learner": learner, "seeds": len(runs)}
-            row["best return of training"] = f"{mean(best):.0f}" + f" ± {pstdev(best):.0f}" * (len(runs) > 1)
-            row["published"] = published.get(learner, "")
-            row["last evaluation"] = f"{median(final):.0f}" if final else ""
-            row |= {"control steps": millions(total), "training, s": f"{training:.0f}", "target": target}
-            row["steps to target"] = "not by most" if never else millions(steps)
-            row["s to target"] = "" if never else f"{seconds:.0f}"
-            rows.append(row)
+            row |= {"best return of training": f"{mean(best):.0f}{spread}", "published": published.get(learner, "")}
+            row |= {"last evaluation": f"{median(last):.0f}" if last else ""}
+            row |= {"control steps": f"{median(ends[0]) / 1e6:.3g} M", "training, s": f"{median(ends[1]):.0f}"}
+            row |= {"target": target, "steps to target": "never" if steps == math.inf else f"{steps / 1e6:.3g} M"}
+            rows.append(row | {"s to target": "never" if seconds == math.inf else f"{seconds:.0f}"})
     return rows
 
 
-def millions(steps: float) -> str:
-    return f"{steps / 1e6:.3g} M"
-
-
 def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[TaskName]) -> None:
-    """Each seed (thin), the median (bold) against control steps and seconds; on log axes where ends lie far apart."""
+    """Each seed (thin) and the median (bold) against control steps and seconds, on log axes if ends lie far apart."""
     grid = list[list[Panel]]()
     for x, text in (("control_steps", "control steps"), ("seconds", "seconds of training")):
         panels = list[Panel]()
@@ -207,13 +182,13 @@ def report(args: Args, name: Name) -> None:
     title, learners, tasks = EXPERIMENTS[name]
     if name == "accuracy":
         text = markdown(summaries(args, ("shac", *PRESETS), tasks), GATE_COLUMNS)
-        return args.publish("learning", text, "accuracy.md")
+        return args.publish("learning", text, "accuracy.md", everywhere=True)
     if name == "muscles":
-        args.publish("results", markdown(summaries(args, learners, tasks), MUSCLE_COLUMNS), "humanoid_mtu.md")
+        text = markdown(summaries(args, learners, tasks), MUSCLE_COLUMNS)
+        args.publish("results", text, "humanoid_mtu.md", everywhere=True)
         return draw(args, "humanoid_mtu", learners, tasks)
     rows = table(args, learners, tasks)
-    place = name if args.directory.name == "cpu" else f"{name}_{args.directory.name}"
-    args.publish(place, f"{markdown(rows)}\n![{title}]({args.link(name)})\n", "experiments.md")
+    args.publish(name, f"{markdown(rows)}\n![{title}]({args.link(name)})\n", "experiments.md")
     if compared := [env for env in tasks if env in {row["task"] for row in rows}]:
         draw(args, name, learners, compared)
 
@@ -239,7 +214,7 @@ def main(args: Args) -> None:
     else:
         rows = [row for row in args.read("learning") if row["learner"] == args.algorithm]
         rows.sort(key=lambda row: TASKS.index(row["task"]))
-        args.publish("results", markdown(rows, RESULT_COLUMNS), {"cpu": LEARNER_PAGES.get(args.algorithm, "")})
+        args.publish("results", markdown(rows, RESULT_COLUMNS), LEARNER_PAGES.get(args.algorithm, "experiments.md"))
         draw(args, args.algorithm, learners, [env for env in TASKS if curves(args, args.algorithm, env)])
 
 

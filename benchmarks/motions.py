@@ -10,12 +10,12 @@ from typing import Literal, get_args
 import mujoco
 import numpy as np
 import torch
-from common import TaskFlags, TaskName
+from common import CommonFlags, TaskName
 from tables import ROOT
 from torch import Tensor, nn
 
 import diffsim
-from diffsim import DiffEnv, Integration, Scene, Simulator
+from diffsim import Integration, Scene, Simulator
 from diffsim.kernels.lanes import Division
 from diffsim.tasks import Task
 from diffsim.training import Count, fail, load_policy, parse
@@ -55,7 +55,7 @@ def simulator(
 
 
 @dataclass
-class PolicyFlags(TaskFlags):
+class PolicyFlags(CommonFlags):
     checkpoint: Path | None = None  # of any script, whose policy acts (default: shac.py's in --runs, else untrained)
     runs: Path = RUNS  # directory of the runs of benchmarks/learning.py
     states: Count = 32  # start states, which the policy visits
@@ -129,16 +129,6 @@ def replay(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple
         path.append((q.double(), v.double()))
     qpos, qvel = (torch.stack(states) for states in zip(*path, strict=True))
     return qpos, qvel, int(bad.sum())
-
-
-def make_env(name: str, num_envs: int, setting: Integration, penalty: dict[str, float]) -> DiffEnv:
-    integrator, substeps, theta = setting.integrator, setting.substeps, setting.theta
-    return diffsim.make(
-        name, num_envs, horizon=1, substeps=substeps, integrator=integrator, theta=theta, penalty=penalty
-    )
-
-
-# What MuJoCo says of states -------------------------------------------------------------------------------------------
 
 
 def state_errors(model: mujoco.MjModel, qpos: Tensor, expected: Tensor) -> Array:

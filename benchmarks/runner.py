@@ -1,7 +1,6 @@
 """Runs of the scripts, each in a folder of its own: what was interrupted goes on, what has finished is kept.
 
-A run is trained, and its policy evaluated as it was trained and explicitly with finer substeps. All is read from the
-files that the scripts write.
+All is read from the files that the scripts write.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ from diffsim.training import checkpoint
 FINER = 4  # times the substeps, of the run's own and of the task's default
 COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return")  # kept of progress.csv
 Curve = dict[str, np.ndarray]
-R = TypeVar("R", bound="RunFlags")
+R = TypeVar("R", bound="ScriptFlags")
 
 
 @dataclass
-class RunFlags(common.TaskFlags):
+class ScriptFlags(common.CommonFlags):
     device: str = "auto"  # torch device of the learners (auto: the GPU if there is one)
     time_limit: float | None = None  # seconds after which runs in progress stop and save; the next call goes on
     runs: Path = RUNS  # directory of the runs
@@ -51,8 +50,6 @@ def parse(kind: type[R], description: str | None) -> R:
 
 
 class Case(NamedTuple):
-    """What is to be run."""
-
     folder: Path
     env: str
     seed: int
@@ -61,7 +58,7 @@ class Case(NamedTuple):
 
 
 class Runner:
-    def __init__(self, args: RunFlags, jobs: int = 1) -> None:
+    def __init__(self, args: ScriptFlags, jobs: int = 1) -> None:
         self.args, self.jobs = args, jobs
         self.stop_at = math.inf if args.time_limit is None else time.monotonic() + args.time_limit
 
@@ -124,9 +121,6 @@ class Runner:
         if process.returncode:
             print(f"{case.folder}: stopped or failed, see output.txt there", flush=True)
         return process.returncode == 0
-
-
-# What the runs left ---------------------------------------------------------------------------------------------------
 
 
 def finer(folder: Path, substeps: int) -> Path:

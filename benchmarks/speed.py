@@ -1,11 +1,10 @@
 """How fast the simulator and a whole SHAC iteration are, against MuJoCo's C step on the same model in the same run.
 
-    python benchmarks/speed.py --env ant --num-envs 64
     python benchmarks/speed.py                                every task, 64 and 256 environments
     python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
     python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
-    python benchmarks/speed.py --parts kernels --device cuda --env hopper  where a GPU's time of an iteration goes
+    python benchmarks/speed.py --parts scene                  links, spheres, limits, dampers, springs, balls, muscles
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
 A machine that does something else meanwhile gives wrong numbers.
@@ -28,47 +27,56 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import mujoco
 import numpy as np
 import torch
-from common import Line, Panel, TaskFlags, TaskName, measured, parse, plot
-from motions import CONTROL_DT, shac, simulator
+from common import CommonFlags, Line, Panel, TaskName, measured, parse, plot
+from motions import CONTROL_DT, idle, integration, shac, simulator
 from tables import ROOT, Row, markdown, read_csv
-from torch.profiler import ProfilerActivity, profile
 
 import diffsim
-from diffsim import DiffEnv, Scene, Simulator
+from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
 from diffsim.launcher import available_cores
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
-from diffsim.training.flags import Range
 from diffsim.training.run import make_env
 
+SETTING = integration("semi_implicit", 16)
+LINKS = 16  # of the chain to which everything but links is added
+PARTS = {  # counts, the feature that is code of its own, and what gives it to a joint, without a force
+    "link": ((4, 8, 16, 32), "", ""),
+    "sphere in the air": ((1, 4, 8, 16, 32), "contact", ""),
+    "sphere in the ground": ((1, 4, 8, 16, 32), "", ""),
+    "limit": ((1, 4, 8, 16), "limit", 'range="-2 2" limited="true"'),
+    "damper": ((1, 4, 8, 16), "damping", 'damping="1e-300"'),
+    "spring": ((1, 4, 8, 16), "stiffness", 'stiffness="1e-300"'),
+    "ball joint": ((1, 4, 8, 15), "", 'type="ball"'),
+    "muscle": ((1, 4, 8, 15), "muscle", ""),
+}
+MUSCLE = (  # from a link to the next
+    '<spatial name="t{0}"> <site site="s{0}"/> <site site="s{1}"/> </spatial>',
+    '<general tendon="t{0}" gainprm="-10" ctrllimited="true" ctrlrange="0 1"/>',
+)
 Precision = Literal["float32", "float64"]
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
-Part = Literal["physics", "scaling", "training", "time", "kernels"]
+Part = Literal["physics", "scaling", "training", "time", "scene"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; larger settings of the scaling table are left out
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
 
 @dataclass
-class Args(TaskFlags):
+class Args(CommonFlags):
     parts: tuple[Part, ...] = ("physics", "training")  # tables to measure
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
-    scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)
-    """batch sizes of the scaling table, at a horizon of 32"""
+    scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
     horizons: tuple[Count, ...] = (1, 4, 8, 16, 32, 64, 128)  # horizons of the scaling table, at 64 environments
-    compare: tuple[Literal["mujoco", "mujoco_warp"], ...] = ("mujoco",)
-    """simulators in the physics table beside ours; mujoco_warp must be installed, and wants --device cuda"""
     dtype: tuple[Precision, ...] = ("float32", "float64")  # precisions of the physics table
-    states: Count = 9
-    """states, visited by random actions, in which a control step is timed; the median over them counts"""
-    repeats: Count = 5
-    """times that all competitors take their turn in each state; the fastest counts, the others were disturbed"""
-    iterations: Annotated[int, Range(4)] = 30  # SHAC iterations of the training table; the first three are not counted
+    states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
+    repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
+    iterations: Count = 27  # SHAC iterations of the training table, after three that are not counted
 
 
 State = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -178,7 +186,7 @@ def mujoco_warp_timer(device: str, scene: Scene, num_envs: int, substeps: int) -
 
 
 def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
-    """With all models of its muscles if a task has any, and without them."""
+    """With all models of its muscles if a task has any, and without; beside MuJoCo, and mujoco_warp if installed."""
     threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()} if args.device == "cpu" else {args.device: 1}
     default, whole = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs=1).scene
     scenes = {"": whole}
@@ -188,7 +196,7 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
     for num_envs in args.num_envs:
         key, shape = ("", "", ""), (whole, num_envs, default.substeps)
         competitors = {key: mujoco_timer(*shape)}
-        if "mujoco_warp" in args.compare:
+        if beside := args.device != "cpu" and importlib.util.find_spec("mujoco_warp") is not None:
             competitors["", "", "warp"] = mujoco_warp_timer(args.device, *shape)
         for (muscles, scene), dtype, (place, count) in product(scenes.items(), args.dtype, threads.items()):
             sim = simulator(scene, default, num_envs, DTYPES[dtype], device=args.device, threads=count)
@@ -197,7 +205,7 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
         race(competitors, states[:1], 1)  # compiles and fills caches
         times = race(competitors, states[1:], args.repeats)
         mj = times.pop(key)["mj_step"] / per_substep
-        warp = times.pop(("", "", "warp"))["mj_step"] / per_substep if "mujoco_warp" in args.compare else ""
+        warp = times.pop(("", "", "warp"))["mj_step"] / per_substep if beside else ""
         for (muscles, precision, place), t in times.items():
             forward, backward = t["forward"] / per_substep, t["backward"] / per_substep
             alone, bare = times[muscles, precision, next(iter(threads))], times.get(("none", precision, place), t)
@@ -285,15 +293,11 @@ def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     plot(args.picture("speed"), [panels], (4.5, 3.6))
 
 
-def make_learner(args: Args, name: TaskName) -> tuple[shac.Args, DiffEnv, shac.SHAC]:
-    settings = parse_script(shac.Args, ["--env", name, "--device", args.device])
-    env = make_env(settings, settings.num_envs, settings.horizon)
-    return settings, env, shac.SHAC(settings, env)
-
-
 def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
     """Table 12: the parts of one iteration of SHAC, each captured and timed alone."""
-    settings, env, learner = make_learner(args, name)
+    settings = parse_script(shac.Args, ["--env", name, "--device", args.device])
+    env = make_env(settings, settings.num_envs, settings.horizon)
+    learner = shac.SHAC(settings, env)
 
     def forward() -> torch.Tensor:
         noise = learner.actor.sample_noise(settings.horizon, settings.num_envs)
@@ -308,36 +312,12 @@ def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
     first, both, critic = (1e3 * median(timed(call, env.device, warmup=4, calls=20)) for call in calls)
     row: dict[str, object] = {"task": name, "environments": settings.num_envs, "forward, ms": first}
     row |= {"backward, ms": both - first, "critic, ms": critic}
-    published = zip(("forward", "backward", "critic"), TABLE_12.get(name, ("",) * 3), strict=True)
-    yield row | {f"published {part}, s (TITAN X)": value for part, value in published}
-
-
-def measure_kernels(args: Args, name: TaskName) -> Iterator[Row]:
-    """What a GPU does in the two graphs of an iteration, by torch.profiler; prints the ten longest of each, too."""
-    _, env, learner = make_learner(args, name)
-    row: dict[str, object] = {"task": name}
-    for part, half, of in (("window", learner.update_actor, env), ("critic", learner.update_critic, None)):
-        call = graph.capture(half, env.device, of)
-        timed(call, env.device, warmup=0, calls=4)
-        with profile(activities=[ProfilerActivity.CUDA]) as record:
-            call()
-            torch.cuda.synchronize()
-        kernels = defaultdict[str, list[float]](list)
-        for event in record.events() or ():
-            if event.device_type == torch.autograd.DeviceType.CUDA:
-                kernels[event.name].append(event.device_time / 1e3)
-        for kernel, times in sorted(kernels.items(), key=lambda item: -sum(item[1]))[:10]:
-            print(f"{part}: {len(times):6d} x {1e3 * median(times):8.2f} us = {sum(times):8.3f} ms  {kernel[:80]}")
-        ours = {k: sum(sum(t) for n, t in kernels.items() if n.startswith(k)) for k in ("forward_", "backward_")}
-        if part == "window":
-            row |= {f"simulator {k[:-1]} (ms)": ms for k, ms in ours.items()}
-        row[f"torch, {part} (ms)"] = sum(map(sum, kernels.values())) - sum(ours.values())
-        row[f"kernels, {part}"] = sum(map(len, kernels.values()))
-    yield row
+    published = dict(zip(("forward", "backward", "critic"), TABLE_12.get(name, ()), strict=False))
+    yield row | {f"published {part}, s (TITAN X)": value for part, value in published.items()}
 
 
 def run_shac(cache: str, directory: Path, arguments: list[str]) -> tuple[float, float]:
-    """Seconds from the start of shac.py to its first iteration's end, and its peak memory in MiB."""
+    """Seconds from the start of shac.py to the end of its first iteration, and its peak memory in MiB."""
     command = [sys.executable, str(ROOT / "shac.py"), "--run-dir", str(directory), "--quiet", *arguments]
     start, first, ended = time.perf_counter(), None, 0
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"WARP_CACHE_PATH": cache})
@@ -357,11 +337,11 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
     if args.device != "cpu":
         techniques = {"cuda graph": [], "cuda, eager": ["--no-cuda-graph"]}
     for technique, flags in techniques.items():
-        flags += ["--env", name, "--device", args.device, "--iterations", str(args.iterations + 1)]  # never evaluated
+        flags += ["--env", name, "--device", args.device, "--iterations", str(args.iterations + 4)]  # never evaluated
         flags += ["--eval-every", "0", "--save-every", "0", "--stop-after"]
         with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as runs:
             cold, _ = run_shac(cache, Path(runs) / "cold", [*flags, "1"])
-            warm, memory = run_shac(cache, run := Path(runs) / "warm", [*flags, str(args.iterations)])
+            warm, memory = run_shac(cache, run := Path(runs) / "warm", [*flags, str(args.iterations + 3)])
             progress = read_csv(run / "progress.csv")[3:]
             num_envs = json.loads((run / "args.json").read_text())["num_envs"]
         names = ("total", "update_critic", "sim_forward", "sim_backward")
@@ -374,24 +354,97 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
         yield row | {"start with nothing compiled (s)": cold}
 
 
-MEASURES: dict[Part, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, ...]]] = {
+def chain(links: int, what: str, count: int) -> Scene:
+    """A floating chain with `count` of `what`."""
+    text = ""
+    for k in range(links):
+        first = 1 if what == "ball joint" else 0
+        extra = PARTS[what][2] if first <= k < count + first else ""
+        joint = f'<joint axis="0 {k % 2} {1 - k % 2}" {extra}/>' if k else "<freejoint/>"
+        spheres = range(len(range(k, count, links)) if what.startswith("sphere") else 0)
+        geoms = '<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.04" contype="0" conaffinity="0"/>'
+        geoms += "".join(f'<geom type="sphere" size="0.05" pos="{0.03 * s} 0 0"/>' for s in spheres)
+        text += f'<body pos="{0.2 if k else 0} 0 0">{joint}{geoms}<site name="s{k}" pos="0.1 0 0.04"/>'
+    text = f'<worldbody><geom type="plane" size="1 1 1"/>{text}{"</body>" * links}</worldbody>'
+    if what == "muscle":
+        tendons, motors = ("".join(part.format(k, k + 1) for k in range(count)) for part in MUSCLE)
+        text += f"<tendon>{tendons}</tendon><actuator>{motors}</actuator>"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "chain.xml"
+        path.write_text(f'<mujoco><compiler angle="radian"/>{text}</mujoco>')
+        return diffsim.load_scene(path)
+
+
+def chain_states(scene: Scene, num_envs: int, height: float) -> State:
+    generator = torch.Generator().manual_seed(0)
+    shapes = ((num_envs, width) for width in (scene.nq, scene.nv))
+    qpos, qvel = (0.1 * torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    qpos[:, 2], qpos[:, 3] = height, 1.0
+    qpos[:, scene.qpos_adr[scene.ball == 0]] = 1.0
+    return qpos, qvel, idle(scene).repeat(num_envs, 1)
+
+
+def difference(scene: Scene, feature: str) -> float:
+    """Largest over the state after a control step and its gradient, relative to each one's largest entry."""
+    results = []
+    for one in (scene, scene.without(feature)):
+        leaves = [x.clone().requires_grad_() for x in chain_states(one, 4, 5.0)]
+        q, v = simulator(one, SETTING, 4, torch.float64).step(*leaves)
+        results.append([q, v, *torch.autograd.grad(q.square().sum() + v.square().sum(), leaves[:2])])
+    return max(((a - b).abs().max() / a.abs().max()).item() for a, b in zip(*results, strict=True))
+
+
+def measure_scene(args: Args) -> Iterator[Row]:
+    """What each part of a scene costs, added to a floating chain of hinges; a ball joint stands in a hinge's place."""
+    for what, (counts, feature, _) in PARTS.items():
+        for count in counts:
+            scene, num_envs = chain(count if what == "link" else LINKS, what, count), args.num_envs[-1]
+            threads = 1 if args.device == "cpu" else None
+            sim = simulator(scene, SETTING, num_envs, device=args.device, threads=threads)
+            state = chain_states(scene, num_envs, 0.0 if what == "sphere in the ground" else 5.0)
+            t = race({0: timer(sim)}, [state], 6 * args.repeats)[0]
+            row: dict[str, object] = {"of": what, "count": count, "environments": num_envs}
+            row |= {f"{kind} (us/substep)": t[kind] / num_envs / SETTING.substeps for kind in ("forward", "backward")}
+            yield row | {"left out": difference(scene, feature) if feature and count == counts[-1] else ""}
+
+
+def report_scene(args: Args) -> None:
+    """The cost of each part as a line in its count: the slope is the cost of one, R^2 says how straight it is."""
+    new = [] if args.draw_only else list(measure_scene(args))
+    rows = args.merge("scene_cost", new, ("of", "count", "environments"))
+    lines, panels = list[Row](), list[Panel]()
+    rows = [row for row in rows if row["environments"] == str(args.num_envs[-1])]
+    for what in PARTS if rows else ():
+        found = [row for row in rows if row["of"] == what]
+        line: dict[str, object] = {"of": what, "counts": " ".join(row["count"] for row in found)}
+        curves = list[Line]()
+        for k, kind in enumerate(("forward", "backward")):
+            x, y = (np.array([float(row[c]) for row in found]) for c in ("count", f"{kind} (us/substep)"))
+            slope, start = np.polyfit(x, y, 1)
+            line[f"{kind}: one (ns/substep)"] = f"{1e3 * slope:.3g}"
+            line[f"{kind}: none (ns/substep)"] = f"{1e3 * start:.3g}"
+            line[f"{kind}: R^2"] = f"{1 - ((y - slope * x - start) ** 2).sum() / ((y - y.mean()) ** 2).sum():.3f}"
+            curves.append(Line(x, y, f"C{k}o-", kind))
+        lines.append(line | {"left out": found[-1]["left out"]})
+        panels.append(Panel(curves, what, "", "" if panels else "us per environment-substep", zero=True))
+    args.publish("scene_cost", markdown(lines), "accuracy.md")
+    plot(args.picture("scene_cost"), [panels], (2.6, 2.8))
+
+
+MEASURES: dict[str, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, ...]]] = {
     "physics": (measure_physics, ("task", "environments", "precision", "device", "muscles")),
     "scaling": (measure_scaling, ("task", "environments", "horizon", "technique")),
     "training": (measure_training, ("task", "environments", "device")),
     "time": (measure_time, ("task",)),
-    "kernels": (measure_kernels, ("task",)),
 }
 
 
 def main(args: Args) -> None:
-    if args.device == "cpu" and not args.draw_only and ("kernels" in args.parts or "mujoco_warp" in args.compare):
-        fail("--parts kernels and --compare mujoco_warp are of a GPU's graphs: give --device cuda")
-    if "mujoco_warp" in args.compare and importlib.util.find_spec("mujoco_warp") is None:
-        fail("--compare mujoco_warp needs it installed: pip install mujoco-warp")
-    for part in args.parts:
-        rows = measured(args, f"speed_{part}", *MEASURES[part])
-        pages = {"cpu": "experiments.md", "h100": "experiments_gpu.md"} if part == "time" else {}
-        args.publish(part, markdown(rows), pages)
+    if "scene" in args.parts:
+        report_scene(args)
+    for part in (part for part in args.parts if part != "scene"):
+        rows = measured(args, "time" if part == "time" else f"speed_{part}", *MEASURES[part])
+        args.publish(part, markdown(rows), "experiments.md")
         if part == "scaling" and rows:
             draw(args, rows)
 

@@ -1,18 +1,12 @@
 """Where the simulator breaks: the largest stable step, and what it does at extremes of constants, states and actions.
 
     python benchmarks/stability.py                         every task and integrator, a quarter of an hour
-    python benchmarks/stability.py --env hopper --parts step sweeps horizon
     python benchmarks/stability.py --parts long --steps 100_000
 
-Writes stability_*.csv, stability.png and the tables of docs/stability.md, where each is explained. All is float32, from
-states that a trained policy visits:
-
-- step: the fewest substeps that stay finite and below twice the largest kinetic energy of a reference (64 times the
-  default's substeps), as do all larger counts.
-- sweeps: one thing is driven to an extreme. With the motors off kinetic and potential energy must never exceed what was
-  there at the start, springs of ground and limits included (10 % allowed); under actions, twice the reference's.
-- horizon: gradient of the mean reward with respect to the policy's weights, through 1 to 1,000 control steps.
-- long: control steps of the policy in a row, resets included.
+Writes stability_*.csv, stability.png and the tables of docs/stability.md, which explains them. All is float32, from
+states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below twice the largest
+kinetic energy of a reference, 64 times as fine. "sweeps" drives one thing to an extreme: without motors the energy must
+never exceed that of the start, springs included, by 10 %; under actions, the kinetic one not twice the reference's.
 """
 
 from __future__ import annotations
@@ -23,21 +17,20 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Literal
 
 import motions
 import mujoco
 import numpy as np
 import torch
 from common import Line, Panel, TaskName, measured, parse, plot
-from motions import CONTROL_DT, INTEGRATORS, Array, integration, mechanics, replay, simulator
+from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay, simulator
 from tables import Row, markdown
 from torch import Tensor
 
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.training import Count
-from diffsim.training.flags import Range
 
 Part = Literal["step", "sweeps", "horizon", "long"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
@@ -59,10 +52,10 @@ NEEDS_GROUND = list(SWEEPS)[:5]
 
 
 @dataclass
-class Args(motions.PolicyFlags):
+class Args(PolicyFlags):
     parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long")  # tables to measure
     states: Count = 8  # start states
-    steps: Annotated[int, Range(64)] = 1_000_000  # control steps of the table "long", over all of its 64 environments
+    steps: Count = 1_000_000  # control steps of the table "long", over all of its 64 environments
 
 
 class Case(motions.Case):
@@ -81,23 +74,21 @@ class Case(motions.Case):
     def actions(self) -> Tensor:
         return motions.closed_loop(self.reference, self.task, self.policy, self.qpos, self.qvel, 120)
 
-    def kinetic(self, qpos: Tensor, qvel: Tensor) -> float:
-        return max(mechanics(self.model, q, v)[0].max() for q, v in zip(qpos, qvel, strict=True))
-
-    def limit(self, actions: Tensor) -> float:
-        """Twice the largest kinetic energy of the reference under these actions."""
-        return 2 * self.kinetic(*replay(self.reference, self.qpos, self.qvel, actions)[:2])
+    def kinetic(self, sim: Simulator, actions: Tensor) -> tuple[float, int]:
+        """The largest kinetic energy under these actions, and how many environments did not stay finite."""
+        qpos, qvel, bad = replay(sim, self.qpos, self.qvel, actions)
+        return max(mechanics(self.model, q, v)[0].max() for q, v in zip(qpos, qvel, strict=True)), bad
 
 
 def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
     case = Case(args, name)
-    limit, default = case.limit(case.actions), case.task.substeps
+    limit, default = case.kinetic(case.reference, case.actions)[0], case.task.substeps
     for integrator in INTEGRATORS:
         stable: dict[int, bool] = {}
         for count in (c for c in COUNTS if c <= 4 * default and (integrator != "extrapolated" or c % 2 == 0)):
             sim = simulator(case.scene, integration(integrator, count), case.n)
-            q, v, bad = replay(sim, case.qpos, case.qvel, case.actions)
-            stable[count] = bad == 0 and case.kinetic(q, v) < limit
+            energy, bad = case.kinetic(sim, case.actions)
+            stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
         row = {"task": name, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
@@ -172,13 +163,14 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
         if sweep in NEEDS_GROUND and not case.scene.ncontact:
             continue
         scene, model, qpos, qvel, actions = setup(case, sweep, value)
-        limit = case.limit(actions) if "action" in sweep else 0.0
+        limit = case.kinetic(case.reference, actions)[0] if "action" in sweep else 0.0
         for integrator in INTEGRATORS:
             sim = simulator(scene, integration(integrator, case.task.substeps), case.n, horizon=8)
-            q, v, bad = replay(sim, qpos, qvel, actions)
             if "action" in sweep:
-                within = case.kinetic(q, v) < limit
+                energy, bad = case.kinetic(sim, actions)
+                within = energy < 2 * limit
             else:
+                q, v, bad = replay(sim, qpos, qvel, actions)
                 before = mechanics(model, qpos, qvel)[1] + stored(scene, model, qpos)
                 # Potential energy has no zero; with its least value along the path taken off, all of it is motion.
                 path = np.array([mechanics(model, a, b)[:2] for a, b in zip(q, v, strict=True)])
@@ -199,14 +191,12 @@ def summary(rows: list[dict[str, str]]) -> list[Row]:
         line = {"task": task, "sweep": sweep, "range": f"{group[0]['value']} .. {group[-1]['value']}"}
         for integrator in INTEGRATORS:
             own = [row for row in group if row["integrator"] == integrator]
-            how = [(row["value"], "not finite" if row["finite"] != "True" else "energy") for row in own if failed(row)]
-            line[integrator] = f"{how[0][0]} ({how[0][1]})" if how else "-" if own else "not measured"
+            line[integrator] = "-" if own else "not measured"
+            for row in reversed(own):
+                if "False" in (row["finite"], row["energy bounded"]):
+                    line[integrator] = f"{row['value']} ({'energy' if row['finite'] == 'True' else 'not finite'})"
         lines.append(line | {"largest gradient": max(float(row["gradient"]) for row in group)})
     return lines
-
-
-def failed(row: dict[str, str]) -> bool:
-    return row["finite"] != "True" or row["energy bounded"] != "True"
 
 
 def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
@@ -242,14 +232,14 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
     policy, returns = args.policy(name)[0].float(), list[float]()
     obs, _ = env.reset(seed=0)
     bad, fastest = torch.zeros((), dtype=torch.long), torch.zeros(())
-    for _ in range(args.steps // 64):
+    for _ in range(math.ceil(args.steps / 64)):
         obs, _, _, _, info = env.step(policy(obs))
         bad += info["nonfinite"].sum()
         fastest = torch.maximum(fastest, env.qvel.abs().max())
         returns += info["episode"]["r"][info["_episode"]].tolist()
     row = {
         "task": name,
-        "control steps": args.steps // 64 * 64,
+        "control steps": 64 * math.ceil(args.steps / 64),
         "contained": int(bad),
         "largest velocity": fastest.item(),
     }
@@ -267,8 +257,7 @@ def draw(args: Args, rows: list[dict[str, str]]) -> None:
         ends = [float(row["gradient"]) for row in rows if row["task"] == name]
         lines.append(Line((32, 32), (min(ends), max(ends)), "k--", "SHAC's window", 0.8))
         panels.append(Panel(lines, name, "control steps", "" if panels else "|gradient of the mean reward|", log="xy"))
-    title = "gradient of a trained policy's weights against the horizon"
-    plot(args.picture("stability"), [panels], (3.4, 3.2), title)
+    plot(args.picture("stability"), [panels], (3.4, 3.2))
 
 
 MEASURES: dict[Part, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, ...]]] = {
@@ -283,7 +272,7 @@ def main(args: Args) -> None:
     for part in args.parts:
         rows = measured(args, f"stability_{part}", *MEASURES[part])
         if part != "horizon":
-            args.publish(part, markdown(summary(rows) if part == "sweeps" else rows), {"cpu": "stability.md"})
+            args.publish(part, markdown(summary(rows) if part == "sweeps" else rows), "stability.md")
         elif rows:
             draw(args, rows)
 

@@ -30,6 +30,7 @@ def digits(value: object) -> str:
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
+@functools.cache
 def origin(device: str = "cpu") -> str:
     """The comment line of rows that this process measures on a device."""
     info = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
@@ -39,17 +40,10 @@ def origin(device: str = "cpu") -> str:
         machine = torch.cuda.get_device_name(device)
     packages = {"torch": "torch", "warp": "warp-lang", "mujoco": "mujoco"}
     versions = ", ".join(f"{name} {metadata.version(package)}" for name, package in packages.items())
+    git = subprocess.run("git describe --always --dirty || echo unknown", shell=True, cwd=ROOT, capture_output=True)
     command = shlex.join(["python", os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
-    return f"# {machine}; python {platform.python_version()}, {versions}; revision {revision()}; {command}\n"
-
-
-@functools.cache
-def revision() -> str:
-    try:
-        git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
-    except FileNotFoundError:
-        return "unknown"
-    return git.stdout.strip() or "unknown"
+    made = f"python {platform.python_version()}, {versions}; revision {git.stdout.decode().strip()}"
+    return f"# {machine}; {made}; {command}\n"
 
 
 def origins(path: Path) -> list[str]:

@@ -1,19 +1,15 @@
 """What speed costs in accuracy: integrators, substeps and precisions against a float64 reference.
 
-    python benchmarks/tradeoff.py --env ant --checkpoint runs/<run>/checkpoint.pt
     python benchmarks/tradeoff.py                     every task, with the policies that benchmarks/learning.py trained
     python benchmarks/tradeoff.py --env hopper --states 8 --dtype float32 --factors 0.25 1 4         a short look
     python benchmarks/tradeoff.py --env hopper --penalty k_n=1e5 k_d=1e4     on another ground, as a task of its own
     python benchmarks/tradeoff.py --timings-only                             on a quieter machine, or --device cuda
+    python benchmarks/tradeoff.py --adaptive                                 what substeps that adapt could win
 
 The reference is explicit with 16 times the most substeps measured. The policy's actions in it are replayed open-loop
-from states that the policy visits. docs/accuracy.md explains the errors; tradeoff.csv has more:
-
-- penetration: deepest within 0.5 s, of any geom, minus the reference's (mm);
-- flight 0.5 s: error of the state without ground and limits, motors off (cartpole: with its motor), against MuJoCo's
-  RK4 at 128 steps per control step; the one motion for which MuJoCo's C simulator solves the same equations;
-- energy, momentum: drift in such a flight without dampers and springs, as parts of the kinetic energy and of the linear
-  and angular momentum; momentum of floating robots only.
+from states that the policy visits. docs/accuracy.md explains the errors. tradeoff.csv also has: how much deeper than
+the reference a robot sinks within 0.5 s; flight, 0.5 s without ground, limits and motors (cartpole keeps its), against
+MuJoCo's RK4 at 128 steps per control step; and what energy and momentum lose there without dampers and springs.
 """
 
 from __future__ import annotations
@@ -31,7 +27,7 @@ import mujoco
 import numpy as np
 import torch
 from common import TASKS, Line, Panel, TaskName, measured, parse, plot
-from motions import CONTROL_DT, INTEGRATORS, Array, Integration, integration, label, replay, simulator, state_errors
+from motions import CONTROL_DT, INTEGRATORS, Array, Integration, PolicyFlags, integration, replay, simulator
 from speed import DTYPES, Precision, race, timer
 from tables import Row, markdown
 from torch import Tensor
@@ -43,6 +39,7 @@ from diffsim.training import Count, Positive, evaluate, fail, parse_penalty
 mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable: some are meant to be, and are seen below
 
 SECONDS = {"0.1 s": 6, "0.5 s": 30, "2 s": 120}  # control steps
+STEPS, INSTANTS = 60, 16  # of an episode; of a control step, at which contact is looked for
 CHUNK = 8  # environments whose gradients are held at once
 PANELS = {
     "state 0.5 s": "state after 0.5 s",
@@ -56,17 +53,17 @@ COLOURS = {kind: f"C{k}" for k, kind in enumerate((*INTEGRATORS, *MUJOCO))}
 
 
 @dataclass
-class Args(motions.PolicyFlags):
-    num_envs: Count = 64
-    """environments of the timings, which are of --device, on a CPU of one thread; errors are measured on the CPU"""
+class Args(PolicyFlags):
+    num_envs: Count = 64  # environments of the timings, which are of --device; errors are measured on the CPU
     dtype: tuple[Precision, ...] = ("float32", "float64")  # precisions
     factors: tuple[Positive, ...] = (0.125, 0.25, 0.5, 1, 2, 4)  # substeps in multiples of the default's, at least 1
     penalty: tuple[str, ...] = ()  # constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4
     timings_only: bool = False  # only time, e.g. on another device or a quieter machine
+    adaptive: bool = False  # instead: what substeps that adapt to contact could win at most
 
 
 def state_error(scene: Scene, qpos: Tensor, expected: Tensor) -> float:
-    return float(np.median(state_errors(scene.mj_model, qpos, expected)))
+    return float(np.median(motions.state_errors(scene.mj_model, qpos, expected)))
 
 
 class Flight:
@@ -158,7 +155,8 @@ class Reference(motions.Case):
         return {horizon: np.concatenate(found) for horizon, found in result.items()}
 
     def policy_return(self, setting: Integration) -> float:
-        env = motions.make_env(self.name, 64, setting, self.penalty)
+        how = setting.substeps, setting.integrator, setting.theta
+        env = diffsim.make(self.name, 64, "cpu", None, 1, *how, penalty=self.penalty)
         return evaluate(env, copy.deepcopy(self.policy).float()).returns.median().item()
 
     def errors(self, setting: Integration, dtype: Precision) -> Iterator[tuple[str, object]]:
@@ -205,9 +203,51 @@ def measure(args: Args, name: TaskName) -> Iterator[Row]:
             threads = 1 if args.device == "cpu" else None
             sim = simulator(timing.scene, setting, timing.n, DTYPES[dtype], device=args.device, threads=threads)
             t = race({0: timer(sim)}, [state], repeats=31)[0]
-            row = own | {"simulator": label(setting), "substeps": setting.substeps, "precision": dtype}
+            row = own | {"simulator": motions.label(setting), "substeps": setting.substeps, "precision": dtype}
             row |= {"device": args.device} | {f"{kind} (us)": t[kind] / timing.n for kind in ("forward", "backward")}
             yield row | (dict(reference.errors(setting, dtype)) if reference else {})
+
+
+@torch.no_grad()
+def measure_adaptive(args: Args, name: TaskName) -> Iterator[Row]:
+    """What substeps that adapt to contact could win at most: how coarse may a control step without contact be?
+
+    The policy's control steps in a fine float64 simulation are sorted into those that touch the ground at one of 16
+    instants and those that do not, and each is taken again, by itself, with fewer substeps. Those in flight may have as
+    few as keep the 95th percentile of their error at or below that of those in contact at the default's substeps. The
+    gain is the default's substeps over the average that is left, if it is known beforehand when a foot will touch.
+    """
+    case = motions.Case(args, name)
+    default, scene, model = case.task.substeps, case.scene, case.scene.mj_model
+    coarse = {n: integration("semi_implicit", n) for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 48) if n <= default}
+    sim = simulator(scene, coarse[default], case.n, torch.float64, control_dt=CONTROL_DT / INSTANTS)
+    qpos, qvel, ctrl = case.qpos, case.qvel, torch.zeros(case.n, scene.nu, dtype=torch.float64)
+    starts, ends, contacts = [], [], []
+    for _ in range(STEPS):
+        ctrl = case.policy(case.task.observe(qpos, qvel, ctrl)).clamp(-1, 1)
+        starts.append((qpos, qvel, ctrl))
+        instants = [qpos]
+        for _ in range(INSTANTS):
+            qpos, qvel = sim.step(qpos, qvel, ctrl)
+            instants.append(qpos)
+        ends.append(qpos)
+        contacts.append(motions.deepest(model, torch.stack(instants)) > 0)
+    qpos, qvel, ctrl = (torch.cat(states) for states in zip(*starts, strict=True))
+    touching = np.concatenate(contacts)
+    row: dict[str, object] = {"task": name, "steps in flight": f"{1 - touching.mean():.3f}"}
+    if not touching.all() and touching.any():  # there is something to compare
+        contact, flight = dict[int, float](), dict[int, float]()
+        for n, setting in coarse.items():
+            end = simulator(scene, setting, len(qpos), torch.float64).step(qpos, qvel, ctrl)[0]
+            errors = motions.state_errors(model, end, torch.cat(ends))
+            contact[n], flight[n] = (float(np.quantile(errors[kind], 0.95)) for kind in (touching, ~touching))
+        enough = [n for n in coarse if all(flight[m] <= contact[default] for m in coarse if m >= n)]
+        least = min([*enough, default])
+        gain = default / (touching.mean() * default + (1 - touching.mean()) * least)
+        row |= {"error in contact, default": contact[default], "error in flight, default": flight[default]}
+        row |= {"default substeps": default, "in flight": least, "error in flight": flight[least]}
+        row["gain"] = f"{gain:.2f}"
+    yield row
 
 
 def number(row: dict[str, str], column: str) -> float:
@@ -238,9 +278,9 @@ def draw(args: Args, rows: list[dict[str, str]], name: str, picture: str) -> Non
                 points.append((x, y))
         best = sorted(points[i] for i in front(points))
         lines.append(Line([x for x, _ in best], [y for _, y in best], "k-", "Pareto front", 0.8))
-        panels.append(Panel(lines, text, f"us per control step, forward{'' if flight else ' + backward'}", log="xy"))
-    title = f"{name}: error against time, numbers are substeps per control step"
-    plot(args.picture(picture), [panels], (4.2, 4.6), title)
+        what = f"us per control step, forward{'' if flight else ' + backward'}; numbers: substeps"
+        panels.append(Panel(lines, f"{name}: {text}", what, log="xy"))
+    plot(args.picture(picture), [panels], (4.2, 4.6))
 
 
 def presets(rows: list[dict[str, str]]) -> Iterator[Row]:
@@ -248,7 +288,9 @@ def presets(rows: list[dict[str, str]]) -> Iterator[Row]:
     found = {(r["task"], r["simulator"], r["substeps"]): r for r in rows if r["precision"] == "float32"}
     for name in TASKS:
         settings = {accuracy: diffsim.TASKS[name].integration(accuracy) for accuracy in ("fast", "default", "accurate")}
-        own = {a: found.get((name, label(setting), str(setting.substeps)), {}) for a, setting in settings.items()}
+        own = {
+            a: found.get((name, motions.label(setting), str(setting.substeps)), {}) for a, setting in settings.items()
+        }
         for accuracy, row in own.items():
             if row.get("state 0.5 s") and own["default"].get("state 0.5 s"):
                 line = {"task": name, "--accuracy": accuracy, "integrator": row["simulator"]}
@@ -259,14 +301,18 @@ def presets(rows: list[dict[str, str]]) -> Iterator[Row]:
 def main(args: Args) -> None:
     if args.states % CHUNK:
         fail(f"--states must be a multiple of {CHUNK}, not {args.states}")
+    if args.adaptive:
+        args.env = tuple(name for name in args.env if name != "cartpole")  # which has no ground
+        rows = measured(args, "adaptive", measure_adaptive, ("task",))
+        return args.publish("adaptive", markdown(rows), "accuracy.md")
     rows = measured(args, "tradeoff", measure, ("task", "simulator", "substeps", "precision", "device"))
     pictures = ""
     for name in dict.fromkeys(row["task"] for row in rows):
         picture = f"tradeoff_{re.sub('[^a-z0-9_]+', '_', name)}"
         draw(args, [row for row in rows if row["task"] == name], name, picture)
         pictures += f"![{name}]({args.link(picture)})\n"
-    args.publish("presets", markdown(list(presets(rows))), {"cpu": "accuracy.md"})
-    args.publish("fronts", pictures, {"cpu": "accuracy.md"})
+    args.publish("presets", markdown(list(presets(rows))), "accuracy.md")
+    args.publish("fronts", pictures, "accuracy.md")
 
 
 if __name__ == "__main__":

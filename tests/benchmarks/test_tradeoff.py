@@ -1,12 +1,12 @@
-"""benchmarks/adaptive.py: control steps are sorted rightly into those in flight and those on the ground."""
+"""Substeps that adapt: control steps are sorted rightly into those in flight and those on the ground."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import adaptive
 import motions
 import pytest
+import tradeoff
 from torch import Tensor
 
 import diffsim
@@ -16,7 +16,7 @@ import diffsim
 def test_a_hopper_is_in_flight_where_it_is_lifted(
     height: float, flight: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An untrained policy, from the start of an episode, 5 cm lower or 1 m above."""
+    """An untrained policy, from the start of an episode, 5 cm lower or 1 m above; only two control steps of it."""
 
     def start(name: str, _policy: object, count: int, _penalty: object) -> tuple[Tensor, Tensor]:
         env = diffsim.make(name, num_envs=count, stochastic_init=False)
@@ -25,6 +25,7 @@ def test_a_hopper_is_in_flight_where_it_is_lifted(
         return qpos, env.qvel.double()
 
     monkeypatch.setattr(motions, "visited_states", start)
-    (row,) = adaptive.measure(adaptive.Args(runs=tmp_path, states=2, steps=2), "hopper")
+    monkeypatch.setattr(tradeoff, "STEPS", 2)
+    (row,) = tradeoff.measure_adaptive(tradeoff.Args(runs=tmp_path, states=2), "hopper")
     assert row["steps in flight"] == flight
     assert "gain" not in row  # there is nothing to compare
