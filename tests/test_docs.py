@@ -149,18 +149,21 @@ def classes(path: Path) -> dict[str, ast.ClassDef]:
 
 
 SHARED = classes(ROOT / "diffsim" / "training" / "flags.py")
+BENCHMARKS = [ROOT / "benchmarks" / f"{name}.py" for name in ("common", "runner", "motions")]
+SHARED |= {name: node for path in BENCHMARKS for name, node in classes(path).items()}
 SCRIPTS = [*ROOT.glob("*.py"), *ROOT.glob("benchmarks/*.py"), *ROOT.glob("tools/*.py")]
 
 
 @functools.cache
 def flags(script: Path) -> set[str]:
     """The flags that a script takes: of the fields of its dataclass Args and of that one's bases."""
-    known, found, todo = SHARED | classes(script), {"--help"}, ["Args"]
+    known = SHARED | classes(script)
+    found, todo = {"--help"}, ["Args"]
     while todo:
         node = known.get(todo.pop())
         if node is None:
             continue
-        todo += [base.id for base in node.bases if isinstance(base, ast.Name)]
+        todo += [getattr(base, "id", getattr(base, "attr", "")) for base in node.bases]
         for field in node.body:
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
                 name = field.target.id.replace("_", "-")

@@ -145,7 +145,7 @@ def test_what_is_compiled_already_is_known(monkeypatch: pytest.MonkeyPatch, tmp_
     env = diffsim.make("cartpole", 1)
     with torch.no_grad():
         env.step(torch.zeros(1, 1))
-    module, cpu = env.sim._kernels["forward"].module, wp.get_device("cpu")
+    module, cpu = env.sim._stepper._launcher._kernels["forward"].module, wp.get_device("cpu")
     assert startup._is_compiled(module, cpu, 1)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     assert not startup._is_compiled(module, cpu, 1)

@@ -14,8 +14,8 @@ import torch
 
 import diffsim.tasks
 from diffsim import render
+from diffsim.mjcf import load_scene
 from diffsim.render import Renderer, film, render_frames, save_video
-from diffsim.scene import load_scene
 from diffsim.training.evaluation import Evaluation
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -21,7 +21,7 @@ import diffsim
 import shac
 import view
 from diffsim import render, web
-from diffsim.scene import load_scene
+from diffsim.mjcf import load_scene
 from diffsim.training import load_policy
 
 ASSETS = Path(diffsim.__file__).parent / "assets"
@@ -274,8 +274,8 @@ def test_substeps_are_those_of_the_training_unless_given(trained: Path) -> None:
     from diffsim.training import make_policy_env
 
     saved = load_policy(trained / "checkpoint.pt")
-    assert make_policy_env(saved, 1).sim.substeps == saved.args["substeps"]
-    assert make_policy_env(saved, 1, substeps=7).sim.substeps == 7
+    assert make_policy_env(saved, 1).sim.integration.substeps == saved.args["substeps"]
+    assert make_policy_env(saved, 1, substeps=7).sim.integration.substeps == 7
 
 
 @pytest.mark.parametrize(

@@ -70,8 +70,8 @@ def test_a_robot_without_ground_has_no_speed() -> None:
 def some(result: Evaluation, **changes: Any) -> Evaluation:
     returns, lengths = torch.tensor([4.0, 1.0, 3.0, 100.0, 2.0]), torch.tensor([5, 2, 7, 10, 1])
     qpos = torch.arange(10.0).reshape(10, 1, 1).expand(10, 5, 15)
-    values = dict(returns=returns, lengths=lengths, speed=1.25, qpos=qpos, scene=result.scene, control_dt=1 / 60)
-    return Evaluation(**values | changes)
+    motion = dict(qpos=qpos, action=qpos[..., :8] / 10, scene=result.scene, control_dt=1 / 60)
+    return Evaluation(**dict(returns=returns, lengths=lengths, speed=1.25) | motion | changes)
 
 
 def test_numbers_of_an_evaluation(result: Evaluation, tmp_path: Path) -> None:
@@ -93,20 +93,15 @@ def test_numbers_of_an_evaluation(result: Evaluation, tmp_path: Path) -> None:
 def test_the_video_is_of_the_median_episode(
     result: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn, written = [], []
+    filmed = []
 
-    def render_frames(scene: diffsim.Scene, qpos: np.ndarray, **_: int) -> np.ndarray:
-        drawn.append((scene, qpos))
-        return np.zeros((len(qpos), 2, 2, 3), np.uint8)
+    def film(path: Path, scene: diffsim.Scene, qpos: np.ndarray, dt: float, ctrl: np.ndarray) -> Path:
+        filmed.append((scene, qpos, dt, ctrl))
+        return path
 
-    def save_video(path: Path, frames: np.ndarray, fps: float) -> Path:
-        written.append((len(frames), fps))
-        return path.with_suffix(".gif")
-
-    monkeypatch.setattr(render, "render_frames", render_frames)
-    monkeypatch.setattr(render, "save_video", save_video)
-    assert some(result).save_video(tmp_path / "video.mp4") == tmp_path / "video.gif"
-    ((scene, qpos),) = drawn
-    assert scene is result.scene
-    np.testing.assert_array_equal(qpos[:, 0], [0, 2, 4, 6])  # seven steps of the episode of return 3, every other one
-    assert written == [(4, pytest.approx(30.0))]
+    monkeypatch.setattr(render, "film", film)
+    assert some(result).save_video(tmp_path / "video.mp4") == tmp_path / "video.mp4"
+    ((scene, qpos, dt, ctrl),) = filmed
+    assert scene is result.scene and dt == 1 / 60
+    np.testing.assert_array_equal(qpos[:, 0], range(7))  # seven steps of the episode of return 3
+    np.testing.assert_allclose(ctrl[:, 0], np.arange(7) / 10, rtol=1e-6)

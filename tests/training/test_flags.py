@@ -34,7 +34,7 @@ def save(args: flags.Flags, **further: object) -> Path:
     values = {name: None if isinstance(v, Path) else v for name, v in dataclasses.asdict(args).items()}
     path = Path("saved") / "checkpoint.pt"
     path.parent.mkdir(exist_ok=True)
-    state = dict(script=args.script(), args=values | further, iteration=5, ranks=[None])
+    state = dict(script=args.script(), args=values | further, iteration=5, ranks=[None], modules={})
     torch.save({"format": checkpoint.FORMAT} | state, path)
     return path
 
