@@ -7,7 +7,7 @@ import numpy as np
 
 from diffsim.ground import PairLaw, ground_pairs, pair_law, self_pairs
 from diffsim.obstacles import is_motor, label
-from diffsim.penalty import CARRIERS, STEP, mass_matrix, recovery
+from diffsim.penalty import CARRIERS, STEP, asked, mass_matrix, recovery
 from diffsim.scene import Scene
 
 GEOM = mujoco.mjtObj.mjOBJ_GEOM
@@ -53,8 +53,13 @@ def _one_law_for_all(scene: Scene, laws: list[PairLaw]) -> list[str]:
     if not named(m, "mu") and len(frictions) > 1:
         span = f"{min(frictions):g} to {max(frictions):g}"
         sentences.append(f"One coefficient of friction, {scene.mu:g}, serves all geoms; the file has {span}.")
-    if not named(m, "k_n") and len(solrefs) > 1:
+    if named(m, "k_n"):
+        return sentences
+    if len(solrefs) > 1:
         sentences.append("One solref serves all geoms: that of the lowest one in the reference pose.")
+    share = scene.mass.sum() / min(CARRIERS, scene.ncontact)
+    if all(scene.k_n < 0.99 * share * asked(solref).stiffness for solref in solrefs):
+        sentences.append("The ground is softer than solref asks, for the lightest part and substeps of 1/960 s.")
     return sentences
 
 
@@ -63,7 +68,7 @@ def _limits(scene: Scene) -> list[str]:
         return []
     m, sentences = scene.mj_model, ["A joint limit is a spring and a damper; solimplimit is ignored."]
     limited = np.flatnonzero(m.jnt_limited).tolist()
-    fast = [j for j in limited if m.jnt_solref[j, 0] > 0 and recovery(m.jnt_solref[j]).damping == 1 / STEP]
+    fast = [joint for joint in limited if recovery(m.jnt_solref[joint]) != asked(m.jnt_solref[joint])]
     if fast and not named(m, "k_limit"):
         joints = ", ".join(label(m, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in fast)
         sentences.append(f"A solreflimit faster than substeps of 1/960 s can follow is slowed down: {joints}.")
@@ -95,7 +100,7 @@ def _stability(scene: Scene) -> list[str]:
     joint = scene.mj_model.dof_jntid[first + int((np.diag(inverse) * (laws[0] * STEP + laws[1])).argmax())]
     name = label(scene.mj_model, mujoco.mjtObj.mjOBJ_JOINT, int(joint))
     steps = int(np.ceil((b + np.sqrt(b**2 + 4 * k)) / 4 / 60))
-    return [f"Spring or damper of joint {name}: semi_implicit needs {steps} substeps of 1/60 s; implicit takes any."]
+    return [f"Spring or damper of joint {name}: semi_implicit needs {steps} substeps of 1/60 s or more."]
 
 
 def named(m: mujoco.MjModel, name: str) -> bool:

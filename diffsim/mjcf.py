@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from diffsim.approximations import approximations
-from diffsim.ground import disabled_flags, ground_pairs, pair_law
+from diffsim.ground import PairLaw, disabled_flags, ground_pairs, pair_law
 from diffsim.obstacles import floating, is_motor, obstacles, text
 from diffsim.penalty import contact_constants, limit_constants, mobilities
 from diffsim.scene import Array, Scene, SceneError
@@ -247,23 +247,26 @@ class _Reader:
             _, rotation, position = self.body[body]
             centre = data.xpos[body] + data.xmat[body].reshape(3, 3) @ rotation.T @ (sphere.centre - position)
             points.append((body, centre - [0.0, 0.0, sphere.radius]))
-        constants = dict.fromkeys(("k_n", "k_d", "k_t", "mu"), 0.0)
-        height = 0.0
-        if spheres:
-            height = float(data.geom_xpos[pairs[0][0], 2])
-            lowest = min(range(len(points)), key=lambda k: round(float(points[k][1][2]), 9))
-            law = pair_law(m, pairs[0][0], spheres[lowest].geom)
-            constants = contact_constants(mass, mobilities(m, points), law.solref)
-            constants["mu"] = law.friction if law.condim > 1 else 0.0
-            named = {name: self._numeric(name, value) for name, value in constants.items()}
-            if constants["k_n"] > 0:  # a file that names k_n alone keeps the damping ratio
-                constants["k_d"] *= named["k_n"] / constants["k_n"]
-            constants = named | {"k_d": self._numeric("k_d", constants["k_d"])}
-        return constants | {
+        laws = [pair_law(m, pairs[0][0], sphere.geom) for sphere in spheres]
+        return self._contact_constants(mass, points, laws) | {
             "contact_link": np.array([sphere.link for sphere in spheres], np.int32),
             "contact_position": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
             "contact_radius": np.array([sphere.radius for sphere in spheres]),
-            "ground_height": height,
+            "ground_height": float(data.geom_xpos[pairs[0][0], 2]) if pairs else 0.0,
+        }
+
+    def _contact_constants(self, mass: float, points: list[tuple[int, Array]], laws: list[PairLaw]) -> dict[str, float]:
+        """k_n, k_d, k_t, mu after the lowest point's law; a file that names k_n alone keeps the damping ratio."""
+        if not points:
+            return dict.fromkeys(("k_n", "k_d", "k_t", "mu"), 0.0)
+        law = laws[min(range(len(points)), key=lambda k: round(float(points[k][1][2]), 9))]
+        default = contact_constants(mass, mobilities(self.m, points), law.solref)
+        k_n = self._numeric("k_n", default["k_n"])
+        return {
+            "k_n": k_n,
+            "k_d": self._numeric("k_d", default["k_d"] * (k_n / default["k_n"] if default["k_n"] > 0 else 1.0)),
+            "k_t": self._numeric("k_t", default["k_t"]),
+            "mu": self._numeric("mu", law.friction if law.condim > 1 else 0.0),
         }
 
     def _spheres(self, geom: int) -> list[Sphere]:

@@ -148,7 +148,7 @@ def _names(m: mujoco.MjModel) -> Iterator[Obstacle]:
         for index in range(count):
             name = mujoco.mj_id2name(m, kind, index)
             if name not in ours and (near := difflib.get_close_matches(name.lower(), ours, 1, 0.65)):
-                yield _of(m, kind, index, f"unknown; did you mean {near[0]!r}? All names: {', '.join(ours)}")
+                yield _of(m, kind, index, f"not one of {', '.join(ours)}; did you mean {near[0]!r}? Else rename it")
     for name in NUMERICS:
         index = mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, name)
         if index >= 0:
@@ -178,8 +178,9 @@ def _options(m: mujoco.MjModel) -> Iterator[Obstacle]:
 def _whole_elements(m: mujoco.MjModel) -> Iterator[Obstacle]:
     for equality in np.flatnonzero(m.eq_active0).tolist():
         yield _of(m, Kind.mjOBJ_EQUALITY, equality, "equality constraints are not simulated")
+    touch = not disabled_flags(m) & {"constraint", "contact"}
     for kind, count, what in (
-        (Kind.mjOBJ_PAIR, m.npair, "contact pairs"),
+        (Kind.mjOBJ_PAIR, m.npair * touch, "contact pairs"),
         (Kind.mjOBJ_FLEX, m.nflex, "deformable bodies"),
         (Kind.mjOBJ_PLUGIN, m.nplugin, "plugins"),
     ):

@@ -29,13 +29,17 @@ class Recovery(NamedTuple):
     damping: float  # 1/s
 
 
-def recovery(solref: Sequence[float] | Array) -> Recovery:
-    """FIRMNESS times what solref asks for, but no faster than a substep can follow, as MuJoCo's flag refsafe has it."""
+def asked(solref: Sequence[float] | Array) -> Recovery:
+    """FIRMNESS times what solref asks for."""
     first, second = map(float, solref)
     if first > 0:
-        stiffness, damping = FIRMNESS / (first * second) ** 2, FIRMNESS * 2 / first
-    else:  # MuJoCo's direct format
-        stiffness, damping = -FIRMNESS * first, -FIRMNESS * second
+        return Recovery(FIRMNESS / (first * second) ** 2, FIRMNESS * 2 / first)
+    return Recovery(-FIRMNESS * first, -FIRMNESS * second)  # MuJoCo's direct format
+
+
+def recovery(solref: Sequence[float] | Array) -> Recovery:
+    """What solref asks for, but no faster than a substep can follow: the idea of MuJoCo's flag refsafe."""
+    stiffness, damping = asked(solref)
     return Recovery(min(stiffness, 1 / (2 * STEP) ** 2), min(damping, 1 / STEP))
 
 

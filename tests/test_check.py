@@ -68,6 +68,10 @@ def test_command(tmp_path, capsys):
         (pendulum(inside='<geom size="0.1"/><geom size="0.05"/>'), "inside others in every pose are left out: 1."),
         (pendulum(inside='<geom size="0.1" solref="0.1 1"/>'), "One solref serves all geoms"),
         (
+            robot('<body><freejoint/><geom size="0.1" solref="1e-3 1" priority="1"/></body>'),
+            "The ground is softer than solref asks",
+        ),
+        (
             tendon(actuator='<muscle tendon="string" force="5" lengthrange="1 2"/>'),
             "A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves.",
         ),

@@ -171,6 +171,20 @@ def test_limit_force_in_closed_form():
     np.testing.assert_allclose(slopes, [-300 * h / inertia, 1 - 2 * h / inertia, 3 * h / inertia], rtol=1e-12)
 
 
+@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
+def test_limit_lets_go_of_a_joint_that_returns_fast(integrator):
+    """Its damper would pull harder than its spring pushes."""
+    scene, h = parse(HINGE), 1 / 60
+    inertia = scene.inertia[1][2, 2] + scene.armature[1]
+    for side in (-1, 1):
+        q, v, u = 0.53 * side, -8.0 * side, 0.7
+        leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in (q, v, u)]
+        _, after = Simulator(scene, 1, Integration(integrator, 1), dtype=torch.float64).step(*leaves)
+        np.testing.assert_allclose(after.item(), v + h * 3 * u / inertia, rtol=1e-12)
+        slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
+        np.testing.assert_allclose(slopes, [0, 1, 3 * h / inertia], rtol=1e-12)
+
+
 def test_gradients_add_up_over_control_steps(rng):
     """Three steps at once, of a third of the length each, have the gradient of one."""
     scene = task_scene("hopper")

@@ -186,7 +186,7 @@ REFUSED = {
     **{
         f"numeric {name}": (
             pendulum(rest=f'<custom><numeric name="{name}" data="1"/></custom>'),
-            f"numeric '{name}': unknown; did you mean '{meant}'",
+            f"numeric '{name}': not one of .*; did you mean '{meant}'",
         )
         for name, meant in (("k_nn", "k_n"), ("kn", "k_n"), ("K_T", "k_t"), ("klimit", "k_limit"), ("mu_", "mu"))
     },
@@ -196,7 +196,7 @@ REFUSED = {
     ),
     "text muscle_modle": (
         pendulum(rest='<custom><text name="muscle_modle" data="hill"/></custom>'),
-        "text 'muscle_modle': unknown; did you mean 'muscle_model'",
+        "text 'muscle_modle': not one of muscle_model; did you mean 'muscle_model'",
     ),
     # numbers
     "numeric with two numbers": (
