@@ -1,77 +1,169 @@
-"""What the benchmarks of accuracy and stability share: a trained policy and the states it visits."""
+"""What the benchmarks share: their flags, where their files go, and how their pictures are drawn."""
 
 from __future__ import annotations
 
+import functools
+import importlib.util
+import os
+import re
 import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, TypeVar, get_args
 
+import numpy as np
+import tables
 import torch
-from torch import Tensor, nn
+import tyro
+from tables import ROOT, Row
 
-import diffsim
-from diffsim.run import fail, load_checkpoint
-from diffsim.scene import Scene
+from diffsim.simulator import check_device
+from diffsim.training import fail
+from diffsim.training.distributed import choose_device
+from diffsim.training.flags import check_ranges
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.append(str(ROOT))
-import shac  # noqa: E402
-
-RESULTS = ROOT / "benchmarks" / "results"
-DOCS = ROOT / "docs"
-RUNS = ROOT / "runs" / "learning"  # where benchmarks/learning.py trains
-
-
-# Policies and states --------------------------------------------------------------------------------------------------
+RESULTS, DOCS = ROOT / "results", ROOT / "docs"
+TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu"]
+TASKS: tuple[TaskName, ...] = get_args(TaskName)  # of the SHAC paper
+Tasks = Annotated[tuple[TaskName, ...], tyro.conf.arg(aliases=["--env-id"])]
+F = TypeVar("F", bound="CommonFlags")
 
 
-class Policy(nn.Module):
-    """The deterministic policy of shac.py, obs -> action."""
+@dataclass
+class CommonFlags:
+    """What every benchmark takes."""
 
-    def __init__(self, actor: nn.Module, normalise: nn.Module) -> None:
-        super().__init__()
-        self.actor, self.normalise = actor, normalise
+    env: Tasks = TASKS  # tasks
+    device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
+    output: Path | None = None  # directory of the csv files (default: results/cpu or, by the GPU, e.g. results/h100)
+    figures: Path | None = None  # of the pictures (default: docs/figures, docs/figures/h100, or that of --output)
+    draw_only: Annotated[bool, tyro.conf.arg(aliases=["--collect-only"])] = False  # measure nothing, read csv files
 
-    def forward(self, obs: Tensor) -> Tensor:
-        return self.actor(self.normalise(obs))
+    @property
+    def directory(self) -> Path:
+        return self.output.resolve() if self.output else RESULTS / machine(self.device)
 
+    def csv(self, name: str) -> Path:
+        return self.directory / f"{name}.csv"
 
-def load_policy(name: str, checkpoint: Path | None, runs: Path = RUNS) -> tuple[Policy, str]:
-    """The policy of a checkpoint of shac.py in float64, and what to call it.
+    def read(self, name: str) -> list[dict[str, str]]:
+        return tables.read_csv(self.csv(name))
 
-    Without a checkpoint it is that of seed 1 in `runs`; where there is none, an untrained one (seed 0).
-    """
-    path = checkpoint or runs / "shac" / f"{name}__1" / "checkpoint.pt"
-    if checkpoint is None and not path.is_file():
-        torch.manual_seed(0)
-        return Policy(
-            *shac.build(shac.parse(["--env", name, "--device", "cpu"])[0], diffsim.make(name, num_envs=1))
-        ).double(), "no training"
-    loaded = load_checkpoint(path, shac.FORMAT)
-    args = shac.Args(**loaded["args"] | {"device": "cpu"})
-    if args.env != name:
-        fail(f"{path} was trained on {args.env}, not {name}")
-    policy = Policy(*shac.build(args, diffsim.make(name, num_envs=1)))
-    policy.actor.load_state_dict(loaded["actor"])
-    policy.normalise.load_state_dict(loaded["normalise"])
-    return policy.double(), f"{path.parent.name}, iteration {loaded['iteration']}"
+    def write(self, name: str, rows: Sequence[Row]) -> None:
+        tables.write_csv(self.csv(name), rows, self.device)
 
+    def merge(self, name: str, rows: Sequence[Row], key: Sequence[str]) -> list[dict[str, str]]:
+        return tables.merge_csv(self.csv(name), rows, key, self.device)
 
-@torch.no_grad()
-def visited_states(
-    name: str, policy: Policy, count: int, penalty: dict[str, float] | None = None
-) -> tuple[Tensor, Tensor]:
-    """(count, nq), (count, nv) in float64: a quarter each after 0.25, 0.5, 1 and 2 s of episodes under the policy."""
-    env = diffsim.make(name, num_envs=count, seed=0, penalty=penalty)
-    obs, _ = env.reset(seed=0)
-    qpos, qvel = env.qpos.double(), env.qvel.double()
-    for step in range(1, 121):
-        obs = env.step(policy(obs.double()).float())[0]
-        if step in (15, 30, 60, 120):
-            rows = slice((15, 30, 60, 120).index(step), None, 4)
-            qpos[rows], qvel[rows] = env.qpos[rows].double(), env.qvel[rows].double()
-    return qpos, qvel
+    def machines(self, name: str) -> dict[str, Path]:
+        """The csv files of a name by their machines: all of the tree of results, or the one outside of it."""
+        paths = sorted(RESULTS.glob(f"*/{name}.csv")) if self.directory.parent == RESULTS else [self.csv(name)]
+        return {path.parent.name: path for path in paths if path.is_file()}
+
+    def picture(self, name: str) -> Path:
+        default = DOCS / "figures" / self.directory.name.replace("cpu", "")
+        return (self.figures or (default if self.directory.parent == RESULTS else self.directory)) / f"{name}.png"
+
+    def link(self, name: str) -> str:
+        """A picture's address in a page."""
+        return os.path.relpath(self.picture(name), DOCS)
+
+    def publish(self, name: str, text: str, page: str, everywhere: bool = False) -> None:
+        """Print a table, and fill the part of a page that has its name; of one GPU's results it is {name}_{machine}."""
+        print(text)
+        name = name if everywhere or self.directory.name == "cpu" else f"{name}_{self.directory.name}"
+        if self.directory.parent == RESULTS and f"<!-- {name} -->" in (DOCS / page).read_text():
+            tables.fill(DOCS / page, name, text)
 
 
-def idle(scene: Scene) -> Tensor:
-    """(nu,) the control without any force: 0 of a motor, -1 of a muscle."""
-    return torch.where(torch.tensor(scene.motor_link) > 0, 0.0, -1.0).double()
+def machine(device: str) -> str:
+    """cpu, or a GPU's short name: "NVIDIA H100 80GB HBM3" is h100."""
+    if not device.startswith("cuda"):
+        return "cpu"
+    name = torch.cuda.get_device_name(device).lower()
+    return found[0] if (found := re.search(r"[a-z]*\d+", name)) else name
+
+
+def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = None) -> F:
+    """The command line, checked; anything wrong ends the benchmark with one line."""
+    args = tyro.cli(kind, args=argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    check_ranges(args)
+    args.device = choose_device(args.device)
+    try:
+        check_device("cpu" if args.draw_only else args.device)
+    except ValueError as error:
+        fail(error)
+    torch.set_num_threads(1)  # as in training: idle threads of torch disturb the simulator's
+    return args
+
+
+def measured(
+    args: F, name: str, measure: Callable[[F, TaskName], Iterable[Row]], key: Sequence[str]
+) -> list[dict[str, str]]:
+    """All rows of a csv file; those of the tasks asked for are measured, and it has each as soon as it is there."""
+    for env in () if args.draw_only else args.env:
+        for row in measure(args, env):
+            print("  " + ", ".join(f"{column} {tables.digits(value)}" for column, value in row.items()), flush=True)
+            args.merge(name, [row], key)
+    return sorted(args.read(name), key=lambda row: TASKS.index(row["task"].split()[0]))
+
+
+Numbers = Sequence[float] | np.ndarray
+
+
+class Line(NamedTuple):
+    x: Numbers
+    y: Numbers
+    style: str = "-"  # colour, marker and line as matplotlib takes them, e.g. C0o-
+    label: str = ""  # equal ones are one entry of the picture's legend
+    width: float = 1.5
+    notes: Sequence[str] = ()  # beside the points
+
+
+class Panel(NamedTuple):
+    lines: Sequence[Line]
+    title: str = ""
+    x: str = ""
+    y: str = ""
+    log: str = ""  # the logarithmic axes: x, y or xy
+    zero: bool = False  # the y axis begins there
+
+
+@functools.cache
+def can_draw() -> bool:
+    if importlib.util.find_spec("matplotlib"):
+        return True
+    print("pictures need matplotlib: pip install -e '.[test]'", file=sys.stderr)
+    return False
+
+
+def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] = (3.4, 2.9)) -> None:
+    """Draw rows of panels, each of a size in inches. Without matplotlib it says so, once, and draws nothing."""
+    if not grid[0] or not can_draw():
+        return
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    figure = Figure(figsize=(len(grid[0]) * size[0], len(grid) * size[1]), layout="constrained")
+    axes = figure.subplots(len(grid), len(grid[0]), squeeze=False)
+    legend: dict[str, Line2D] = {}
+    for axis, panel in zip(axes.flat, chain(*grid), strict=True):
+        for line in panel.lines:
+            (drawn,) = axis.plot(line.x, line.y, line.style, linewidth=line.width, markersize=4)
+            legend |= {line.label: drawn} if line.label else {}
+            for x, y, note in zip(line.x, line.y, line.notes, strict=False):
+                axis.annotate(note, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6)
+        axis.set(xlabel=panel.x, ylabel=panel.y)
+        axis.set(xscale="log" if "x" in panel.log else "linear", yscale="log" if "y" in panel.log else "linear")
+        axis.set_title(panel.title, fontsize=10)
+        if panel.zero:
+            axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    columns = max(1, round(len(grid[0]) * size[0] / 1.8))
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    print(path)

@@ -1,14 +1,13 @@
 """How fast the simulator and a whole SHAC iteration are, against MuJoCo's C step on the same model in the same run.
 
-    python benchmarks/speed.py --env ant --num-envs 64
     python benchmarks/speed.py                                every task, 64 and 256 environments
     python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
-    python benchmarks/speed.py --parts muscles --env humanoid_mtu    what muscles cost in a substep
-    python benchmarks/speed.py --parts picture                only draws benchmarks/results/speed.png from the csv files
+    python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
+    python benchmarks/speed.py --parts scene                  links, spheres, limits, dampers, springs, balls, muscles
 
-Prints markdown tables and writes their rows to benchmarks/results/speed_*.csv, in place of older rows of the same
-setting. A machine that does something else meanwhile gives wrong numbers.
+Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
+A machine that does something else meanwhile gives wrong numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import gc
 import importlib.util
-import itertools
 import json
 import os
 import subprocess
@@ -24,92 +22,72 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any, Literal
+from typing import Literal, TypeVar
 
-import matplotlib
 import mujoco
 import numpy as np
 import torch
-import tyro
-from tables import digits, markdown, merge_csv, read_csv
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from common import CommonFlags, Line, Panel, TaskName, measured, parse, plot
+from motions import CONTROL_DT, idle, integration, shac, simulator
+from tables import ROOT, Row, markdown, read_csv
 
 import diffsim
-from diffsim import graph
-from diffsim.run import fail
-from diffsim.simulator import available_cores
+from diffsim import Scene, Simulator
+from diffsim.kernels.lanes import divide
+from diffsim.launcher import available_cores
+from diffsim.training import Count, fail, graph
+from diffsim.training import parse as parse_script
+from diffsim.training.run import make_env
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-
-ROOT = Path(__file__).resolve().parents[1]
-DTYPES = {"float32": torch.float32, "float64": torch.float64}
-Part = Literal["physics", "muscles", "scaling", "training", "compile", "picture"]
-
-
-@dataclass
-class Args:
-    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(diffsim.TASKS)
-    """tasks"""
-    num_envs: tuple[int, ...] = (64, 256)
-    """batch sizes of the physics table (training uses the task's own)"""
-    scaling: tuple[int, ...] = (64, 256, 1024, 4096, 16384, 65536)
-    """batch sizes of the scaling table, at a horizon of 32"""
-    horizons: tuple[int, ...] = (1, 4, 8, 16, 32, 64, 128)
-    """horizons of the scaling table, at 64 environments"""
-    max_memory: float = 40.0
-    """GiB; settings of the scaling table whose checkpoints would need more are left out"""
-    compare: tuple[Literal["mujoco", "mujoco_warp"], ...] = ("mujoco",)
-    """simulators in the physics table beside ours; mujoco_warp must be installed"""
-    dtype: tuple[Literal["float32", "float64"], ...] = ("float32", "float64")
-    """precisions of the physics table"""
-    device: str = "cpu"
-    """torch device, cpu or cuda"""
-    parts: tuple[Part, ...] = ("physics", "training", "compile")
-    """tables to measure"""
-    states: int = 9
-    """states, visited by random actions, in which a control step is timed; the median over them counts"""
-    repeats: int = 5
-    """times that all competitors take their turn in each state; the fastest counts, the others were disturbed"""
-    iterations: int = 30
-    """SHAC iterations of the training table; the first three are not counted"""
-    output: Path = ROOT / "benchmarks" / "results"
-    """directory of the csv files"""
-
-
-# Tables ---------------------------------------------------------------------------------------------------------------
+SETTING = integration("semi_implicit", 16)
+LINKS = 16  # of the chain to which everything but links is added
+PARTS = {  # counts, the feature that is code of its own, and what gives it to a joint, without a force
+    "link": ((4, 8, 16, 32), "", ""),
+    "sphere in the air": ((1, 4, 8, 16, 32), "contact", ""),
+    "sphere in the ground": ((1, 4, 8, 16, 32), "", ""),
+    "limit": ((1, 4, 8, 16), "limit", 'range="-2 2" limited="true"'),
+    "damper": ((1, 4, 8, 16), "damping", 'damping="1e-300"'),
+    "spring": ((1, 4, 8, 16), "stiffness", 'stiffness="1e-300"'),
+    "ball joint": ((1, 4, 8, 15), "", 'type="ball"'),
+    "muscle": ((1, 4, 8, 15), "muscle", ""),
+}
+MUSCLE = (  # from a link to the next
+    '<spatial name="t{0}"> <site site="s{0}"/> <site site="s{1}"/> </spatial>',
+    '<general tendon="t{0}" gainprm="-10" ctrllimited="true" ctrlrange="0 1"/>',
+)
+Precision = Literal["float32", "float64"]
+DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
+Part = Literal["physics", "scaling", "training", "time", "scene"]
+MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; larger settings of the scaling table are left out
+TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
 
 @dataclass
-class Table:
-    """Rows of one csv file. The `key` columns say what was measured: a new row replaces the old one of its key."""
+class Args(CommonFlags):
+    parts: tuple[Part, ...] = ("physics", "training")  # tables to measure
+    num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
+    scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
+    horizons: tuple[Count, ...] = (1, 4, 8, 16, 32, 64, 128)  # horizons of the scaling table, at 64 environments
+    dtype: tuple[Precision, ...] = ("float32", "float64")  # precisions of the physics table
+    states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
+    repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
+    iterations: Count = 27  # SHAC iterations of the training table, after three that are not counted
 
-    name: str
-    key: tuple[str, ...]
-    directory: Path
-    rows: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, **row: Any) -> None:
-        """A row, which the file has at once: a measurement cut short keeps what it has."""
-        self.rows.append({k: digits(v) for k, v in row.items()})
-        print(" ", ", ".join(f"{k} {v}" for k, v in self.rows[-1].items()), flush=True)
-        merge_csv(self.directory / f"speed_{self.name}.csv", self.rows[-1:], self.key)
-
-
-# Physics --------------------------------------------------------------------------------------------------------------
 
 State = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+Times = dict[str, float]  # microseconds
+K = TypeVar("K", bound=Hashable)
 
 
 @torch.no_grad()
-def visited_states(name: str, num_envs: int, count: int) -> list[State]:
+def random_states(name: str, num_envs: int, count: int) -> list[State]:
     """(qpos, qvel, ctrl) in float64, every 8 control steps of a run under uniform random actions, resets included."""
-    env = diffsim.make(name, num_envs=num_envs, seed=0)
-    generator = torch.Generator().manual_seed(0)
+    env, generator = diffsim.make(name, num_envs=num_envs, seed=0), torch.Generator().manual_seed(0)
     env.reset(seed=0)
     states = []
     for step in range(8 * count):
@@ -120,219 +98,165 @@ def visited_states(name: str, num_envs: int, count: int) -> list[State]:
     return states
 
 
-def time_diffsim(sim: diffsim.Simulator, state: State) -> dict[str, float]:
-    """Microseconds of one differentiated control step: forward and backward, with torch's part and of the kernels."""
+def timer(sim: Simulator) -> Callable[[State], Times]:
+    """Times one differentiated control step: forward and backward, the whole ("step") and the kernels alone."""
     synchronize = torch.cuda.synchronize if sim.device.type == "cuda" else lambda: None
-    inputs = [x.to(sim.device, sim.dtype, copy=True).requires_grad_() for x in state]
-    gradients = [torch.ones_like(x) for x in inputs[:2]]
-    kernels = dict(sim.seconds)
-    synchronize()
-    start = time.perf_counter()
-    outputs = sim.step(*inputs)
-    synchronize()
-    middle = time.perf_counter()
-    torch.autograd.grad(outputs, inputs, gradients)
-    synchronize()
-    wall = {"forward": middle - start, "backward": time.perf_counter() - middle}
-    if sim.device.type == "cpu":
-        kernels = {k: sim.seconds[k] - before for k, before in kernels.items()}
-    else:
-        kernels = wall
-    return {f"step {k}": 1e6 * v for k, v in wall.items()} | {f"kernel {k}": 1e6 * v for k, v in kernels.items()}
+
+    def time_step(state: State) -> Times:
+        inputs = [x.to(sim.device, sim.dtype, copy=True).requires_grad_() for x in state]
+        gradients, kernels = [torch.ones_like(x) for x in inputs[:2]], dict(sim.seconds)
+        synchronize()
+        start = time.perf_counter()
+        outputs = sim.step(*inputs)
+        synchronize()
+        middle = time.perf_counter()
+        torch.autograd.grad(outputs, inputs, gradients)
+        synchronize()
+        wall = {"forward": middle - start, "backward": time.perf_counter() - middle}
+        alone = {k: sim.seconds[k] - kernels[k] for k in wall} if sim.device.type == "cpu" else wall
+        return {f"step {k}": 1e6 * v for k, v in wall.items()} | {k: 1e6 * v for k, v in alone.items()}
+
+    return time_step
 
 
-class MuJoCo:
+def race(competitors: Mapping[K, Callable[[State], Times]], states: Sequence[State], repeats: int) -> dict[K, Times]:
+    """In each state all take their turn, many times, and each one's fastest counts; medians over the states."""
+    found: dict[K, list[Times]] = {key: [] for key in competitors}
+    for state in states:
+        turns = [{key: call(state) for key, call in competitors.items()} for _ in range(repeats)]
+        for key in competitors:
+            found[key].append({what: min(turn[key][what] for turn in turns) for what in turns[0][key]})
+    return {key: {what: median(t[what] for t in times) for what in times[0]} for key, times in found.items()}
+
+
+def euler(scene: Scene, substeps: int) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_path(scene.path)
+    model.opt.timestep, model.opt.integrator = CONTROL_DT / substeps, mujoco.mjtIntegrator.mjINT_EULER
+    return model
+
+
+def mujoco_timer(scene: Scene, num_envs: int, substeps: int) -> Callable[[State], Times]:
     """mj_step of each environment in turn on one core: Euler, the substep's length, MuJoCo's own contact solver."""
+    model = euler(scene, substeps)
+    low, high = model.actuator_ctrlrange.T
+    environments = [mujoco.MjData(model) for _ in range(num_envs)]
 
-    def __init__(self, scene: diffsim.Scene, num_envs: int, substeps: int, control_dt: float) -> None:
-        self.model = mujoco.MjModel.from_xml_path(scene.path)
-        self.model.opt.timestep = control_dt / substeps
-        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        self.substeps = substeps
-        self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
-
-    def time(self, state: State) -> dict[str, float]:
-        low, high = self.model.actuator_ctrlrange.T
-        for data, qpos, qvel, ctrl in zip(self.data, *(x.numpy() for x in state), strict=True):
+    def time_step(state: State) -> Times:
+        for data, qpos, qvel, ctrl in zip(environments, *(x.numpy() for x in state), strict=True):
             data.qpos, data.qvel, data.ctrl = qpos, qvel, low + (ctrl + 1) / 2 * (high - low)
-            mujoco.mj_forward(self.model, data)  # gives the solver the warm start that a running simulation has
+            mujoco.mj_forward(model, data)  # gives the solver the warm start that a running simulation has
         start = time.perf_counter()
-        for data in self.data:
-            mujoco.mj_step(self.model, data, self.substeps)
+        for data in environments:
+            mujoco.mj_step(model, data, substeps)
         return {"mj_step": 1e6 * (time.perf_counter() - start)}
 
+    return time_step
 
-class MuJoCoWarp:
-    """mujoco_warp's step of all environments, on a GPU as one CUDA graph: its own contact solver, no gradients."""
 
-    def __init__(self, args: Args, scene: diffsim.Scene, num_envs: int, substeps: int, control_dt: float) -> None:
-        import mujoco_warp
-        import warp as wp
+def mujoco_warp_timer(device: str, scene: Scene, num_envs: int, substeps: int) -> Callable[[State], Times]:
+    """mujoco_warp's step of all environments of a GPU as one CUDA graph: its own contact solver, no gradients."""
+    import mujoco_warp
+    import warp as wp
 
-        model = mujoco.MjModel.from_xml_path(scene.path)
-        model.opt.timestep = control_dt / substeps
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        self.low, self.high = model.actuator_ctrlrange.T
-        with wp.ScopedDevice(args.device):
-            self.model = mujoco_warp.put_model(model)
-            self.data = mujoco_warp.make_data(model, nworld=num_envs, nconmax=64, njmax=256)
+    model = euler(scene, substeps)
+    low, high = model.actuator_ctrlrange.T
+    with wp.ScopedDevice(device):
+        warp_model = mujoco_warp.put_model(model)
+        data = mujoco_warp.make_data(model, nworld=num_envs, nconmax=64, njmax=256)
 
-            def steps() -> None:
-                for _ in range(substeps):
-                    mujoco_warp.step(self.model, self.data)
+        def steps() -> None:
+            for _ in range(substeps):
+                mujoco_warp.step(warp_model, data)
 
+        steps()
+        with wp.ScopedCapture() as capture:
             steps()
-            self.run = steps
-            if args.device != "cpu":
-                with wp.ScopedCapture() as capture:
-                    steps()
-                self.run = lambda: wp.capture_launch(capture.graph)
-        self.synchronize = wp.synchronize
 
-    def time(self, state: State) -> dict[str, float]:
-        ctrl = self.low + (state[2].numpy() + 1) / 2 * (self.high - self.low)
-        for array, value in zip((self.data.qpos, self.data.qvel, self.data.ctrl), (*state[:2], ctrl), strict=True):
+    def time_step(state: State) -> Times:
+        ctrl = low + (state[2].numpy() + 1) / 2 * (high - low)
+        for array, value in zip((data.qpos, data.qvel, data.ctrl), (*state[:2], ctrl), strict=True):
             array.assign(np.asarray(value, dtype=np.float32))
-        self.synchronize()
+        wp.synchronize()
         start = time.perf_counter()
-        self.run()
-        self.synchronize()
+        wp.capture_launch(capture.graph)
+        wp.synchronize()
         return {"mj_step": 1e6 * (time.perf_counter() - start)}
 
-
-def measure_physics(args: Args, table: Table) -> None:
-    threads = [1] if args.device != "cpu" else [1, available_cores()]
-    for name in args.env:
-        task = diffsim.TASKS[name]
-        for num_envs in args.num_envs:
-            states = visited_states(name, num_envs, args.states + 1)
-            scene = diffsim.load_scene(Path(diffsim.__file__).parent / "assets" / task.asset)
-            reference = MuJoCo(scene, num_envs, task.substeps, task.control_dt)
-            competitors: dict[Any, Callable[[State], dict[str, float]]] = {"mujoco": reference.time}
-            if "mujoco_warp" in args.compare:
-                competitors["mujoco_warp"] = MuJoCoWarp(args, scene, num_envs, task.substeps, task.control_dt).time
-            for dtype in args.dtype:
-                for count in threads:
-                    sim = diffsim.Simulator(
-                        scene,
-                        num_envs,
-                        task.control_dt,
-                        task.substeps,
-                        device=args.device,
-                        dtype=DTYPES[dtype],
-                        threads=count,
-                    )
-                    competitors[dtype, count] = lambda state, sim=sim: time_diffsim(sim, state)
-            times: dict[Any, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-            for k, state in enumerate(states):
-                fastest: dict[Any, dict[str, float]] = defaultdict(dict)
-                for _ in range(args.repeats):
-                    for competitor, measure in competitors.items():
-                        for what, value in measure(state).items():
-                            fastest[competitor][what] = min(value, fastest[competitor].get(what, value))
-                if k > 0:  # the first state compiles and fills caches
-                    for competitor, values in fastest.items():
-                        for what, value in values.items():
-                            times[competitor][what].append(value)
-            report_physics(args, table, name, num_envs, task.substeps, times)
+    return time_step
 
 
-def report_physics(args: Args, table: Table, name: str, num_envs: int, substeps: int, times: Any) -> None:
-    per_substep = num_envs * substeps
-    mj = median(times.pop("mujoco")["mj_step"]) / per_substep
-    mj_warp = median(times.pop("mujoco_warp")["mj_step"]) / per_substep if "mujoco_warp" in times else None
-    for (dtype, count), measured in times.items():
-        t = {what: median(values) for what, values in measured.items()}
-        alone = {what: median(values) for what, values in times[dtype, 1].items()}
-        total, total_alone = (x["kernel forward"] + x["kernel backward"] for x in (t, alone))
-        table.add(
-            **{
-                "task": name,
-                "environments": num_envs,
-                "precision": dtype,
-                "device": args.device if args.device != "cpu" else "cpu, 1 thread" if count == 1 else "cpu, all cores",
-                "forward (us/substep)": t["kernel forward"] / per_substep,
-                "backward (us/substep)": t["kernel backward"] / per_substep,
-                "backward/forward": t["kernel backward"] / t["kernel forward"],
-                "control step forward (us)": t["step forward"],
-                "control step backward (us)": t["step backward"],
-                "mj_step, one core (us/substep)": mj,
-                "mj_step/forward": mj * per_substep / t["kernel forward"],
-                "mujoco_warp (us/substep)": mj_warp if mj_warp is not None else "",
-                "one thread/this": total_alone / total,
-            }
-        )
+def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
+    """With all models of its muscles if a task has any, and without; beside MuJoCo, and mujoco_warp if installed."""
+    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()} if args.device == "cpu" else {args.device: 1}
+    default, whole = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs=1).scene
+    scenes = {"": whole}
+    if "muscle" in whole.features:
+        scenes = {model: dataclasses.replace(whole, muscle_model=model) for model in ("linear", "hill")}
+        scenes["none"] = whole.without("muscle")
+    for num_envs in args.num_envs:
+        key, shape = ("", "", ""), (whole, num_envs, default.substeps)
+        competitors = {key: mujoco_timer(*shape)}
+        if beside := args.device != "cpu" and importlib.util.find_spec("mujoco_warp") is not None:
+            competitors["", "", "warp"] = mujoco_warp_timer(args.device, *shape)
+        for (muscles, scene), dtype, (place, count) in product(scenes.items(), args.dtype, threads.items()):
+            sim = simulator(scene, default, num_envs, DTYPES[dtype], device=args.device, threads=count)
+            competitors[muscles, dtype, place] = timer(sim)
+        states, per_substep = random_states(name, num_envs, args.states + 1), num_envs * default.substeps
+        race(competitors, states[:1], 1)  # compiles and fills caches
+        times = race(competitors, states[1:], args.repeats)
+        mj = times.pop(key)["mj_step"] / per_substep
+        warp = times.pop(("", "", "warp"))["mj_step"] / per_substep if beside else ""
+        for (muscles, precision, place), t in times.items():
+            forward, backward = t["forward"] / per_substep, t["backward"] / per_substep
+            alone, bare = times[muscles, precision, next(iter(threads))], times.get(("none", precision, place), t)
+            share = {kind: 1 - bare[kind] / t[kind] for kind in ("forward", "backward")}
+            row: dict[str, object] = {"task": name, "environments": num_envs, "precision": precision, "device": place}
+            row |= {"muscles": muscles, "forward (us/substep)": forward, "backward (us/substep)": backward}
+            row |= {"backward/forward": backward / forward, "control step forward (us)": t["step forward"]}
+            row |= {"control step backward (us)": t["step backward"], "mj_step, one core (us/substep)": mj}
+            row |= {"mj_step/forward": mj / forward, "mujoco_warp (us/substep)": warp}
+            row["one thread/this"] = (alone["forward"] + alone["backward"]) / (t["forward"] + t["backward"])
+            yield row | {f"muscles' share, {kind}": value if muscles else "" for kind, value in share.items()}
 
 
-# Muscles --------------------------------------------------------------------------------------------------------------
+def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: int) -> list[float]:
+    """Seconds of each call, once compiled, captured and warm."""
+    synchronize = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    seconds = []
+    for _ in range(warmup + calls):
+        synchronize()
+        start = time.perf_counter()
+        call()
+        synchronize()
+        seconds.append(time.perf_counter() - start)
+    return seconds[warmup:]
 
 
-def measure_muscles(args: Args, table: Table) -> None:
-    """A substep without muscles, with linear and with Hill-type ones; their share is what the first lacks."""
-    for name in args.env:
-        task = diffsim.TASKS[name]
-        scene = diffsim.load_scene(Path(diffsim.__file__).parent / "assets" / task.asset)
-        if "muscle" not in scene.features:
-            continue
-        scenes = {"none": scene.without("muscle")}
-        scenes |= {model: dataclasses.replace(scene, muscle_model=model) for model in ("linear", "hill")}
-        for num_envs, dtype in itertools.product(args.num_envs, args.dtype):
-            options: dict[str, Any] = dict(device=args.device, dtype=DTYPES[dtype], threads=1)
-            sims = {
-                muscles: diffsim.Simulator(s, num_envs, task.control_dt, task.substeps, **options)
-                for muscles, s in scenes.items()
-            }
-            times: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-            for k, state in enumerate(visited_states(name, num_envs, args.states + 1)):
-                fastest: dict[str, dict[str, float]] = defaultdict(dict)
-                for _ in range(args.repeats):
-                    for muscles, sim in sims.items():
-                        for what, value in time_diffsim(sim, state).items():
-                            fastest[muscles][what] = min(value, fastest[muscles].get(what, value))
-                if k > 0:  # the first state compiles and fills caches
-                    for muscles, values in fastest.items():
-                        for what in ("forward", "backward"):
-                            times[muscles][what].append(values[f"kernel {what}"] / num_envs / task.substeps)
-            t = {muscles: {what: median(values) for what, values in of.items()} for muscles, of in times.items()}
-            for muscles, own in t.items():
-                bare, both = t["none"], own["forward"] + own["backward"]
-                table.add(
-                    **{
-                        "task": name,
-                        "environments": num_envs,
-                        "precision": dtype,
-                        "device": args.device if args.device != "cpu" else "cpu, 1 thread",
-                        "muscles": muscles,
-                        "forward (us/substep)": own["forward"],
-                        "backward (us/substep)": own["backward"],
-                        "muscles' share, forward": 1 - bare["forward"] / own["forward"],
-                        "backward": 1 - bare["backward"] / own["backward"],
-                        "both": 1 - (bare["forward"] + bare["backward"]) / both,
-                    }
-                )
+def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
+    techniques = ["cuda graph", "cuda graph, one thread per environment", "cuda, eager"]
+    if args.device == "cpu":
+        techniques = ["cpu, 1 thread", "cpu, all cores"]
+    substeps, scene = diffsim.TASKS[name].substeps, diffsim.make(name, num_envs=1).scene
+    numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
+    settings = dict.fromkeys([(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons])
+    for (num_envs, horizon), technique in product(settings, techniques):
+        if 4 * numbers * num_envs * horizon * substeps <= MAX_MEMORY:
+            yield time_window(name, num_envs, horizon, technique)
 
 
-# Scaling --------------------------------------------------------------------------------------------------------------
-
-
-def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[str, Any]:
-    """Seconds of a window of control steps, without gradients, differentiably, and with its backward; peak memory."""
-    device = "cuda" if "cuda" in technique else "cpu"
-    if device == "cuda":
+def time_window(name: TaskName, num_envs: int, horizon: int, technique: str) -> Row:
+    """A window of control steps without gradients, differentiably, and with its backward pass."""
+    device = torch.device("cuda" if "cuda" in technique else "cpu")
+    if device.type == "cuda":
         gc.collect()  # the graphs of the setting before
         torch.cuda.empty_cache()
         torch.cuda.synchronize()
         free = torch.cuda.mem_get_info()[0]
     env = diffsim.make(name, num_envs=num_envs, seed=0, device=device)
-    sim = diffsim.Simulator(
-        env.scene,
-        num_envs,
-        env.control_dt,
-        env.task.substeps,
-        horizon,
-        device=device,
-        threads={"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique),
-        lanes=(1, 1) if "one thread" in technique else None,
+    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique)
+    division, default = divide(env.scene) if "one thread" in technique else None, env.task.integration("default")
+    sim = simulator(
+        env.scene, default, num_envs, horizon=horizon, device=device.type, threads=threads, division=division
     )
     start_qpos, start_qvel = env.qpos.clone(), env.qvel.clone()
     actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()
@@ -344,204 +268,186 @@ def time_window(name: str, num_envs: int, horizon: int, technique: str) -> dict[
             qpos, qvel = sim.step(qpos, qvel, action)
         return qpos.sum() + qvel.sum()
 
-    def both() -> torch.Tensor:
-        return torch.autograd.grad(forward(), actions)[0]
-
-    seconds: dict[str, Any] = {}
-    for what, function in (("no_grad", torch.no_grad()(forward)), ("forward", forward), ("both", both)):
-        call = graph.capture(function, device) if "graph" in technique else function
-        fastest = float("inf")
-        for k in range(7):
-            if device == "cuda":
-                torch.cuda.synchronize()
-            start = time.perf_counter()
-            call()
-            if device == "cuda":
-                torch.cuda.synchronize()
-            if k > 2:  # compilation, warm-up, capture
-                fastest = min(fastest, time.perf_counter() - start)
-        seconds[what] = fastest
-    memory = (free - torch.cuda.mem_get_info()[0]) / 2**30 if device == "cuda" else ""
-    return seconds | {"memory": memory}
+    calls = (torch.no_grad()(forward), forward, lambda: torch.autograd.grad(forward(), actions)[0])
+    captured = [graph.capture(call, device) if "graph" in technique else call for call in calls]
+    no_grad, one_way, both = (min(timed(call, device, warmup=3, calls=4)) for call in captured)
+    row: dict[str, object] = {"task": name, "environments": num_envs, "horizon": horizon, "technique": technique}
+    row["forward (us/substep of all)"] = 1e6 * one_way / horizon / default.substeps
+    row["backward (us/substep of all)"] = 1e6 * (both - one_way) / horizon / default.substeps
+    row["differentiated control steps/s"] = num_envs * horizon / both
+    row["substeps/s without gradient"] = num_envs * horizon * default.substeps / no_grad
+    return row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if device.type == "cuda" else ""}
 
 
-def measure_scaling(args: Args, table: Table) -> None:
-    techniques = ["cuda graph", "cuda graph, one thread per environment", "cuda, eager"]
-    if args.device == "cpu":
-        techniques = ["cpu, 1 thread", "cpu, all cores"]
-    for name in args.env:
-        task = diffsim.TASKS[name]
-        settings = [(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons]
-        for num_envs, horizon in dict.fromkeys(settings):
-            scene = diffsim.load_scene(Path(diffsim.__file__).parent / "assets" / task.asset)
-            row = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # numbers of a checkpoint, see kernels/model.py
-            if 4 * row * num_envs * horizon * task.substeps > args.max_memory * 2**30:
-                continue
-            for technique in techniques:
-                t = time_window(name, num_envs, horizon, technique)
-                steps = num_envs * horizon
-                table.add(
-                    **{
-                        "task": name,
-                        "environments": num_envs,
-                        "horizon": horizon,
-                        "technique": technique,
-                        "forward (us/substep of all)": 1e6 * t["forward"] / horizon / task.substeps,
-                        "backward (us/substep of all)": 1e6 * (t["both"] - t["forward"]) / horizon / task.substeps,
-                        "differentiated control steps/s": steps / t["both"],
-                        "substeps/s without gradient": steps * task.substeps / t["no_grad"],
-                        "memory (GiB)": t["memory"],
-                    }
-                )
-
-
-def draw(directory: Path) -> None:
+def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     """Microseconds of one differentiated control step of one environment, against environments and horizon."""
-    path = directory / "speed_scaling.csv"
-    if not path.is_file():
-        fail(f"{path} does not exist: measure with --parts scaling first")
-    rows = read_csv(path)
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
-    for axis, of, fixed, value in (
-        (axes[0], "environments", "horizon", "32"),
-        (axes[1], "horizon", "environments", "64"),
-    ):
-        curves: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    panels = []
+    for of, fixed, value in (("environments", "horizon", "32"), ("horizon", "environments", "64")):
+        curves = defaultdict[str, dict[int, float]](dict)
         for row in rows:
             if row[fixed] == value:
-                label = f"{row['task']}, {row['technique']}"
-                curves[label].append((int(row[of]), 1e6 / float(row["differentiated control steps/s"])))
-        for label, points in curves.items():
-            axis.loglog(*zip(*sorted(points), strict=True), marker="o", markersize=3, label=label)
-        axis.set_xlabel(f"{of} ({fixed} {value})")
-        axis.grid(True, which="both", alpha=0.3)
-    axes[0].set_ylabel("us per control step, forward + backward")
-    axes[0].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(directory / "speed.png", dpi=110)
+                microseconds = 1e6 / float(row["differentiated control steps/s"])
+                curves[f"{row['task']}, {row['technique']}"][int(row[of])] = microseconds
+        lines = [Line(sorted(c), [c[k] for k in sorted(c)], "o-", label) for label, c in curves.items()]
+        panels.append(Panel(lines, "", f"{of} ({fixed} {value})", "us per control step, forward + backward", "xy"))
+    plot(args.picture("speed"), [panels], (4.5, 3.6))
 
 
-# Training and compilation ---------------------------------------------------------------------------------------------
+def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
+    """Table 12: the parts of one iteration of SHAC, each captured and timed alone."""
+    settings = parse_script(shac.Args, ["--env", name, "--device", args.device])
+    env = make_env(settings, settings.num_envs, settings.horizon)
+    learner = shac.SHAC(settings, env)
 
-COMPILE = """
-import sys, time
-import diffsim, torch
-start = time.perf_counter()
-env = diffsim.make(sys.argv[1], num_envs=1, horizon=1, device=sys.argv[2])
-action = torch.zeros(1, env.scene.nu, device=env.device, requires_grad=True)
-torch.autograd.grad(env.step(action)[1].sum(), action)
-print(time.perf_counter() - start)
-"""
+    def forward() -> torch.Tensor:
+        noise = learner.actor.sample_noise(settings.horizon, settings.num_envs)
+        rollout = shac.collect(env, learner.actor, noise)
+        return shac.actor_loss(rollout.reward, learner.next_values(rollout), rollout.done, settings.gamma)
 
-
-def measure_compile(args: Args, table: Table) -> None:
-    """Seconds until the first control step and its backward are done, with an empty and with a filled kernel cache."""
-    for name in args.env:
-        with tempfile.TemporaryDirectory() as cache:
-            command = [sys.executable, "-c", COMPILE, name, args.device]
-            environment = os.environ | {"WARP_CACHE_PATH": cache}
-            cold, warm = (
-                float(subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout)
-                for _ in range(2)
-            )
-        table.add(task=name, device=args.device, **{"cold cache (s)": cold, "warm cache (s)": warm})
+    calls: list[Callable[[], object]] = [
+        graph.capture(lambda: forward().detach(), env.device, env),
+        graph.capture(lambda: learner.actor_optimizer.step(forward()), env.device, env),
+        graph.capture(learner.update_critic, env.device),
+    ]
+    first, both, critic = (1e3 * median(timed(call, env.device, warmup=4, calls=20)) for call in calls)
+    row: dict[str, object] = {"task": name, "environments": settings.num_envs, "forward, ms": first}
+    row |= {"backward, ms": both - first, "critic, ms": critic}
+    published = dict(zip(("forward", "backward", "critic"), TABLE_12.get(name, ()), strict=False))
+    yield row | {f"published {part}, s (TITAN X)": value for part, value in published.items()}
 
 
-def run_shac(directory: Path, arguments: list[str]) -> tuple[float, float]:
-    """Runs shac.py; returns the seconds from its start to its first iteration's end, and its peak memory in MiB."""
+def run_shac(cache: str, directory: Path, arguments: list[str]) -> tuple[float, float]:
+    """Seconds from the start of shac.py to the end of its first iteration, and its peak memory in MiB."""
     command = [sys.executable, str(ROOT / "shac.py"), "--run-dir", str(directory), "--quiet", *arguments]
-    progress = directory / "progress.csv"
-    start, first = time.perf_counter(), float("nan")
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    while True:
+    start, first, ended = time.perf_counter(), None, 0
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"WARP_CACHE_PATH": cache})
+    while not ended:
         ended, status, usage = os.wait4(process.pid, os.WNOHANG)
-        if first != first and progress.is_file() and len(progress.read_text().splitlines()) > 1:
+        if first is None and read_csv(directory / "progress.csv"):
             first = time.perf_counter() - start
-        if ended:
-            break
         time.sleep(0.01)
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        fail(f"{' '.join(command)} ended with {process.returncode}")
+    if first is None or process.returncode:
+        fail(f"{' '.join(command)} failed")
     return first, usage.ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
 
 
-def logged(directory: Path, tag: str) -> list[float]:
-    """The values of a tensorboard scalar."""
-    events = EventAccumulator(str(directory), size_guidance={"scalars": 0})
-    events.Reload()
-    return [event.value for event in events.Scalars(tag)]
+def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
+    techniques = {"cpu, 1 thread": ["--threads", "1"], "cpu, all cores": ["--threads", str(available_cores())]}
+    if args.device != "cpu":
+        techniques = {"cuda graph": [], "cuda, eager": ["--no-cuda-graph"]}
+    for technique, flags in techniques.items():
+        flags += ["--env", name, "--device", args.device, "--iterations", str(args.iterations + 4)]  # never evaluated
+        flags += ["--eval-every", "0", "--save-every", "0", "--stop-after"]
+        with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as runs:
+            cold, _ = run_shac(cache, Path(runs) / "cold", [*flags, "1"])
+            warm, memory = run_shac(cache, run := Path(runs) / "warm", [*flags, str(args.iterations + 3)])
+            progress = read_csv(run / "progress.csv")[3:]
+            num_envs = json.loads((run / "args.json").read_text())["num_envs"]
+        names = ("total", "update_critic", "sim_forward", "sim_backward")
+        t = {n: 1e3 * median(float(row[f"time_{n}"]) for row in progress) for n in names if f"time_{n}" in progress[0]}
+        whole, critic = t.pop("total"), t.pop("update_critic")
+        row: dict[str, object] = {"task": name, "environments": num_envs, "device": technique, "iteration (ms)": whole}
+        row |= {f"physics {kind}": t.get(f"sim_{kind}", "") for kind in ("forward", "backward")} | {"critic": critic}
+        row["policy, task, loss"] = whole - critic - sum(t.values())  # and the physics on a GPU
+        row |= {"start to first iteration (s)": warm, "peak memory (MiB)": memory}
+        yield row | {"start with nothing compiled (s)": cold}
 
 
-def measure_training(args: Args, table: Table) -> None:
-    devices = ["cuda graph", "cuda, eager"] if args.device != "cpu" else ["cpu, 1 thread", "cpu, all cores"]
-    for name in args.env:
-        for device in devices:
-            options = ["--env", name, "--device", args.device, "--eval-every", "0", "--save-every", "0"]
-            options += ["--no-cuda-graph"] if "eager" in device else []
-            options += [
-                "--iterations",
-                str(args.iterations),
-                "--threads",
-                "1" if "1 thread" in device else str(available_cores()),
-            ]
-            with tempfile.TemporaryDirectory() as temporary:
-                run_shac(Path(temporary) / "compile", [*options, "--stop-after", "1"])
-                directory = Path(temporary) / "run"
-                first, memory = run_shac(directory, options)
-                tags = (
-                    "time/total",
-                    "time/critic",
-                    *(["time/sim_forward", "time/sim_backward"] * (args.device == "cpu")),
-                )
-                total, critic, *physics = (1e3 * median(logged(directory, tag)[3:]) for tag in tags)
-                num_envs = json.loads((directory / "args.json").read_text())["num_envs"]
-            table.add(
-                **{
-                    "task": name,
-                    "environments": num_envs,
-                    "device": device,
-                    "iteration (ms)": total,
-                    "physics forward": physics[0] if physics else "",
-                    "physics backward": physics[1] if physics else "",
-                    "critic": critic,
-                    "policy, task, loss": total - critic - sum(physics),  # and the physics on a GPU
-                    "start to first iteration (s)": first,
-                    "peak memory (MiB)": memory,
-                }
-            )
+def chain(links: int, what: str, count: int) -> Scene:
+    """A floating chain with `count` of `what`."""
+    text = ""
+    for k in range(links):
+        first = 1 if what == "ball joint" else 0
+        extra = PARTS[what][2] if first <= k < count + first else ""
+        joint = f'<joint axis="0 {k % 2} {1 - k % 2}" {extra}/>' if k else "<freejoint/>"
+        spheres = range(len(range(k, count, links)) if what.startswith("sphere") else 0)
+        geoms = '<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.04" contype="0" conaffinity="0"/>'
+        geoms += "".join(f'<geom type="sphere" size="0.05" pos="{0.03 * s} 0 0"/>' for s in spheres)
+        text += f'<body pos="{0.2 if k else 0} 0 0">{joint}{geoms}<site name="s{k}" pos="0.1 0 0.04"/>'
+    text = f'<worldbody><geom type="plane" size="1 1 1"/>{text}{"</body>" * links}</worldbody>'
+    if what == "muscle":
+        tendons, motors = ("".join(part.format(k, k + 1) for k in range(count)) for part in MUSCLE)
+        text += f"<tendon>{tendons}</tendon><actuator>{motors}</actuator>"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "chain.xml"
+        path.write_text(f'<mujoco><compiler angle="radian"/>{text}</mujoco>')
+        return diffsim.load_scene(path)
+
+
+def chain_states(scene: Scene, num_envs: int, height: float) -> State:
+    generator = torch.Generator().manual_seed(0)
+    shapes = ((num_envs, width) for width in (scene.nq, scene.nv))
+    qpos, qvel = (0.1 * torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    qpos[:, 2], qpos[:, 3] = height, 1.0
+    qpos[:, scene.qpos_adr[scene.ball == 0]] = 1.0
+    return qpos, qvel, idle(scene).repeat(num_envs, 1)
+
+
+def difference(scene: Scene, feature: str) -> float:
+    """Largest over the state after a control step and its gradient, relative to each one's largest entry."""
+    results = []
+    for one in (scene, scene.without(feature)):
+        leaves = [x.clone().requires_grad_() for x in chain_states(one, 4, 5.0)]
+        q, v = simulator(one, SETTING, 4, torch.float64).step(*leaves)
+        results.append([q, v, *torch.autograd.grad(q.square().sum() + v.square().sum(), leaves[:2])])
+    return max(((a - b).abs().max() / a.abs().max()).item() for a, b in zip(*results, strict=True))
+
+
+def measure_scene(args: Args) -> Iterator[Row]:
+    """What each part of a scene costs, added to a floating chain of hinges; a ball joint stands in a hinge's place."""
+    for what, (counts, feature, _) in PARTS.items():
+        for count in counts:
+            scene, num_envs = chain(count if what == "link" else LINKS, what, count), args.num_envs[-1]
+            threads = 1 if args.device == "cpu" else None
+            sim = simulator(scene, SETTING, num_envs, device=args.device, threads=threads)
+            state = chain_states(scene, num_envs, 0.0 if what == "sphere in the ground" else 5.0)
+            t = race({0: timer(sim)}, [state], 6 * args.repeats)[0]
+            row: dict[str, object] = {"of": what, "count": count, "environments": num_envs}
+            row |= {f"{kind} (us/substep)": t[kind] / num_envs / SETTING.substeps for kind in ("forward", "backward")}
+            yield row | {"left out": difference(scene, feature) if feature and count == counts[-1] else ""}
+
+
+def report_scene(args: Args) -> None:
+    """The cost of each part as a line in its count: the slope is the cost of one, R^2 says how straight it is."""
+    new = [] if args.draw_only else list(measure_scene(args))
+    rows = args.merge("scene_cost", new, ("of", "count", "environments"))
+    lines, panels = list[Row](), list[Panel]()
+    rows = [row for row in rows if row["environments"] == str(args.num_envs[-1])]
+    for what in PARTS if rows else ():
+        found = [row for row in rows if row["of"] == what]
+        line: dict[str, object] = {"of": what, "counts": " ".join(row["count"] for row in found)}
+        curves = list[Line]()
+        for k, kind in enumerate(("forward", "backward")):
+            x, y = (np.array([float(row[c]) for row in found]) for c in ("count", f"{kind} (us/substep)"))
+            slope, start = np.polyfit(x, y, 1)
+            line[f"{kind}: one (ns/substep)"] = f"{1e3 * slope:.3g}"
+            line[f"{kind}: none (ns/substep)"] = f"{1e3 * start:.3g}"
+            line[f"{kind}: R^2"] = f"{1 - ((y - slope * x - start) ** 2).sum() / ((y - y.mean()) ** 2).sum():.3f}"
+            curves.append(Line(x, y, f"C{k}o-", kind))
+        lines.append(line | {"left out": found[-1]["left out"]})
+        panels.append(Panel(curves, what, "", "" if panels else "us per environment-substep", zero=True))
+    args.publish("scene_cost", markdown(lines), "accuracy.md")
+    plot(args.picture("scene_cost"), [panels], (2.6, 2.8))
+
+
+MEASURES: dict[str, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, ...]]] = {
+    "physics": (measure_physics, ("task", "environments", "precision", "device", "muscles")),
+    "scaling": (measure_scaling, ("task", "environments", "horizon", "technique")),
+    "training": (measure_training, ("task", "environments", "device")),
+    "time": (measure_time, ("task",)),
+}
 
 
 def main(args: Args) -> None:
-    if unknown := [name for name in args.env if name not in diffsim.TASKS]:
-        fail(f"unknown task {unknown[0]!r}: choose from {', '.join(diffsim.TASKS)}")
-    if min(args.states, args.repeats, *args.num_envs) < 1 or args.iterations < 4:
-        fail("--states, --repeats and --num-envs must be at least 1, --iterations at least 4")
-    torch.set_num_threads(1)
-    if "mujoco_warp" in args.compare and importlib.util.find_spec("mujoco_warp") is None:
-        fail("--compare mujoco_warp needs it installed: pip install mujoco-warp")
-    measures = {
-        "physics": (measure_physics, ("task", "environments", "precision", "device")),
-        "muscles": (measure_muscles, ("task", "environments", "precision", "device", "muscles")),
-        "scaling": (measure_scaling, ("task", "environments", "horizon", "technique")),
-        "training": (measure_training, ("task", "environments", "device")),
-        "compile": (measure_compile, ("task", "device")),
-    }
-    tables = []
-    for part in args.parts:
-        if part == "picture":
-            continue
-        measure, key = measures[part]
-        print(f"{part}:", flush=True)
-        tables.append(Table(part, key, args.output))
-        measure(args, tables[-1])
-        if not tables[-1].rows:
-            fail(f"none of {', '.join(args.env)} has muscles")
-    for table in tables:
-        print(f"\n{markdown(table.rows)}", end="")
-    if {"scaling", "picture"} & set(args.parts):
-        draw(args.output)
+    if "scene" in args.parts:
+        report_scene(args)
+    for part in (part for part in args.parts if part != "scene"):
+        rows = measured(args, "time" if part == "time" else f"speed_{part}", *MEASURES[part])
+        args.publish(part, markdown(rows), "experiments.md")
+        if part == "scaling" and rows:
+            draw(args, rows)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    main(parse(Args, __doc__))

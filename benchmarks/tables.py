@@ -1,49 +1,88 @@
-"""What the benchmarks write: csv files, markdown tables, and the marked parts of pages."""
+"""What the benchmarks write: csv files that say where they come from, markdown tables, and the marked parts of pages.
+
+The comment lines at a csv file's top are the origins of its rows, one for each command that wrote some of them:
+machine; versions; git revision; command.
+"""
 
 from __future__ import annotations
 
 import csv
+import functools
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+Row = Mapping[str, object]
 
 
-def digits(value: Any) -> str:
+def digits(value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
+@functools.cache
+def origin(device: str = "cpu") -> str:
+    """The comment line of rows that this process measures on a device."""
+    info = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
+    found = re.search("model name.*: (.*)", info)
+    machine = f"{os.cpu_count()} cores of {found[1] if found else platform.processor()}"
+    if device.startswith("cuda"):
+        machine = torch.cuda.get_device_name(device)
+    packages = {"torch": "torch", "warp": "warp-lang", "mujoco": "mujoco"}
+    versions = ", ".join(f"{name} {metadata.version(package)}" for name, package in packages.items())
+    git = subprocess.run("git describe --always --dirty || echo unknown", shell=True, cwd=ROOT, capture_output=True)
+    command = shlex.join(["python", os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
+    made = f"python {platform.python_version()}, {versions}; revision {git.stdout.decode().strip()}"
+    return f"# {machine}; {made}; {command}\n"
+
+
+def origins(path: Path) -> list[str]:
+    lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
+    return [line for line in lines if line.startswith("# ")]
+
+
 def read_csv(path: Path) -> list[dict[str, str]]:
     """The rows; none if there is no file."""
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    lines = path.read_text().splitlines() if path.is_file() else []
+    return list(csv.DictReader(line for line in lines if not line.startswith("# ")))
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Nothing if there are no rows."""
+def write_csv(path: Path, rows: Sequence[Row], device: str = "cpu", older: Iterable[str] = ()) -> None:
+    """Write rows that were measured on a device, some of them by other processes, of the older origins."""
     if not rows:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    columns = list(dict.fromkeys(name for row in rows for name in row))
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+        file.writelines([*older, origin(device)])
+        columns = dict.fromkeys(name for row in rows for name in row)
+        writer = csv.DictWriter(file, list(columns), restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
 
-def merge_csv(path: Path, rows: list[dict[str, Any]], key: tuple[str, ...]) -> list[dict[str, str]]:
+def merge_csv(path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu") -> list[dict[str, str]]:
     """Write the rows' cells over those of rows that agree in all of `key`; returns all rows of the file."""
-    new = [{name: digits(value) for name, value in row.items()} for row in rows]
     merged: dict[tuple[str, ...], dict[str, str]] = {}
-    for row in [*read_csv(path), *new]:
+    for row in [*read_csv(path), *({name: digits(value) for name, value in row.items()} for row in rows)]:
         merged.setdefault(tuple(row.get(k, "") for k in key), {}).update(row)
-    write_csv(path, list(merged.values()))
+    if rows:
+        command = origin(device).rpartition("; ")[2]
+        older = [line for line in origins(path) if line.rpartition("; ")[2] != command]
+        write_csv(path, list(merged.values()), device, older)
     return list(merged.values())
 
 
-def markdown(rows: list[dict[str, Any]], columns: list[str] | None = None) -> str:
+def markdown(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
     if not rows:
         return "(none yet)\n"
     columns = columns or list(rows[0])

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
 import gymnasium
 import torch
-import warp as wp
+from gymnasium.vector import AutoresetMode
 
-from diffsim.env import DiffEnv, NumpyEnv
-from diffsim.scene import PENALTY_DEFAULTS, Scene, SceneError, load_scene
+from diffsim import startup  # first: it starts Warp and MuJoCo
+from diffsim.env import DiffEnv
+from diffsim.integration import Integration
+from diffsim.mjcf import load_scene
+from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
+from diffsim.scene import Scene, SceneError
+from diffsim.screen import RenderMode
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy
 
-__all__ = ["TASKS", "DiffEnv", "Scene", "SceneError", "Simulator", "load_scene", "make"]
-
-wp.config.log_level = wp.LOG_WARNING
+__all__ = [
+    "TASKS",
+    "DiffEnv",
+    "Integration",
+    "NumpyEnv",
+    "NumpyVectorEnv",
+    "Scene",
+    "SceneError",
+    "Simulator",
+    "load_scene",
+    "make",
+]
 
 
 def make(
@@ -37,6 +49,8 @@ def make(
     stochastic_init: bool = True,
     early_termination: bool = True,
     threads: int | None = None,
+    max_episode_steps: int | None = None,
+    render_mode: RenderMode | None = None,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -48,35 +62,28 @@ def make(
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
 
     Raises:
-        ValueError: an argument out of range, with what is allowed.
+        ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
     """
     if name not in TASKS:
         raise ValueError(f"unknown task {name!r}; choose from {', '.join(TASKS)}")
     device = check_device(device)
+    startup.check_kernel_cache()
     task = TASKS[name](device, dtype)
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
-    changes: dict[str, Any] = dict(penalty or {})
-    for key, value in changes.items():
-        if key not in PENALTY_DEFAULTS:
-            raise ValueError(f"unknown penalty constant {key!r}; choose from {', '.join(PENALTY_DEFAULTS)}")
-        if not 0 <= value < math.inf:
-            raise ValueError(f"penalty constant {key} is {value!r}, must be finite and not negative")
-    scene = dataclasses.replace(scene, **changes)
-    preset = task.integration(accuracy)
     return DiffEnv(
         task,
-        scene,
+        scene.with_penalty(penalty or {}),
         num_envs,
+        integration=task.integration(accuracy).replaced(integrator, substeps, theta),
         seed=seed,
         horizon=horizon,
-        substeps=preset.substeps if substeps is None else substeps,
-        integrator=preset.integrator if integrator is None else integrator,
-        theta=preset.theta if theta is None else theta,
         device=device,
         dtype=dtype,
         stochastic_init=stochastic_init,
         early_termination=early_termination,
         threads=threads,
+        max_episode_steps=max_episode_steps,
+        render_mode=render_mode,
     )
 
 
@@ -84,10 +91,20 @@ def _make_one(name: str, **arguments: Any) -> NumpyEnv:
     return NumpyEnv(make(name, num_envs=1, horizon=1, **arguments))
 
 
-for _name in TASKS:
-    gymnasium.register(
-        id=f"diffsim/{_name.title().replace('_', '')}-v0",
-        entry_point="diffsim:_make_one",
-        vector_entry_point="diffsim:make",
-        kwargs={"name": _name},
-    )
+def _make_numpy(
+    name: str, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, **arguments: Any
+) -> NumpyVectorEnv:
+    return NumpyVectorEnv(make(name, num_envs, horizon=1, **arguments), autoreset_mode)
+
+
+# Two ids of each task: gymnasium.make makes the same environment of both, gymnasium.make_vec one on tensors and one in
+# NumPy, which has an id of its own because many libraries take an id and no further argument.
+for _name, _task in TASKS.items():
+    for _suffix, _vector in (("", "make"), ("-numpy", "_make_numpy")):
+        gymnasium.register(
+            id=f"diffsim/{_name.title().replace('_', '')}{_suffix}-v0",
+            entry_point="diffsim:_make_one",
+            vector_entry_point=f"diffsim:{_vector}",
+            max_episode_steps=_task.episode_length,
+            kwargs={"name": _name},
+        )

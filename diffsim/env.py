@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -11,8 +12,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from diffsim.integration import Integration, check_count
+from diffsim.launcher import check_memory
 from diffsim.scene import Scene
-from diffsim.simulator import Simulator
+from diffsim.screen import RENDER_MODES, Frames, RenderMode, Screen
+from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import Task
 
 
@@ -27,10 +31,13 @@ class DiffEnv(VectorEnv):
     Args:
         task: task on the simulator's device and dtype.
         scene: its robot.
-        num_envs, horizon, substeps, integrator, theta, threads: see Simulator.
+        integration: default the task's "default".
+        num_envs, horizon, threads: see Simulator.
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
+        max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
+        render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
 
     Attributes:
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.
@@ -38,7 +45,10 @@ class DiffEnv(VectorEnv):
         generator: the torch.Generator of the start states.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": RENDER_MODES}
+    qpos: Tensor
+    qvel: Tensor
+    _obs: Tensor
 
     def __init__(
         self,
@@ -46,28 +56,33 @@ class DiffEnv(VectorEnv):
         scene: Scene,
         num_envs: int,
         *,
+        integration: Integration | None = None,
         seed: int | None = None,
         horizon: int = 32,
-        substeps: int | None = None,
-        integrator: str = "semi_implicit",
-        theta: float = 0.0,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         stochastic_init: bool = True,
         early_termination: bool = True,
         threads: int | None = None,
+        max_episode_steps: int | None = None,
+        render_mode: RenderMode | None = None,
     ) -> None:
+        num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
+        numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
+        check_memory("start states of a window", num_envs, numbers * dtype.itemsize, check_device(device))
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
+        if max_episode_steps is not None:
+            self.episode_length = check_count("max_episode_steps", max_episode_steps)
+        self.metadata = self.metadata | {"render_fps": round(1 / task.control_dt)}
+        self._screen = Screen(scene, render_mode, 1 / task.control_dt) if render_mode else None
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
         self.sim = Simulator(
             scene,
             num_envs,
+            integration or task.integration("default"),
             task.control_dt,
-            task.substeps if substeps is None else substeps,
             horizon,
-            integrator,
-            theta,
             device,
             dtype,
             threads,
@@ -87,20 +102,37 @@ class DiffEnv(VectorEnv):
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
-        self.qpos, self.qvel, self._obs = (torch.empty(0),) * 3
-        self._starts, self._time = (torch.empty(0),) * 3, 0
-        self._recorded = 0  # differentiable steps since the window began
         self._restart()
+        self.render_mode = render_mode
+
+    @property
+    def np_random_seed(self) -> int:
+        """The seed of `generator`."""
+        return self.generator.initial_seed()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Start all episodes anew; returns obs (N, obs_dim) and an empty info."""
+        """Start all episodes anew, or only those of options={"reset_mask": mask (N,) bool}.
+
+        Returns:
+            obs (N, obs_dim) of all environments, and an empty info.
+
+        Raises:
+            ValueError: several seeds, as one generator draws all start states; a mask of another shape or dtype.
+        """
+        rows = self.masked(options)
         if seed is not None:
-            self.generator.manual_seed(seed)
-        self._restart()
+            if not isinstance(seed, Integral):
+                raise ValueError(f"seed is {seed!r}, must be one integer; a NumPy vector environment takes one each")
+            self.generator.manual_seed(int(seed))
+        if len(rows) == self.num_envs:
+            self._restart()
+        else:
+            self.begin(rows, self._uniform(len(rows)))
+            self._draw_starts()
         return self._obs, {}
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """One control step of all environments.
+        """One control step of all environments, and the reset of those that end.
 
         Args:
             action: (N, nu), clipped to [-1, 1].
@@ -115,6 +147,20 @@ class DiffEnv(VectorEnv):
             ValueError: action of the wrong shape, dtype or device, or, on the CPU, not a number.
             RuntimeError: more than `horizon` differentiable steps without `detach`.
         """
+        _, reward, terminated, truncated, info = self.advance(action)
+        if self._time == self.horizon:
+            self._draw_starts()
+        row, starts = info["_final_obs"].unsqueeze(1), (start[self._time] for start in self._starts)
+        self.qpos, self.qvel, self._obs = (
+            torch.where(row, start, end) for start, end in zip(starts, (self.qpos, self.qvel, self._obs), strict=True)
+        )
+        self._time += 1
+        self.episode_step.masked_fill_(info["_final_obs"], 0)
+        self._episode_return.masked_fill_(info["_final_obs"], 0.0)
+        return self._obs, reward, terminated, truncated, info
+
+    def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """`step` without the reset: obs is info["final_obs"], and what has ended waits for `begin`."""
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action.detach()).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
@@ -129,36 +175,67 @@ class DiffEnv(VectorEnv):
                 "window, step under torch.no_grad(), or make the environment with a larger horizon"
             )
         self._recorded += recorded
-        if self._time == self.horizon:
-            self._draw_starts()
-        start_qpos, start_qvel, start_obs = (start[self._time] for start in self._starts)
-        self._time += 1
-
-        qpos, qvel = self.sim.step(self.qpos, self.qvel, action)
+        self.qpos, self.qvel = self.sim.step(self.qpos, self.qvel, action)
         nonfinite = self.sim.nonfinite.clone()
-        final_obs = self.task.observe(qpos, qvel, action)
-        reward = self.task.reward(final_obs, action).masked_fill(nonfinite, 0.0)
+        self._obs = obs = self.task.observe(self.qpos, self.qvel, action)
+        reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)
         with torch.no_grad():
             self.episode_step += 1
             self._episode_return += reward
-            terminated = self.task.terminated(final_obs) | nonfinite if self.early_termination else nonfinite
+            terminated = self.task.terminated(obs) | nonfinite if self.early_termination else nonfinite
             truncated = (self.episode_step >= self.episode_length) & ~terminated
             done = terminated | truncated
             length = self.episode_step.clone()
             episode = {"r": self._episode_return.clone(), "l": length, "t": length * self.control_dt}
-            self.episode_step.masked_fill_(done, 0)
-            self._episode_return.masked_fill_(done, 0.0)
-        row = done.unsqueeze(1)
-        self.qpos, self.qvel = torch.where(row, start_qpos, qpos), torch.where(row, start_qvel, qvel)
-        self._obs = torch.where(row, start_obs, final_obs)
-        info = {
-            "final_obs": final_obs,
-            "_final_obs": done,
-            "episode": episode,
-            "_episode": done,
-            "nonfinite": nonfinite,
-        }
-        return self._obs, reward, terminated, truncated, info
+        self._show()
+        info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
+        return obs, reward, terminated, truncated, info
+
+    def begin(self, rows: Tensor, rand: Tensor) -> Tensor:
+        """Start new episodes in some environments; gradients of the others stay as they are.
+
+        Args:
+            rows: (k,) int64, which ones.
+            rand: (k, num_random) uniform in [0, 1), what Task.reset makes their start states of.
+
+        Returns:
+            obs (N, obs_dim) of all environments.
+        """
+        starts = self._start_states(rand)
+        self.qpos, self.qvel, self._obs = (
+            whole.index_copy(0, rows, part)
+            for whole, part in zip((self.qpos, self.qvel, self._obs), starts, strict=True)
+        )
+        self.episode_step.index_fill_(0, rows, 0)
+        self._episode_return.index_fill_(0, rows, 0.0)
+        self._show()
+        return self._obs
+
+    def masked(self, options: dict[str, Any] | None) -> Tensor:
+        """(k,) int64, the environments that reset's options ask for: all, or those of "reset_mask" (N,).
+
+        Raises:
+            ValueError: a mask of another shape, or not bool.
+        """
+        everyone = torch.ones(self.num_envs, dtype=torch.bool)
+        mask = torch.as_tensor((options or {}).get("reset_mask", everyone))
+        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
+            raise ValueError(f"reset_mask is {mask.dtype} {tuple(mask.shape)}, must be bool ({self.num_envs},)")
+        return mask.nonzero().flatten().to(self.device)
+
+    def render(self) -> Frames | None:
+        """A frame (height, width, 3) of each environment in render_mode "rgb_array"; None in "human".
+
+        Raises:
+            RuntimeError: made without render_mode; no OpenGL, or no display for a window.
+        """
+        if self._screen is None:
+            raise RuntimeError('there is no picture without a render_mode: make the environment with "rgb_array"')
+        return self._screen.show(self.qpos.numpy(force=True))
+
+    def close_extras(self, **_: Any) -> None:
+        if self._screen is not None:
+            self._screen.close()
 
     def detach(self) -> Tensor:
         """Cut the graph at the current state, start a new window there, and return its observation (N, obs_dim)."""
@@ -196,9 +273,10 @@ class DiffEnv(VectorEnv):
         self._obs = self.task.observe(qpos, qvel, self._no_action)
         return self._obs
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Any]:
         """Everything that continues the episodes exactly, as of the start of a window."""
         return {
+            "task": self.task.name,
             "qpos": self.qpos.detach().clone(),
             "qvel": self.qvel.detach().clone(),
             "obs": self._obs.detach().clone(),
@@ -207,8 +285,18 @@ class DiffEnv(VectorEnv):
             "generator": self.generator.get_state(),
         }
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from a state_dict of an environment of the same task and size; call `detach` next."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a state_dict of an environment of the same task, size and dtype; call `detach` next.
+
+        Raises:
+            ValueError: it is of another task, size or dtype, or no state_dict of an environment.
+        """
+        own = self.state_dict()
+        if state.keys() != own.keys():
+            raise ValueError(f"the state has {', '.join(state)}; that of an environment has {', '.join(own)}")
+        theirs, ours = (f"{len(x['qpos'])} x {x['task']} in {x['qpos'].dtype}" for x in (state, own))
+        if theirs != ours:
+            raise ValueError(f"the state is of {theirs}; this environment is {ours}")
         self.qpos, self.qvel = state["qpos"].to(self.device), state["qvel"].to(self.device)
         self._obs = state["obs"].to(self.device)
         self.episode_step.copy_(state["episode_step"])
@@ -219,42 +307,32 @@ class DiffEnv(VectorEnv):
     def _restart(self) -> None:
         self.episode_step.zero_()
         self._episode_return.zero_()
-        self._recorded = 0
+        self._recorded = 0  # differentiable steps since the window began
         self.sim.rewind()
         qpos, qvel, obs = self._draw(1)
         self.qpos, self.qvel, self._obs = qpos[0], qvel[0], obs[0]
         self._draw_starts()
+        self._show()
 
     def _draw_starts(self) -> None:
         # Start states of a whole window at once: one batch of small operations instead of one per step.
         self._starts, self._time = self._draw(self.horizon), 0
 
-    @torch.no_grad()
     def _draw(self, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-        size = (steps, self.num_envs, self.task.num_random)
-        rand = torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
+        return self._start_states(self._uniform(steps, self.num_envs))
+
+    def _uniform(self, *size: int) -> Tensor:
+        size = *size, self.task.num_random
+        return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
+
+    @torch.no_grad()
+    def _start_states(self, rand: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """qpos, qvel and obs (..., each) of rand (..., num_random)."""
         if not self.stochastic_init:
             rand = torch.full_like(rand, 0.5)
         qpos, qvel = self.task.reset(rand)
-        return qpos, qvel, self.task.observe(qpos, qvel, self._no_action.expand(steps, -1, -1))
+        return qpos, qvel, self.task.observe(qpos, qvel, self._no_action[0].expand(*rand.shape[:-1], -1))
 
-
-class NumpyEnv(gymnasium.Env[Any, Any]):
-    """One episode at a time in NumPy, for tools that expect gymnasium's plain environments."""
-
-    metadata = {"render_modes": []}
-
-    def __init__(self, env: DiffEnv) -> None:
-        self.env = env
-        self.observation_space, self.action_space = env.single_observation_space, env.single_action_space
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        obs, _ = self.env.reset(seed=seed)
-        return obs[0].numpy().copy(), {}
-
-    @torch.no_grad()
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        tensor = torch.as_tensor(np.asarray(action), dtype=self.env.dtype).reshape(1, -1)
-        _, reward, terminated, truncated, info = self.env.step(tensor)
-        return info["final_obs"][0].numpy().copy(), reward.item(), bool(terminated), bool(truncated), {}
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()

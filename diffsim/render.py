@@ -1,10 +1,14 @@
-"""Pictures and videos of a scene, drawn by MuJoCo from a sequence of qpos."""
+"""Pictures and videos of a scene, drawn by MuJoCo from its qpos."""
 
 from __future__ import annotations
 
 import copy
+import itertools
+import math
 import os
 import sys
+import warnings
+from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,9 +17,111 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .scene import Scene
+from diffsim.scene import Scene
+
+Frame = NDArray[np.uint8]  # (height, width, 3)
 
 AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.1, 1.0])  # colours of a muscle
+SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
+VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
+VIDEO_FPS = 30.0  # at most
+VIDEO_SECONDS = 10.0  # of an episode that is filmed
+BLOCK = 16
+
+
+class Renderer:
+    """Draws a scene, or an MJCF file, one configuration at a time.
+
+    Args:
+        scene: what is drawn.
+        width, height: of a frame in pixels.
+        camera: name of a camera of the MJCF; by default "track", or one that follows the robot if there is none.
+        fast: no antialiasing, coarser shapes, shadows on the floor alone; by default where OpenGL runs on the CPU. An
+            ant takes 15 ms of one core instead of 300.
+
+    Raises:
+        ValueError: the MJCF has no such camera.
+        RuntimeError: the machine has no OpenGL, with the remedy.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | str | os.PathLike[str],
+        width: int = 640,
+        height: int = 480,
+        camera: str | None = None,
+        fast: bool | None = None,
+    ) -> None:
+        loaded = scene.mj_model if isinstance(scene, Scene) else mujoco.MjModel.from_xml_path(os.fspath(scene))
+        self.model = model = copy.copy(loaded)
+        self.width, self.height = width, height
+        self._view = _camera(model, camera)
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._window = _gl_context(width, height)
+        self._fast = _is_software(_gl_renderer()) if fast is None else fast
+        if self._fast:
+            lower_quality(model)
+        self._data, self._option, self._perturb = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._scene, self._area = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        if self._fast:
+            self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+
+    def draw(self, qpos: ArrayLike, ctrl: ArrayLike | None = None) -> Frame:
+        """The frame (height, width, 3) of one configuration.
+
+        Args:
+            qpos: (nq,).
+            ctrl: (nu,) in [-1, 1]; colours muscles by their activation, blue at rest, red at full force.
+
+        Raises:
+            ValueError: an argument of another shape.
+        """
+        model, data = self.model, self._data
+        data.qpos[:] = _check("qpos", qpos, (model.nq,))
+        if ctrl is not None:
+            colour_muscles(model, _check("ctrl", ctrl, (model.nu,)))
+        # All that a picture depends on, without the contacts and matrices of mj_forward.
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
+            stage(model, data)
+        self._window.make_current()
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._option, self._perturb, self._view, everything, self._scene)
+        if self._fast:
+            _add_shadows(model, data, self._scene)
+        mujoco.mjr_render(self._area, self._scene, self._context)
+        frame = np.empty((self.height, self.width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(frame, None, self._area, self._context)
+        return np.ascontiguousarray(frame[::-1])  # OpenGL's first row is the lowest
+
+    def close(self) -> None:
+        """Free what OpenGL holds; a second call does nothing."""
+        if self._window is not None:
+            self._window.make_current()
+            self._context.free()
+            self._window.free()
+            self._window = None
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def lower_quality(model: mujoco.MjModel) -> None:
+    """What draws a model several times as fast where OpenGL runs on the CPU: no antialiasing, coarser shapes."""
+    quality = model.vis.quality
+    quality.shadowsize, quality.offsamples = 1024, 0
+    quality.numslices, quality.numstacks, quality.numquads = 16, 8, 1
+
+
+def colour_muscles(model: mujoco.MjModel, ctrl: ArrayLike) -> None:
+    """Colour the tendons of a model by the activation of their muscles, ctrl (nu,) in [-1, 1]."""
+    muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
+    force = (np.asarray(ctrl)[muscles, None].clip(-1, 1) + 1) / 2
+    model.tendon_rgba[model.actuator_trnid[muscles, 0]] = force * FULL_FORCE + (1 - force) * AT_REST
 
 
 def render_frames(
@@ -23,12 +129,11 @@ def render_frames(
     qpos: ArrayLike,
     width: int = 640,
     height: int = 480,
-    camera: str = "track",
+    camera: str | None = None,
     ctrl: ArrayLike | None = None,
+    fast: bool | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw a scene, or an MJCF file, in each of the configurations qpos (T, nq), seen from a camera of the MJCF.
-
-    With ctrl (T, nu) in [-1, 1], muscles are coloured by their activation: blue at rest, red at full force.
+    """Draw each of the configurations qpos (T, nq), with muscles coloured by ctrl (T, nu); see Renderer.
 
     Returns:
         Frames (T, height, width, 3).
@@ -37,85 +142,268 @@ def render_frames(
         ValueError: qpos or ctrl has another shape, or the MJCF has no such camera.
         RuntimeError: the machine has no OpenGL.
     """
-    model = copy.copy(scene.mj_model) if isinstance(scene, Scene) else mujoco.MjModel.from_xml_path(os.fspath(scene))
-    qpos = np.asarray(qpos, dtype=np.float64)
-    if qpos.ndim != 2 or qpos.shape[1] != model.nq:
-        raise ValueError(f"qpos must have shape (T, {model.nq}), not {qpos.shape}")
-    muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
-    activation = np.zeros((len(qpos), model.nu)) if ctrl is None else (np.asarray(ctrl, dtype=np.float64) + 1) / 2
-    if activation.shape != (len(qpos), model.nu):
-        raise ValueError(f"ctrl must have shape ({len(qpos)}, {model.nu}), not {activation.shape}")
-    cameras = [model.camera(i).name for i in range(model.ncam)]
-    if camera not in cameras:
-        raise ValueError(f"no camera {camera!r} in this scene; it has: {', '.join(cameras) or 'none'}")
-    view = mujoco.MjvCamera()
-    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, cameras.index(camera)
-
-    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    data, option, perturb = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
-    frames = np.empty((len(qpos), height, width, 3), dtype=np.uint8)
-    window = _gl_context(width, height)
-    try:
-        window.make_current()
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-        picture, area = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
-        for frame, q, a in zip(frames, qpos, activation[:, muscles, None].clip(0, 1), strict=True):
-            data.qpos[:] = q
-            if ctrl is not None:
-                model.tendon_rgba[model.actuator_trnid[muscles, 0]] = a * FULL_FORCE + (1 - a) * AT_REST
-            mujoco.mj_forward(model, data)
-            mujoco.mjv_updateScene(model, data, option, perturb, view, mujoco.mjtCatBit.mjCAT_ALL, picture)
-            mujoco.mjr_render(area, picture, context)
-            mujoco.mjr_readPixels(frame, None, area, context)
-        context.free()
-    finally:
-        window.free()
-    return np.ascontiguousarray(frames[:, ::-1])  # OpenGL's first row is the lowest
+    with Renderer(scene, width, height, camera, fast) as renderer:
+        return np.stack(list(_draw_all(renderer, qpos, ctrl)))
 
 
-def write_video(path: str | os.PathLike[str], frames: NDArray[np.uint8], fps: float = 60.0) -> Path:
-    """Write frames (T, height, width, 3) as .mp4, or as .gif where imageio-ffmpeg is not installed.
+def film(
+    path: str | os.PathLike[str],
+    scene: Scene,
+    qpos: ArrayLike,
+    control_dt: float,
+    ctrl: ArrayLike | None = None,
+    size: tuple[int, int] = VIDEO_SIZE,
+) -> Path:
+    """Film a motion at true speed, with at most 30 frames/s; see save_video.
+
+    Args:
+        path: of an .mp4 or a .gif.
+        scene: what moves.
+        qpos, ctrl: (T, nq) and (T, nu), one row per control step.
+        control_dt: s of a control step.
+        size: width and height in pixels.
+    """
+    check_video(path, size)
+    stride = max(1, math.ceil(1 / (VIDEO_FPS * control_dt) - 1e-6))
+    qpos = np.asarray(qpos)[::stride]
+    ctrl = None if ctrl is None else np.asarray(ctrl)[::stride]
+    with Renderer(scene, *size) as renderer:
+        return save_video(path, _draw_all(renderer, qpos, ctrl), 1 / (stride * control_dt))
+
+
+def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float) -> Path:
+    """Write frames (height, width, 3) as .mp4 (H.264) or .gif, which plays at true speed.
+
+    A gif holds its delays in hundredths of a second and browsers want at least two of them: frames beyond 50 per second
+    are left out, and delays differ by a hundredth where they must.
 
     Returns:
-        The file written; its suffix is .gif if an .mp4 could not be.
+        The file written.
 
     Raises:
-        ValueError: no frames, or another suffix.
-        ModuleNotFoundError: imageio is not installed.
+        ValueError: no frames, another suffix, or an mp4 whose width or height is not a multiple of 16.
+        OSError: the file cannot be written.
+        RuntimeError: the encoder is missing or fails.
     """
-    path = Path(path)
-    if path.suffix not in (".mp4", ".gif"):
-        raise ValueError(f"a video ends in .mp4 or .gif, not {path.suffix!r}")
-    if len(frames) == 0:
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
         raise ValueError("a video needs at least one frame")
-    if find_spec("imageio") is None:
-        raise ModuleNotFoundError('videos need imageio: pip install "gymnasium[mujoco]"')
-    import imageio.v2 as imageio
-
-    if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
-        path = path.with_suffix(".gif")
+    path, frames = check_video(path, (first.shape[1], first.shape[0])), itertools.chain([first], frames)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        stride = max(1, round(fps / 30))  # browsers show at most 50 frames/s of a gif
-        imageio.mimsave(path, list(frames[::stride]), duration=1000 * stride / fps, loop=0)
-    else:
-        imageio.mimsave(path, list(frames), fps=fps)
+    path.open("ab").close()  # what forbids writing is said here, in Python's words, not in the encoder's
+    try:
+        if path.suffix == ".gif":
+            _write_gif(path, frames, fps)
+        else:
+            _write_mp4(path, frames, first.shape[1], first.shape[0], fps)
+    except BaseException:  # half a video helps nobody
+        path.unlink(missing_ok=True)
+        raise
     return path
 
 
-def _gl_context(width: int, height: int) -> Any:
-    """MuJoCo's OpenGL context, EGL on a machine without a display.
+def check_video(path: str | os.PathLike[str], size: tuple[int, int] = VIDEO_SIZE) -> Path:
+    """That a video of this name and size can be encoded here; raises what save_video does."""
+    path = Path(path)
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"a video ends in .mp4 or .gif, not {path.suffix!r}")
+    package = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
+    if find_spec(package) is None:
+        name = {"PIL": "pillow"}.get(package, "imageio-ffmpeg")
+        raise RuntimeError(f"an {path.suffix} needs {name}: pip install {name}")
+    if path.suffix == ".mp4":
+        if size[0] % BLOCK or size[1] % BLOCK:
+            raise ValueError(f"width and height of an .mp4 are multiples of {BLOCK}; {size[0]} x {size[1]} are not")
+        from imageio_ffmpeg import get_ffmpeg_exe
 
-    MuJoCo chooses one from MUJOCO_GL when it is first imported, which is too early for us to set that variable.
+        try:
+            get_ffmpeg_exe()
+        except RuntimeError as error:
+            raise RuntimeError("no ffmpeg to write an .mp4: pip install --force-reinstall imageio-ffmpeg") from error
+    return path
+
+
+def check_opengl() -> None:
+    """That pictures can be drawn here; raises RuntimeError with the remedy in one line."""
+    _gl_context(16, 16).free()
+
+
+def check_display() -> bool:
+    """That a window can be opened here; returns whether OpenGL runs on the CPU there.
+
+    It leaves EGL alone: a process that has used both EGL and a window crashes at its end.
+
+    Raises:
+        RuntimeError: there is no display, or it knows no OpenGL.
     """
+    import glfw
+
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    with warnings.catch_warnings():  # GLFW warns instead of raising
+        warnings.simplefilter("ignore")
+        if not glfw.init():
+            raise RuntimeError(f"display {display} does not answer" if display else "there is no display")
+        glfw.window_hint(glfw.VISIBLE, 0)
+        window = glfw.create_window(16, 16, "diffsim", None, None)
+        if not window:
+            raise RuntimeError(f"display {display} has no OpenGL")
+        glfw.make_context_current(window)
+        name = _gl_renderer()
+        glfw.destroy_window(window)
+        glfw.default_window_hints()
+    return _is_software(name)
+
+
+def opengl_name() -> str:
+    """What draws, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"; raises RuntimeError as check_opengl does."""
+    window = _gl_context(16, 16)
     try:
-        if sys.platform == "linux" and not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
+        return _gl_renderer()
+    finally:
+        window.free()
+
+
+def _draw_all(renderer: Renderer, qpos: ArrayLike, ctrl: ArrayLike | None) -> Iterator[Frame]:
+    qpos = np.asarray(qpos, dtype=np.float64)
+    if qpos.ndim != 2:
+        raise ValueError(f"qpos must have shape (T, {renderer.model.nq}), not {qpos.shape}")
+    if ctrl is not None:
+        ctrl = _check("ctrl", ctrl, (len(qpos), renderer.model.nu))
+    for t, row in enumerate(qpos):
+        yield renderer.draw(row, None if ctrl is None else ctrl[t])
+
+
+def _check(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
+    return array
+
+
+def _camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera:
+    names, view = [model.camera(i).name for i in range(model.ncam)], mujoco.MjvCamera()
+    if name is not None and name not in names:
+        raise ValueError(f"no camera {name!r} in this scene; it has: {', '.join(names) or 'none'}")
+    if name is None and "track" not in names:
+        mujoco.mjv_defaultFreeCamera(model, view)
+        view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
+        return view
+    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name or "track")
+    return view
+
+
+def _add_shadows(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene) -> None:
+    """Add flat dark copies of a scene's shapes, projected along the first light onto the floor.
+
+    MuJoCo's own shadows cost twice as much as all the rest where OpenGL runs on the CPU.
+    """
+    planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    if not (len(planes) and model.nlight and data.light_xdir[0, 2] < 0):
+        return
+    floor, sun = model.geom_pos[planes[0], 2] + 2 * FLATNESS, data.light_xdir[0]
+    project = np.eye(3) - np.outer(sun, (0, 0, 1)) / sun[2]
+    project[2, 2] = FLATNESS  # a singular matrix has no normals
+    for shape in [scene.geoms[k] for k in range(scene.ngeom)]:
+        if shape.objtype != mujoco.mjtObj.mjOBJ_GEOM or shape.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            continue
+        shadow = scene.geoms[scene.ngeom]
+        place = project @ (shape.pos - (0, 0, floor)) + (0, 0, floor)
+        mujoco.mjv_initGeom(shadow, shape.type, shape.size, place, (project @ shape.mat).ravel(), SHADOW)
+        shadow.size[:] = shape.size  # which it takes for that of a model, written in another order
+        scene.ngeom += 1
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def _write_mp4(path: Path, frames: Iterable[Frame], width: int, height: int, fps: float) -> None:
+    from imageio_ffmpeg import write_frames
+
+    # faststart: browsers begin to play before they have loaded all of it.
+    options = ["-preset", "veryfast", "-movflags", "+faststart"]
+    writer = write_frames(
+        path, (width, height), fps=fps, codec="libx264", quality=7, ffmpeg_log_level="error", output_params=options
+    )
+
+    def send(data: Frame | None) -> None:
+        try:
+            writer.send(data)
+        except Exception as error:  # with all that ffmpeg has printed
+            raise RuntimeError(f"ffmpeg cannot write {path}") from error
+
+    send(None)
+    try:
+        for frame in frames:
+            send(np.ascontiguousarray(frame))
+    finally:
+        writer.close()
+    if path.stat().st_size == 0:
+        raise RuntimeError(f"ffmpeg has written nothing to {path}")
+
+
+def _write_gif(path: Path, frames: Iterable[Frame], fps: float) -> None:
+    from PIL import Image
+
+    stride = math.ceil(fps / 50 - 1e-6)
+    images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
+    times = [round(100 * k * stride / fps) for k in range(len(images) + 1)]  # hundredths of a second
+    delays = [10 * (b - a) for a, b in itertools.pairwise(times)]  # ms
+    images[0].save(path, save_all=True, append_images=images[1:], duration=delays, loop=0)
+
+
+# OpenGL ---------------------------------------------------------------------------------------------------------------
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """A current OpenGL context of MuJoCo's.
+
+    MuJoCo chooses one from MUJOCO_GL when it is first imported. Where that is not set, on Linux, it takes GLFW's, which
+    needs a display; EGL needs none.
+
+    Raises:
+        RuntimeError: there is none, with the remedy.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if wanted in ("disable", "disabled", "off", "false", "0"):
+        raise RuntimeError(f"MUJOCO_GL={wanted} forbids to draw: unset it")
+    remedy = "no OpenGL to draw with"
+    os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # Mesa prints its search for drivers otherwise
+    try:
+        if sys.platform != "linux":
+            context = mujoco.GLContext(width, height)
+        elif wanted == "osmesa":
+            remedy = "MUJOCO_GL=osmesa, but OSMesa is not there: unset MUJOCO_GL, or apt install libosmesa6"
+            from mujoco.osmesa import GLContext
+
+            context = GLContext(width, height)
+        elif wanted in ("glfw", "glx"):
+            remedy = f"MUJOCO_GL={wanted}, but no display is there: unset MUJOCO_GL"
+            check_display()
+            from mujoco.glfw import GLContext
+
+            context = GLContext(width, height)
+        else:
+            remedy = (
+                "no OpenGL to draw with: apt install libegl1 libgl1 libgl1-mesa-dri (or your system's EGL and Mesa)"
+            )
+            if (platform := os.environ.get("PYOPENGL_PLATFORM", "egl").lower()) != "egl":
+                remedy = f"PYOPENGL_PLATFORM={platform} excludes EGL: unset it"
             from mujoco.egl import GLContext
 
-            return GLContext(width, height)
-        return mujoco.GLContext(width, height)
-    except (AttributeError, ImportError, RuntimeError) as error:
-        raise RuntimeError(
-            "MuJoCo finds no OpenGL to draw with: install libegl1, or libosmesa6 and set MUJOCO_GL=osmesa"
-        ) from error
+            context = GLContext(width, height)
+        context.make_current()
+    except Exception as error:  # each of them fails in its own ways, AttributeError among them
+        raise RuntimeError(remedy) from error
+    return context
+
+
+def _gl_renderer() -> str:
+    from OpenGL.GL import GL_RENDERER, glGetString
+
+    return glGetString(GL_RENDERER).decode()
+
+
+def _is_software(name: str) -> bool:
+    """Whether OpenGL of this name runs on the CPU."""
+    return any(software in name for software in ("llvmpipe", "softpipe", "swrast"))

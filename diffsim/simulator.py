@@ -1,33 +1,17 @@
-"""Simulator: the buffers of a batch of environments, and the launches of its kernels."""
+"""Simulator: a batch of environments of one scene, and what may be asked of it."""
 
 from __future__ import annotations
 
 import math
-import os
-import time
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import NoReturn
 
 import torch
-import warp as wp
 
-from diffsim.bridge import ControlStep
-from diffsim.kernels.backward import backward_kernel
-from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.lanes import divide
-from diffsim.kernels.model import model_of, shape_of
+from diffsim.integration import Integration, check_count
+from diffsim.kernels.lanes import Division
+from diffsim.launcher import WARP_DTYPE, Launcher, check_memory
 from diffsim.scene import Scene
-
-INTEGRATORS = ("semi_implicit", "implicit", "extrapolated")
-State = tuple[torch.Tensor, torch.Tensor]  # qpos, qvel
-WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
-# Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
-# thread (about 1 ms) it saves nothing. A whole iteration of 64 ants takes 0.22 s with two threads, 0.26 s with one.
-MIN_WORK_PER_THREAD = 4_000
-# Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
-MAX_THREADS = 65_536
-MUSCLE_SHARERS = 4
-LANES = [(lanes, sharers) for lanes in (1, 2, 4, 8, 16) for sharers in (1, 2, 4, 8, 16) if sharers <= lanes]
+from diffsim.stepper import ExtrapolatedStepper, State, Stepper
 
 
 class Simulator:
@@ -39,18 +23,13 @@ class Simulator:
     Args:
         scene: what is simulated.
         num_envs: number of copies N.
+        integration: integrator, substeps and theta.
         control_dt: seconds of one control step.
-        substeps: integration steps in one control step.
         horizon: differentiable control steps that can be alive at once.
-        integrator: "semi_implicit" (Euler), "implicit" (linearly implicit in damping, friction and, scaled by theta,
-            stiffness) or "extrapolated" (from two semi-implicit steps, one of half the substeps; second order at 1.5
-            times the cost); docs/physics.md.
-        theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); used by "implicit" only.
         device: "cpu" or a CUDA device.
         dtype: torch.float32 or torch.float64.
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
-        lanes: GPU threads per environment, and how many of them have the same limbs (kernels/lanes.py): powers of two
-            up to 16; default as measured to be fastest.
+        division: of an environment among GPU threads, from kernels.lanes.divide; default as measured to be fastest.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
@@ -66,81 +45,38 @@ class Simulator:
         self,
         scene: Scene,
         num_envs: int,
+        integration: Integration = Integration(),
         control_dt: float = 1 / 60,
-        substeps: int = 16,
         horizon: int = 1,
-        integrator: str = "semi_implicit",
-        theta: float = 0.0,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         threads: int | None = None,
-        lanes: tuple[int, int] | None = None,
+        division: Division | None = None,
     ) -> None:
-        for name, value in (("num_envs", num_envs), ("substeps", substeps), ("horizon", horizon), ("threads", threads)):
-            if value is not None and (not isinstance(value, int) or value < 1):
-                raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
+        num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
+        if threads is not None:
+            threads = check_count("threads", threads)
+        integration = integration.check()
         if not 0 < control_dt < math.inf:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
-        if integrator not in INTEGRATORS:
-            raise ValueError(f"unknown integrator {integrator!r}; choose from {', '.join(INTEGRATORS)}")
-        if integrator == "extrapolated" and substeps % 2:
-            raise ValueError(f"substeps is {substeps}, must be even for the extrapolated integrator")
-        if not 0 <= theta <= 1:
-            raise ValueError(f"theta is {theta!r}, must lie in [0, 1]")
-        if lanes not in (None, *LANES):
-            raise ValueError(f"lanes is {lanes!r}, must be one of {', '.join(map(str, LANES))}")
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
         self.device = check_device(device)
+        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu)
+        check_memory("states and actions", num_envs, numbers * dtype.itemsize, self.device)
         self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
-        self.control_dt, self.substeps, self.horizon = control_dt, substeps, horizon
-        self.integrator, self.theta = integrator, theta if integrator == "implicit" else 0.0
-        self.seconds = {"forward": 0.0, "backward": 0.0}
-
-        real, cuda = WARP_DTYPE[dtype], self.device.type == "cuda"
-        team = (lanes or default_lanes(scene, num_envs)) if cuda else (1, 1)
-        shape = shape_of(scene, real, integrator == "implicit", cuda, *team)
-        self._kernels = {"forward": forward_kernel(shape), "backward": backward_kernel(shape)}
-        self._model = model_of(scene, real, str(self.device), *team)
-        self._commands: dict[tuple[str, int, int], wp.Launch] = {}
-        # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
-        self._block_dim = max(8 if num_envs <= 256 else 32, shape.lanes)
-        self._chunks = self._split(threads, shape.nlink)
-        self._pool = ThreadPoolExecutor(len(self._chunks) - 1) if len(self._chunks) > 1 else None
-
-        def tensor(*size: int, of: torch.dtype = dtype) -> torch.Tensor:
-            return torch.zeros(size, dtype=of, device=self.device)
-
-        # One buffer for qpos, qvel and ctrl side by side: torch copies each in one operation, the kernels see parts.
-        n, slots = num_envs, horizon + 1  # the last slot serves steps that record nothing
-        self._widths = (self.nq, self.nv, self.nu)
-        self._start = tensor(slots, n, sum(self._widths))
-        self._end = tensor(n, self.nq + self.nv)
-        self._nonfinite = tensor(slots, n, of=torch.bool)
-        self._g_end = tensor(n, self.nq + self.nv)
-        self._g_start = tensor(n, sum(self._widths))
-        self._checkpoint: list[wp.array] | None = None
-        self._shape = shape
-        self._slot, self._last = 0, horizon
-        self._version = [0] * horizon
-        self.nonfinite_gradients = tensor(n, of=torch.int32)
-        self._coarse: Simulator | None = None
-        if integrator == "extrapolated":
-            half = substeps // 2
-            self._coarse = Simulator(
-                scene, n, control_dt, half, horizon, device=device, dtype=dtype, threads=threads, lanes=lanes
-            )
-            self._coarse.nonfinite_gradients, self._coarse.seconds = self.nonfinite_gradients, self.seconds
-            first = [*scene.qpos_adr[scene.ball == 0], *([3] if scene.floating else [])]
-            self._quaternions = torch.tensor([range(k, k + 4) for k in first], device=self.device)
+        self.integration, self.control_dt, self.horizon = integration, control_dt, horizon
+        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, division)
+        stepper = ExtrapolatedStepper if integration.integrator == "extrapolated" else Stepper
+        self._stepper = stepper(launcher, integration, control_dt, horizon)
+        self.seconds, self.nonfinite_gradients = launcher.seconds, launcher.nonfinite_gradients
 
     @property
     def nonfinite(self) -> torch.Tensor:
-        own = self._nonfinite[self._last]
-        return own if self._coarse is None else own | self._coarse.nonfinite
+        return self._stepper.nonfinite
 
-    def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
         """Advance all environments by one control step, differentiable in all three arguments.
 
         Args:
@@ -157,33 +93,17 @@ class Simulator:
         """
         for name, value, width in (("qpos", qpos, self.nq), ("qvel", qvel, self.nv), ("ctrl", ctrl, self.nu)):
             self.check_tensor(name, value, width)
-        recorded = torch.is_grad_enabled() and (qpos.requires_grad or qvel.requires_grad or ctrl.requires_grad)
-        if recorded:
-            slot = self._slot
-            self._slot = (slot + 1) % self.horizon
-            state = ControlStep.apply(self, slot, qpos, qvel, ctrl)
-        else:
-            state = self._forward(self.horizon, qpos, qvel, ctrl)
-        end = state.split(self._widths[:2], dim=1)
-        if self._coarse is None:
-            return end
-        return self._extrapolate((qpos, qvel), self._coarse.step(qpos, qvel, ctrl), end)
-
-    def _extrapolate(self, start: State, coarse: State, fine: State) -> State:
-        """Richardson: an error proportional to the substep cancels in 2 fine - coarse."""
-        qpos, qvel = (2.0 * b - a for a, b in zip(coarse, fine, strict=True))
-        if len(self._quaternions):
-            columns = self._quaternions
-            unit = torch.nn.functional.normalize(qpos[:, columns], dim=2)
-            qpos = qpos.index_copy(1, columns.flatten(), unit.flatten(1))
-        bad = self.nonfinite.unsqueeze(1)
-        return torch.where(bad, start[0].detach(), qpos), torch.where(bad, start[1].detach(), qvel)
+        return self._stepper.step(qpos, qvel, ctrl)
 
     def rewind(self) -> None:
         """Let the next differentiable step use the first checkpoint: the start of a new window."""
-        self._slot = 0
-        if self._coarse is not None:
-            self._coarse.rewind()
+        self._stepper.rewind()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a simulator, and so an environment, cannot be pickled or copied, because it holds compiled kernels: make "
+            "another one, and load the environment's state_dict() into it"
+        )
 
     def check_tensor(self, name: str, value: torch.Tensor, width: int) -> None:
         """Raise ValueError unless value is a (num_envs, width) tensor of the simulator's dtype on its device."""
@@ -196,105 +116,6 @@ class Simulator:
             raise ValueError(f"{name} has dtype {value.dtype}, must be {self.dtype}")
         if value.device != self.device:
             raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
-
-    # -- called by bridge.ControlStep ---------------------------------------------------------------------------------
-
-    def _forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
-        torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
-        self._last = slot
-        if slot < self.horizon:
-            self._version[slot] += 1
-        self._launch("forward", slot)
-        return self._end.clone()
-
-    def _backward(self, slot: int, version: int, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        if self._version[slot] != version:
-            raise RuntimeError(
-                f"backward through a control step whose checkpoint was overwritten: at most {self.horizon} "
-                "differentiable steps can be alive; build the simulator with a larger horizon"
-            )
-        self._g_end.copy_(g_end)
-        self._launch("backward", slot)
-        return self._g_start.clone().split(self._widths, dim=1)
-
-    # -- launches -----------------------------------------------------------------------------------------------------
-
-    def _split(self, threads: int | None, nlink: int) -> list[tuple[int, int]]:
-        """(first environment, count) of each thread's share."""
-        n = self.num_envs
-        if self.device.type == "cuda":
-            return [(0, n)]
-        wanted = threads or min(available_cores(), max(1, n * self.substeps * nlink // MIN_WORK_PER_THREAD))
-        bounds = [n * k // min(wanted, n) for k in range(min(wanted, n) + 1)]
-        return [(a, b - a) for a, b in zip(bounds, bounds[1:], strict=False)]
-
-    def _launch(self, kernel: str, slot: int) -> None:
-        if self.device.type == "cuda":
-            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-            with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
-                self._command(kernel, slot, 0).launch()
-            return
-        start = time.perf_counter()
-        commands = [self._command(kernel, slot, k) for k in range(len(self._chunks))]
-        # Warp runs a CPU kernel on the calling thread and releases the interpreter lock meanwhile.
-        waiting = [self._pool.submit(c.launch) for c in commands[1:]] if self._pool else []
-        commands[0].launch()
-        for future in waiting:
-            future.result()
-        self.seconds[kernel] += time.perf_counter() - start
-
-    def _command(self, kernel: str, slot: int, chunk: int) -> wp.Launch:
-        """A launch with its arguments packed once: packing costs more than a small kernel."""
-        key = (kernel, slot, chunk)
-        if key not in self._commands:
-            first, count = self._chunks[chunk]
-            self._commands[key] = wp.launch(
-                self._kernels[kernel],
-                dim=count * self._shape.lanes,
-                inputs=self._arguments(kernel, slot, first),
-                device=str(self.device),
-                block_dim=self._block_dim,
-                record_cmd=True,
-            )
-        return self._commands[key]
-
-    def _arguments(self, kernel: str, slot: int, first: int) -> list[Any]:
-        record = slot < self.horizon
-        if self._checkpoint is None and record:
-            self._checkpoint = self._rows(self.horizon * self.substeps)
-        rows = self._checkpoint if record and self._checkpoint else self._rows(0)
-        row0 = slot * self.substeps if record else 0
-        real = WARP_DTYPE[self.dtype]
-        head = [self._model, real(self.control_dt / self.substeps), real(self.theta), self.substeps, first]
-        qpos, qvel, ctrl = self._parts(self._start[slot], 3)
-        nonfinite = wp.from_torch(self._nonfinite[slot])
-        if kernel == "forward":
-            return [*head, qpos, qvel, ctrl, int(record), row0, *rows, *self._parts(self._end, 2), nonfinite]
-        gradients = [*self._parts(self._g_end, 2), *self._parts(self._g_start, 3)]
-        blown_up = wp.from_torch(self.nonfinite_gradients)
-        return [*head, row0, *rows, qpos, ctrl, nonfinite, *gradients, blown_up]
-
-    def _parts(self, buffer: torch.Tensor, count: int) -> list[Any]:
-        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl."""
-        return [wp.from_torch(part) for part in buffer.split(self._widths[:count], dim=1)]
-
-    def _rows(self, count: int) -> list[wp.array]:
-        """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
-        n, widths = self.num_envs, (self.nq, self.nv, self.nv, self._shape.nfactor)
-        sizes = [(count, k, n) if self._shape.env_last else (count, n, k) for k in widths]
-        return [wp.zeros(size, dtype=WARP_DTYPE[self.dtype], device=str(self.device)) for size in sizes]
-
-
-def default_lanes(scene: Scene, num_envs: int) -> tuple[int, int]:
-    """GPU threads per environment, and how many of them share limbs: as measured in docs/performance.md."""
-    groups = min((1, 2, 4), key=lambda lanes: (divide(scene, lanes).slots, lanes))
-    sharers = MUSCLE_SHARERS if "muscle" in scene.features else 1
-    return (groups * sharers, sharers) if groups * sharers * num_envs <= MAX_THREADS else (1, 1)
-
-
-def available_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_device(device: str | torch.device) -> torch.device:

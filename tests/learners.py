@@ -1,9 +1,9 @@
-"""What the tests of the learners share."""
+"""What the tests of the scripts and of what surrounds them share."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import csv
+import importlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
@@ -13,12 +13,27 @@ import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+# Windows of cartpole with a time-out on the way (240 steps), an evaluation before the end and one at it.
+_SMALL = (
+    "--env cartpole --num-envs 3 --horizon 32 --iterations 10 --eval-every 4 --eval-episodes 3 --quiet --device cpu"
+).split()
+SMALL = {
+    "shac": [*_SMALL, "--critic-iterations", "3"],
+    "bptt": _SMALL,
+    "ppo_baseline": [*_SMALL, "--minibatch-size", "40", "--epochs", "2"],
+}
+SCRIPTS = {name: importlib.import_module(name) for name in SMALL}
 
 
-def run(learner: ModuleType, directory: Path, *arguments: object) -> dict[str, Any]:
+def run(script: ModuleType, directory: Path, *arguments: object) -> dict[str, Any]:
     """Trains in directory; returns the checkpoint."""
-    learner.main([*map(str, arguments), "--run-dir", str(directory)])
+    script.main([*map(str, arguments), "--run-dir", str(directory)])
     return torch.load(directory / "checkpoint.pt", weights_only=True)
+
+
+def read_progress(directory: Path) -> list[dict[str, str]]:
+    with (directory / "progress.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def assert_same(a: Any, b: Any) -> None:
@@ -53,8 +68,18 @@ def assert_derivatives(
         assert gradients[name].flatten()[index].item() == pytest.approx(difference, rel=rel), name
 
 
+def refusal(call: Callable[[], object], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line with which a call ends the script, exit code 2."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit:
+        call()
+    out, error = capsys.readouterr()
+    assert exit.value.code == 2 and out == "" and error.count("\n") == 1
+    return error.strip()
+
+
 def assert_refuses(
-    learner: ModuleType,
+    script: ModuleType,
     arguments: str,
     message: str,
     trained: Path,
@@ -62,27 +87,20 @@ def assert_refuses(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Arguments, with {places} to fill in, give one line that holds the message, exit code 2, and no file."""
-    places = {name: tmp_path / name for name in ("file", "truncated", "foreign", "elsewhere")} | {"trained": trained}
+    places = {name: tmp_path / name for name in ("file", "truncated", "foreign", "older", "other", "elsewhere")}
+    places["trained"] = trained
+    checkpoint = torch.load(trained / "checkpoint.pt", weights_only=True)
     places["file"].write_text("hello")
     places["truncated"].write_bytes((trained / "checkpoint.pt").read_bytes()[:5000])
     torch.save({"weights": torch.zeros(3)}, places["foreign"])
-    checkpoint = torch.load(trained / "checkpoint.pt", weights_only=True)
+    torch.save(checkpoint | {"format": f"{script.__name__}-1"}, places["older"])
+    torch.save(checkpoint | {"script": "other"}, places["other"])
     torch.save(checkpoint | {"args": checkpoint["args"] | {"device": "cuda:0"}}, places["elsewhere"])
     before = sorted(tmp_path.rglob("*"))
     argv = arguments.format(**places).split()
     if not {"--run-dir", "--resume", "--evaluate"} & set(argv):
         argv += ["--run-dir", str(tmp_path / "run")]
-    with pytest.raises(SystemExit) as exit:
-        learner.main(argv)
-    assert exit.value.code == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"{learner.__name__}.py: ") and error.count("\n") == 1
-    assert message.format(**places, name=learner.__name__) in error
+    error = refusal(lambda: script.main(argv), capsys)
+    assert error.startswith(f"{script.__name__}.py: ")
+    assert message.format(**places, name=script.__name__) in error
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def assert_refuses_a_missing_gpu(learner: ModuleType) -> None:
-    command = [sys.executable, str(ROOT / f"{learner.__name__}.py"), "--device", "cuda"]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 2 and result.stdout == ""
-    assert result.stderr.splitlines()[-1].startswith(f"{learner.__name__}.py: ") and "cuda" in result.stderr.lower()

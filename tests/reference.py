@@ -11,6 +11,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from diffsim.integration import Integration
 from diffsim.scene import Scene
 
 Array = NDArray[np.float64]
@@ -120,11 +121,11 @@ def joint_forces(
         q = joint_position(scene, i, qpos) + theta * h * qd
         bound = np.clip(q, scene.lower[i], scene.upper[i])
         beyond = q != bound
-        damping = scene.damping[i] + beyond * scene.d_limit
-        force[dof] += scene.stiffness[i] * (scene.spring_ref[i] - q) - damping * qd
-        if beyond:
-            force[dof] += scene.k_limit * (bound - q)
-        resistance[dof] = h * damping + theta * h**2 * (scene.stiffness[i] + beyond * scene.k_limit)
+        push = scene.k_limit[i] * (bound - q) - scene.d_limit[i] * qd
+        pushes = beyond and push * (bound - q) > 0  # it never pulls
+        force[dof] += scene.stiffness[i] * (scene.spring_ref[i] - q) - scene.damping[i] * qd + pushes * push
+        resistance[dof] = h * (scene.damping[i] + pushes * scene.d_limit[i])
+        resistance[dof] += theta * h**2 * (scene.stiffness[i] + pushes * scene.k_limit[i])
     return force, resistance
 
 
@@ -256,11 +257,10 @@ def step(
     qvel: Array,
     ctrl: Array,
     control_dt: float,
-    substeps: int,
-    integrator: str = "semi_implicit",
-    theta: float = 0.0,
+    integration: Integration,
 ) -> tuple[Array, Array]:
     """One control step of one environment."""
+    integrator, substeps, theta = integration
     h = control_dt / substeps
     for _ in range(substeps):
         implicit = h if integrator == "implicit" else 0.0

@@ -13,9 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 import diffsim
-from diffsim.scene import Scene, load_scene
+from diffsim.integration import Integration
+from diffsim.mjcf import load_scene
+from diffsim.scene import Scene
 from diffsim.simulator import Simulator
-from diffsim.tasks import PLANAR, TASKS
+from diffsim.tasks import TASKS
 
 Array = NDArray[np.float64]
 
@@ -146,6 +148,31 @@ HINGE = """
 </mujoco>"""
 
 
+FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
+
+
+def robot(body: str, rest: str = "", world: str = FLOOR) -> str:
+    return f'<mujoco><compiler angle="radian"/><worldbody>{world}{body}</worldbody>{rest}</mujoco>'
+
+
+def pendulum(joint: str = "", inside: str = "", rest: str = "", world: str = FLOOR) -> str:
+    """A sphere on a hinge."""
+    body = f'<body name="arm"><joint name="hinge" {joint}/><geom type="sphere" size="0.1" pos="0 0 -1"/>{inside}</body>'
+    return robot(body, rest, world)
+
+
+MUSCLE = 'name="biceps" tendon="string" force="5" lengthrange="1 2"'
+
+
+def tendon(more: str = "", spring: str = "", joint: str = "<joint/>", actuator: str = "", custom: str = "") -> str:
+    """A string from the world's site w to the body's site b."""
+    body = (
+        f'<site name="w"/><body>{joint}<geom name="g" size="0.1"/><site name="a" pos="1 0 0"/><site name="b"/></body>'
+    )
+    path = f'<spatial name="string" {spring}><site site="w"/><site site="a"/>{more}<site site="b"/></spatial>'
+    return robot(body, f"<tendon>{path}</tendon><actuator>{actuator}</actuator><custom>{custom}</custom>")
+
+
 def parse(mjcf: str) -> Scene:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"
@@ -155,7 +182,7 @@ def parse(mjcf: str) -> Scene:
 
 @cache
 def task_scene(name: str) -> Scene:
-    return load_scene(Path(diffsim.__file__).parent / "assets" / (TASKS | PLANAR)[name].asset)
+    return load_scene(Path(diffsim.__file__).parent / "assets" / TASKS[name].asset)
 
 
 @cache
@@ -334,4 +361,4 @@ def run(
 
 def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, **simulator: object) -> Array:
     """qacc: the change of velocity over one substep of one second."""
-    return run(scene, qpos, qvel, ctrl, control_dt=1.0, substeps=1, **simulator)[1] - qvel
+    return run(scene, qpos, qvel, ctrl, control_dt=1.0, integration=Integration(substeps=1), **simulator)[1] - qvel

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import BALL, HINGE, acting_states, parse, run, task_scene
+from scenes import BALL, HINGE, acting_states, leg_scene, parse, run, task_scene
 
 import diffsim
+from diffsim.integration import INTEGRATORS, Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
-from diffsim.kernels.model import shape_of
-from diffsim.simulator import INTEGRATORS, Simulator
-from diffsim.tasks import TASKS
-from diffsim.tasks.base import Integration
+from diffsim.kernels.lanes import divide
+from diffsim.kernels.spec import kernel_spec
+from diffsim.simulator import Simulator
+from diffsim.tasks import SHAC_TASKS, TASKS
 
 SETTINGS = [  # and the order of each
     ("semi_implicit", 0.0, 1),
@@ -32,44 +33,44 @@ SETTINGS = [  # and the order of each
 # Presets
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", SHAC_TASKS)
 def test_presets_of_every_task_are_used(name):
     task = TASKS[name]
-    assert task.integration("default") == Integration("semi_implicit", 0.0, task.substeps)
+    assert task.integration("default") == Integration("semi_implicit", task.substeps)
     works = {}
     for accuracy in ("fast", "default", "accurate"):
         preset = task.integration(accuracy)
         sim = diffsim.make(name, num_envs=1, horizon=1, accuracy=accuracy).sim
-        assert (sim.integrator, sim.theta, sim.substeps) == preset
+        assert sim.integration == preset
         works[accuracy] = preset.substeps * (1.5 if preset.integrator == "extrapolated" else 1)
     assert works["fast"] <= works["default"] / 2 and works["default"] < works["accurate"]
     default = diffsim.make(name, num_envs=1, horizon=1).sim
-    assert (default.integrator, default.theta, default.substeps) == task.integration("default")
+    assert default.integration == task.integration("default")
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", SHAC_TASKS)
 def test_accurate_presets_are(name, rng):
     """Error after a control step, median over states in contact: a fifth of the default's, fast at most five times."""
     scene, states = task_scene(name), acting_states(task_scene(name), 16, rng)
     leaves = [torch.tensor(x) for x in states]
 
-    def end(integrator, theta, substeps):
-        options = dict(substeps=substeps, integrator=integrator, theta=theta, dtype=torch.float64)
-        return torch.cat(Simulator(scene, 16, **options).step(*leaves), 1)
+    def end(integration):
+        return torch.cat(Simulator(scene, 16, integration, dtype=torch.float64).step(*leaves), 1)
 
     task = TASKS[name]
-    exact = end("semi_implicit", 0.0, 64 * task.substeps)
-    error = {a: (end(*task.integration(a)) - exact).norm(dim=1).median() for a in ("fast", "default", "accurate")}
+    exact = end(Integration("semi_implicit", 64 * task.substeps))
+    error = {a: (end(task.integration(a)) - exact).norm(dim=1).median() for a in ("fast", "default", "accurate")}
     assert error["accurate"] < 0.2 * error["default"] and error["fast"] < 5 * error["default"]
 
 
 def test_arguments_override_the_preset():
-    sim = diffsim.make("humanoid", 1, horizon=1, accuracy="fast", substeps=7).sim
-    assert (sim.substeps, sim.integrator) == (7, TASKS["humanoid"].fast.integrator)
-    sim = diffsim.make("humanoid", 1, horizon=1, accuracy="fast", integrator="implicit", theta=0.25).sim
-    assert (sim.substeps, sim.integrator, sim.theta) == (TASKS["humanoid"].fast.substeps, "implicit", 0.25)
-    sim = diffsim.make("humanoid", 1, horizon=1, accuracy="fast", integrator="semi_implicit").sim
-    assert (sim.integrator, sim.theta) == ("semi_implicit", 0.0)
+    def integration(**given):
+        return diffsim.make("humanoid", 1, horizon=1, accuracy="fast", **given).sim.integration
+
+    fast = TASKS["humanoid"].fast
+    assert integration(substeps=7) == Integration(fast.integrator, 7)
+    assert integration(integrator="implicit", theta=0.25) == Integration("implicit", fast.substeps, 0.25)
+    assert integration(integrator="semi_implicit") == Integration("semi_implicit", fast.substeps)
 
 
 def test_presets_that_are_not_there_are_named(monkeypatch):
@@ -79,7 +80,7 @@ def test_presets_that_are_not_there_are_named(monkeypatch):
     class Bare(diffsim.tasks.Task):
         name, substeps = "bare", 8
 
-    assert Bare.integration("default") == ("semi_implicit", 0.0, 8)
+    assert Bare.integration("default") == ("semi_implicit", 8, 0.0)
     with pytest.raises(ValueError, match="'bare' has no preset 'fast'"):
         Bare.integration("fast")
 
@@ -122,8 +123,8 @@ def test_order_of_a_damped_oscillator(integrator, theta, order):
 
     def simulated(substeps):
         leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in start]
-        options = dict(substeps=substeps, dtype=torch.float64, integrator=integrator, theta=theta)
-        q, v = Simulator(scene, 1, t, **options).step(*leaves, torch.zeros(1, 0, dtype=torch.float64))
+        sim = Simulator(scene, 1, Integration(integrator, substeps, theta), t, dtype=torch.float64)
+        q, v = sim.step(*leaves, torch.zeros(1, 0, dtype=torch.float64))
         return np.array([q.item(), v.item(), *(g.item() for g in torch.autograd.grad(q, leaves))])
 
     errors = [abs(simulated(n) - exact) for n in (256, 512, 1024)]
@@ -137,11 +138,8 @@ def test_order_of_contact_and_friction(integrator, theta, order):
     depth = scene.mass[0] * 9.81 / scene.k_n
     qpos = np.array([[0.0, 0.0, 0.1 - 1.2 * depth, 1.0, 0.0, 0.0, 0.0]])
     qvel = np.array([[0.02, -0.01, 0.0, 0.3, 0.1, -0.2]])
-    options = dict(control_dt=0.05, integrator=integrator, theta=theta)
-    ends = [
-        np.concatenate(run(scene, qpos, qvel, np.zeros((1, 0)), substeps=n, **options), 1)[0]
-        for n in (256, 512, 1024, 2048)
-    ]
+    ctrl, settings = np.zeros((1, 0)), [Integration(integrator, n, theta) for n in (256, 512, 1024, 2048)]
+    ends = [np.concatenate(run(scene, qpos, qvel, ctrl, control_dt=0.05, integration=s), 1)[0] for s in settings]
     changes = [np.linalg.norm(a - b) for a, b in zip(ends, ends[1:], strict=False)]
     np.testing.assert_allclose(np.log2(np.array(changes[:-1]) / changes[1:]), order, atol=0.1)
 
@@ -186,7 +184,7 @@ def test_extremes_stay_finite_or_contained(name, integrator, rng):
         qpos, qvel, _ = acting_states(task_scene(name), 4, rng)
         scene, qpos, qvel = extreme(task_scene(name), qpos, qvel, kind)
         substeps = 32 if integrator == "extrapolated" else 16  # it is as stable as its coarser step
-        sim = Simulator(scene, 4, substeps=substeps, horizon=12, integrator=integrator)
+        sim = Simulator(scene, 4, Integration(integrator, substeps), horizon=12)
         leaves = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (qpos, qvel)]
         ctrl = torch.ones(4, scene.nu, requires_grad=True)
         (q, v), contained = leaves, torch.zeros(4, dtype=torch.bool)
@@ -257,7 +255,7 @@ QUATERNION = range(3, 7)  # its length is not a coordinate; test_gradient.py has
 def test_corners_of_contact_have_one_sided_gradients(integrator, theta):
     """Exact touch with and without approach, exactly no slip, and exactly where friction saturates."""
     scene, weights = parse(BALL), np.cos(np.arange(13.0))
-    options = dict(substeps=1, integrator=integrator, theta=theta)
+    options = dict(integration=Integration(integrator, 1, theta))
 
     def ball(depth, *velocity):
         return [
@@ -279,7 +277,7 @@ def test_limit_exactly_met_has_a_one_sided_gradient(integrator, theta):
     scene = parse(HINGE)
     for bound in (scene.lower[1], scene.upper[1]):
         states = [np.array([[x]]) for x in (bound, 0.0, 0.0)]
-        options = dict(substeps=1, integrator=integrator, theta=theta)
+        options = dict(integration=Integration(integrator, 1, theta))
         assert check_one_sided(scene, states, np.array([1.0, 2.0]), **options) > 0
 
 
@@ -293,7 +291,7 @@ def test_upright_and_upside_down(name, turn, integrator):
     qpos[0, 7:] = np.clip(0.0, scene.lower[1:] + 0.1, scene.upper[1:] - 0.1)
     weights = np.sin(np.arange(float(scene.nq + scene.nv)))
     states = [qpos, 0.1 * np.ones((1, scene.nv)), 0.1 * np.ones((1, scene.nu))]
-    assert check_one_sided(scene, states, weights, QUATERNION, substeps=4, integrator=integrator) == 0
+    assert check_one_sided(scene, states, weights, QUATERNION, integration=Integration(integrator, 4)) == 0
 
 
 def test_cartpole_upright_and_hanging():
@@ -314,9 +312,9 @@ def test_cartpole_upright_and_hanging():
 def source(scene):
     """Warp's C++ of the scene's forward and backward kernel."""
     wp.init()
-    shape, text = shape_of(scene, wp.float64, implicit=False, env_last=False), ""
+    spec, text = kernel_spec(scene, divide(scene), wp.float64, implicit=False, env_last=False), ""
     for build in (forward_kernel, backward_kernel):
-        module = build(shape).module
+        module = build(spec).module
         module.load("cpu")
         (path,) = (Path(wp.config.kernel_cache_dir) / module.get_module_identifier()).glob("*.cpp")
         text += path.read_text()
@@ -331,16 +329,17 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "slide": r"\(var_m\)\.slide\b",
     "hinge": r"\bsin\(",
     "motor": r"\(var_m\)\.motor_slot\b",
-    "ball": r"\(var_m\)\.(ball_link|qpos_adr|inboard|outboard)\b",
-    "muscle": r"\(var_m\)\.(npair|pair_\w+|segment_\w+)\b",
+    "ball": r"\(var_m\)\.(ball_\w+|qpos_adr|inboard|outboard)\b",
+    "muscle": r"\(var_m\)\.(pair_\w+|segment_\w+)\b",
+    "drag": r"\(var_m\)\.drag_\w+\b",
     "hill": r"\(var_m\)\.hill\b",
     "floating": r"\bquat",  # or a ball; every ball here is on a floating base
 }
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", [*TASKS, "linear", "hill"])
 def test_kernels_hold_the_code_of_the_features_and_no_other(name):
-    scene = task_scene(name)
+    scene = task_scene(name) if name in TASKS else leg_scene(name)
     text = source(scene)
     for feature, pattern in CODE.items():
         assert bool(re.search(pattern, text)) == (feature in scene.features), feature
@@ -363,7 +362,7 @@ def test_a_feature_that_is_left_out_changes_nothing_where_it_did_nothing(integra
     qpos[:, 1], qpos[:, 3:] = 100.0, (full.lower[4:] + full.upper[4:]) / 2
     results = []
     for scene in (full, bare):
-        sim = Simulator(scene, 4, dtype=torch.float64, integrator=integrator)
+        sim = Simulator(scene, 4, Integration(integrator), dtype=torch.float64)
         leaves = [torch.tensor(x, requires_grad=True) for x in (qpos, 0.1 * qvel, 0.01 * ctrl)]
         q, v = sim.step(*leaves)
         results.append([q.detach(), v.detach(), *torch.autograd.grad(q.sum() + v.square().sum(), leaves)])

@@ -1,17 +1,25 @@
-"""BPTT's loss and gradient against plain reference implementations."""
+"""BPTT's loss and gradient against plain reference implementations, and its own switches."""
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from learners import assert_derivatives, run
+from learners import assert_derivatives, read_progress, run
 
 import bptt
 import diffsim
+from diffsim.training import parse
+
+
+def build(task: str, *arguments: str, dtype: torch.dtype = torch.float32) -> bptt.BPTT:
+    """The algorithm on three environments; in float64 not to be optimised."""
+    args = parse(bptt.Args, ["--env", task, "--device", "cpu", *arguments])
+    learner = bptt.BPTT(args, diffsim.make(task, num_envs=3, seed=0, horizon=args.horizon, dtype=dtype))
+    learner.actor.to(dtype)
+    return learner
 
 
 @pytest.mark.parametrize("horizon", [1, 12])
@@ -35,56 +43,50 @@ def test_loss_and_its_gradient_are_those_of_a_loop(rng: np.random.Generator, hor
 def test_gradient_is_the_finite_difference(task: str, horizon: int) -> None:
     """Through a whole window of cartpole, and of ants of which one runs out of time."""
     torch.manual_seed(0)
-    env = diffsim.make(task, num_envs=3, seed=0, horizon=horizon, dtype=torch.float64)
-    actor, normalise = (part.double() for part in bptt.build(bptt.Args(hidden=(16,)), env))
+    learner = build(task, "--hidden", "16", "--horizon", str(horizon), dtype=torch.float64)
+    env, policy = learner.env, learner.actor
     env.episode_step[1] = env.episode_length - 4
     start = env.state_dict()
     noise = torch.randn(horizon, 3, env.single_action_space.shape[0], dtype=torch.float64)
 
     def loss() -> torch.Tensor:
         env.load_state_dict(start)
-        window = bptt.collect(env, actor, normalise, actor.log_std.exp() * noise)
-        assert window.truncated.any(0).tolist() == [False, True, False] and not window.terminated.any()
-        return bptt.bptt_loss(window.reward, window.done, 0.99)
+        rollout = bptt.collect(env, policy, policy.log_std.exp() * noise)
+        assert rollout.done.any(0).tolist() == [False, True, False] and rollout.done[3, 1]
+        return bptt.bptt_loss(rollout.reward, rollout.done, 0.99)
 
     places = (("mean.0.weight", 40), ("mean.3.weight", 7), ("log_std", 0))
-    assert_derivatives(dict(actor.named_parameters()), loss, places, rel=1e-5)
+    assert_derivatives(dict(policy.named_parameters()), loss, places, rel=1e-5)
 
 
-def test_large_gradients_are_clipped_and_only_infinite_ones_skipped() -> None:
-    """An exploding gradient is what this baseline is about: it is followed as long as it has a direction."""
-    torch.manual_seed(0)
-    module = bptt.mlp(3, (5,), 1, orthogonal=False)
-    optimizer = bptt.ClippedAdam(module, bptt.Args())
+def test_large_gradients_are_followed() -> None:
+    """An exploding gradient is what this baseline is about; test_optimizer.py has the rest."""
+    optimizer = build("cartpole").optimizer
+    before, weights = optimizer.vector.clone(), optimizer.parameters
     optimizer.lr.fill_(1e-2)
-    reference = torch.nn.Parameter(optimizer.vector.clone())
-    adam = torch.optim.Adam([reference], 1e-2, betas=(0.7, 0.95))
-    inputs = torch.randn(20, 3)
-    for scale in (1.0, 1e12, float("nan"), float("inf"), 1e3):
-        loss = scale * module(inputs).square().mean()
-        gradients = torch.autograd.grad(loss, optimizer.parameters, retain_graph=True)
-        gradient = torch.cat([g.flatten() for g in gradients])
-        norm = optimizer.step(loss)
-        if scale < float("inf"):
-            torch.testing.assert_close(norm, gradient.norm())
-            reference.grad = gradient / norm.clamp(min=1.0)
-            adam.step()
-        torch.testing.assert_close(optimizer.vector, reference.detach())
-    assert optimizer.skipped == 2
+    assert optimizer.step(1e15 * sum(weight.square().sum() for weight in weights)) > 1e15
+    assert optimizer.skipped == 0 and not torch.equal(optimizer.vector, before)
+    assert optimizer.max_norm == 1.0 and optimizer.adam.param_groups[0]["betas"] == (0.7, 0.95)
 
 
-@pytest.mark.parametrize("normalised", [True, False])
-def test_observations_are_normalised_on_request(normalised: bool, tmp_path: Path) -> None:
-    arguments = f"--env cartpole --num-envs 2 --horizon 8 --iterations 2 --normalise-obs {normalised} --eval-episodes 1"
-    checkpoint = run(bptt, tmp_path, *arguments.split(), "--quiet")
-    assert checkpoint["normalise"]["count"] == (2 * 8 * 2 if normalised else 0)
+def test_the_learning_rate_decays_linearly() -> None:
+    learner = build("cartpole", "--iterations", "10")
+    for iteration in (1, 4, 10):
+        learner.set_learning_rate(iteration)
+        assert learner.optimizer.lr.item() == pytest.approx(1e-5 + (1e-2 - 1e-5) * (11 - iteration) / 10)
+
+
+@pytest.mark.parametrize("flag", ["--normalize-obs", "--no-normalize-obs"])
+def test_observations_are_normalized_on_request(flag: str, tmp_path: Path) -> None:
+    arguments = f"--env cartpole --num-envs 2 --horizon 8 --iterations 2 {flag} --eval-episodes 1 --quiet"
+    policy = run(bptt, tmp_path, *arguments.split())["modules"]["actor"]
+    assert policy["normalizer.count"] == (2 * 8 * 2 if flag == "--normalize-obs" else 0)
 
 
 def test_a_window_as_long_as_the_episode_swings_the_pole_up_in_part(tmp_path: Path) -> None:
-    """From -2,375 per episode of 240 steps to -1,550; a wrong sign only gets worse."""
-    arguments = "--env cartpole --num-envs 16 --horizon 240 --iterations 15 --eval-episodes 16 --quiet"
+    """From -2,375 per episode of 240 steps to -1,890; a wrong sign only gets worse."""
+    arguments = "--env cartpole --num-envs 16 --horizon 240 --iterations 8 --eval-episodes 1 --quiet"
     run(bptt, tmp_path, *arguments.split())
-    with (tmp_path / "progress.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_progress(tmp_path)
     assert rows[0]["length"] == "240.0"  # every window holds a whole episode
-    assert float(rows[0]["return"]) < -2200 and float(rows[-1]["return"]) > -1800
+    assert float(rows[0]["return"]) < -2200 and float(rows[-1]["return"]) > -2000

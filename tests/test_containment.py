@@ -8,7 +8,8 @@ import torch
 from scenes import BALL, PENDULUM, acting_states, parse, task_scene
 
 import diffsim
-from diffsim.simulator import INTEGRATORS, Simulator
+from diffsim.integration import INTEGRATORS, Integration
+from diffsim.simulator import Simulator
 
 BAD, GOOD = 2, [0, 1, 3, 4]
 
@@ -31,7 +32,7 @@ def step_and_gradients(sim, states):
 def test_simulator_contains_what_is_not_finite(name, threads, integrator, where, value, rng):
     scene = task_scene(name)
     states = acting_states(scene, 5, rng)
-    sim = Simulator(scene, 5, threads=threads, integrator=integrator)
+    sim = Simulator(scene, 5, Integration(integrator), threads=threads)
     outputs, gradients = step_and_gradients(sim, states)
     assert not sim.nonfinite.any()
     states[where][BAD, -1] = value
@@ -141,7 +142,7 @@ def test_blow_up_ends_the_episode_without_early_termination_too():
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"name": "walker"}, "walker.*cartpole, hopper, half_cheetah, ant, humanoid"),
+        ({"name": "runner"}, "runner.*cartpole, hopper, half_cheetah, ant, humanoid, humanoid_mtu, swimmer, walker"),
         ({"num_envs": 0}, "num_envs.*0.*at least 1"),
         ({"num_envs": 2.5}, "num_envs"),
         ({"horizon": 0}, "horizon.*0"),
@@ -150,6 +151,8 @@ def test_blow_up_ends_the_episode_without_early_termination_too():
         ({"integrator": "rk4"}, "rk4.*semi_implicit, implicit"),
         ({"substeps": 7, "integrator": "extrapolated"}, "substeps is 7, must be even"),
         ({"theta": 1.5, "integrator": "implicit"}, "theta.*1.5"),
+        ({"theta": 0.5}, "theta is 0.5, but only the implicit"),
+        ({"theta": 0.5, "integrator": "extrapolated"}, "theta is 0.5, but only the implicit"),
         ({"dtype": torch.float16}, "float16.*float32.*float64"),
         ({"device": "tpu"}, "tpu.*cpu"),
     ],

@@ -10,6 +10,7 @@ import torch
 from scenes import acceleration, free_states, parse, run
 from test_gradient import check_gradients
 
+from diffsim.integration import Integration
 from diffsim.simulator import Simulator
 
 # A free box of three unlike sides, two more on hinges about unlike axes, one of them on a slide besides. It is fast in
@@ -67,16 +68,17 @@ def test_accelerations_are_mujocos(fish, rng):
 @pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
 def test_steps_are_the_references(fish, integrator, rng):
     states = states_of(fish, rng)
-    q, v = run(fish, *states, substeps=4, integrator=integrator)
+    integration = Integration(integrator, 4)
+    q, v = run(fish, *states, integration=integration)
     for e, state in enumerate(zip(*states, strict=True)):
-        expected = reference.step(fish, *state, 1 / 60, 4, integrator=integrator)
+        expected = reference.step(fish, *state, 1 / 60, integration)
         np.testing.assert_allclose(q[e], expected[0], atol=1e-10)
         np.testing.assert_allclose(v[e], expected[1], atol=1e-10)
 
 
 @pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
 def test_gradient_is_that_of_differences(fish, integrator, rng):
-    check_gradients(fish, states_of(fish, rng), rng, substeps=8, integrator=integrator)
+    check_gradients(fish, states_of(fish, rng), rng, integration=Integration(integrator, 8))
 
 
 def test_gradient_at_rest_is_the_viscous_one(rng):
@@ -85,7 +87,7 @@ def test_gradient_at_rest_is_the_viscous_one(rng):
         scene = parse(BALL.format(viscosity=viscosity))
         qpos = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
         qvel = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
-        sim = Simulator(scene, 1, control_dt=0.01, substeps=1, dtype=torch.float64)
+        sim = Simulator(scene, 1, Integration(substeps=1), control_dt=0.01, dtype=torch.float64)
         _, after = sim.step(qpos, qvel, torch.zeros(1, 0, dtype=torch.float64))
         (slope,) = torch.autograd.grad(after[0, 0], qvel)
         side = np.sqrt(0.4 * 6) * 0.1  # of the cube with the sphere's inertia
@@ -97,7 +99,7 @@ def test_terminal_velocity():
     scene = parse(BALL.format(viscosity=0).replace('gravity="0 0 0"', 'gravity="0 0 -9.81"').replace('"3"', '"100"'))
     state = np.zeros((1, 7)), np.zeros((1, 6)), np.zeros((1, 0))
     state[0][0, 3] = 1.0
-    _, v = run(scene, *state, steps=600, substeps=4)
+    _, v = run(scene, *state, steps=600, integration=Integration(substeps=4))
     assert v[0, 2] == pytest.approx(-np.sqrt(2 * 2 * 9.81 / (100 * 0.4 * 6 * 0.1**2)), rel=1e-6)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import re
 
 import mujoco
 import numpy as np
@@ -31,6 +32,7 @@ from scenes import (
     without_ground,
 )
 
+from diffsim.integration import Integration
 from diffsim.simulator import Simulator
 from diffsim.tasks import TASKS
 
@@ -144,14 +146,22 @@ def test_muscle_on_the_world_pulls_as_mujocos(rng):
     check_against_mujoco(parse(CRANE), torch.float64, rng)
 
 
+@pytest.mark.parametrize("text, model", [("", "linear"), ('<text name="muscle_model" data="hill"/>', "hill")])
+def test_an_mjcf_asks_for_hill_type_muscles(text, model, rng):
+    """The same <muscle> pulls with MuJoCo's curves where the file says so, with its maximum force alone elsewhere."""
+    muscle = '<muscle name="winch" tendon="rope" force="9" lengthrange=".5 3" range="0.6 1.5"/>'
+    mjcf = re.sub("<motor.*/>", muscle, CRANE).replace("<worldbody>", f"<custom> {text} </custom> <worldbody>")
+    scene = parse(mjcf)
+    assert scene.muscle_model == model and ("hill" in scene.features) == (model == "hill")
+    check_against_mujoco(scene, torch.float64, rng)
+
+
 # Against the plain NumPy reference
 
 
-def check_against_reference(scene, qpos, qvel, ctrl, substeps, **integrator):
-    q, v = run(scene, qpos, qvel, ctrl, substeps=substeps, **integrator)
-    expected = [
-        reference.step(scene, *state, 1 / 60, substeps, **integrator) for state in zip(qpos, qvel, ctrl, strict=True)
-    ]
+def check_against_reference(scene, qpos, qvel, ctrl, integration):
+    q, v = run(scene, qpos, qvel, ctrl, integration=integration)
+    expected = [reference.step(scene, *state, 1 / 60, integration) for state in zip(qpos, qvel, ctrl, strict=True)]
     assert relative_error(q, np.array([e[0] for e in expected])) < 1e-10
     assert relative_error(v, np.array([e[1] for e in expected])) < 1e-10
 
@@ -162,7 +172,7 @@ def test_task_steps_are_the_references(name, integrator, theta, rng):
     scene = task_scene(name)
     states = acting_states(scene, 3, rng)
     check_that_ground_and_limits_act(scene, *states[:2])
-    check_against_reference(scene, *states, TASKS[name].substeps, integrator=integrator, theta=theta)
+    check_against_reference(scene, *states, Integration(integrator, TASKS[name].substeps, theta))
 
 
 @pytest.mark.parametrize("base, seed", TREES)
@@ -171,26 +181,26 @@ def test_tree_steps_are_the_references(base, seed, rng):
     qpos, qvel, ctrl = free_states(scene, 4, rng)
     pass_limits(scene, qpos, rng)
     scene = raise_ground(scene, qpos)
-    check_against_reference(scene, qpos, qvel, ctrl, substeps=16)
+    check_against_reference(scene, qpos, qvel, ctrl, Integration(substeps=16))
 
 
 @pytest.mark.parametrize("theta", [0.0, 0.5])
 def test_ball_joint_takes_implicit_steps_as_the_reference(theta, rng):
     scene = parse(SHOULDER)
-    check_against_reference(scene, *free_states(scene, 4, rng), substeps=4, integrator="implicit", theta=theta)
+    check_against_reference(scene, *free_states(scene, 4, rng), Integration("implicit", 4, theta))
 
 
 @pytest.mark.parametrize("model", ["linear", "hill"])
 def test_muscle_steps_are_the_references(model, rng):
     scene = leg_scene(model)
-    check_against_reference(scene, *free_states(scene, 4, rng), substeps=16)
+    check_against_reference(scene, *free_states(scene, 4, rng), Integration(substeps=16))
 
 
 def test_ball_joints_know_a_quaternion_and_its_negative_as_one(rng):
     scene = parse(SHOULDER)
     qpos, qvel, ctrl = free_states(scene, 16, rng)
-    q, v = run(scene, qpos, qvel, ctrl, substeps=64)
-    opposite_q, opposite_v = run(scene, qpos * [-1, -1, -1, -1, 1], qvel, ctrl, substeps=64)
+    q, v = run(scene, qpos, qvel, ctrl, integration=Integration(substeps=64))
+    opposite_q, opposite_v = run(scene, qpos * [-1, -1, -1, -1, 1], qvel, ctrl, integration=Integration(substeps=64))
     np.testing.assert_array_equal(opposite_q * [-1, -1, -1, -1, 1], q)
     np.testing.assert_array_equal(opposite_v, v)
     np.testing.assert_allclose(np.linalg.norm(q[:, :4], axis=1), 1, rtol=1e-14)
@@ -213,7 +223,7 @@ def test_free_flight_keeps_momentum_and_energy_to_first_order(base, rng):
 
     def errors(conserved, ctrl, gained=0.0):
         before = conserved(scene, qpos[0], qvel[0])
-        ends = [run(scene, qpos, qvel, ctrl, control_dt=t, substeps=n) for n in substeps]
+        ends = [run(scene, qpos, qvel, ctrl, control_dt=t, integration=Integration(substeps=n)) for n in substeps]
         return [
             np.linalg.norm(conserved(scene, q[0], v[0]) - before - gained) / np.linalg.norm(before) for q, v in ends
         ]
@@ -240,7 +250,7 @@ def test_motion_is_the_same_far_from_the_origin(name, rng):
     def motion(place):
         qpos[:, horizontal] = place
         inputs = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (qpos, qvel, ctrl)]
-        sim = Simulator(scene, 8, substeps=substeps, horizon=steps)
+        sim = Simulator(scene, 8, Integration(substeps=substeps), horizon=steps)
         q, v, u = inputs
         for _ in range(steps):
             q, v = sim.step(q, v, u)
@@ -261,7 +271,7 @@ def test_motion_is_the_same_far_from_the_origin(name, rng):
 
 def closed_loop(scene, qpos, qvel, steps, substeps):
     """Final (qpos, qvel), their inputs as leaves, after steps of 1/60 s without control."""
-    sim = Simulator(scene, 1, substeps=substeps, horizon=steps, dtype=torch.float64)
+    sim = Simulator(scene, 1, Integration(substeps=substeps), horizon=steps, dtype=torch.float64)
     start = [torch.tensor([x], dtype=torch.float64, requires_grad=True) for x in (qpos, qvel)]
     q, v = start
     ctrl = torch.zeros(1, scene.nu, dtype=torch.float64)
@@ -359,7 +369,7 @@ def test_block_slides_to_rest_by_coulomb_friction():
     depth = scene.mass[0] * 9.81 / (4 * scene.k_n)
     qpos, qvel = np.array([[0.0, 0.0, 0.02 - depth, 1.0, 0.0, 0.0, 0.0]]), np.zeros((1, 6))
     qvel[0, :2] = 0.6 * speed, -0.8 * speed
-    q, v = run(scene, qpos, qvel, np.zeros((1, 0)), steps=60, substeps=64)
+    q, v = run(scene, qpos, qvel, np.zeros((1, 0)), steps=60, integration=Integration(substeps=64))
     path = speed**2 / (2 * scene.mu * 9.81)
     np.testing.assert_allclose(q[0, :2], [0.6 * path, -0.8 * path], rtol=0.01)
     np.testing.assert_allclose(v, 0, atol=1e-6)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import diffsim
+from diffsim.integration import INTEGRATORS
 from diffsim.tasks import TASKS
 
-IDS = {name: f"diffsim/{name.title().replace('_', '')}-v0" for name in TASKS}
+HOPPER = f"{diffsim.__path__[0]}/assets/hopper.xml"
 
 
 def random_actions(env, steps, seed=0):
@@ -39,7 +42,7 @@ def records(env, actions):
 def test_spaces(name):
     env = diffsim.make(name, num_envs=3, seed=0)
     sizes = {"cartpole": (5, 1), "hopper": (11, 3), "half_cheetah": (17, 6), "ant": (37, 8), "humanoid": (76, 21)}
-    sizes = (sizes | {"humanoid_mtu": (53, 152)})[name]
+    sizes = (sizes | {"humanoid_mtu": (53, 152), "swimmer": (8, 2), "walker": (17, 6)})[name]
     assert env.single_observation_space.shape == sizes[:1] and env.single_action_space.shape == sizes[1:]
     assert env.observation_space.shape == (3, sizes[0]) and env.action_space.shape == (3, sizes[1])
     assert (env.single_action_space.low == -1).all() and (env.single_action_space.high == 1).all()
@@ -48,35 +51,6 @@ def test_spaces(name):
     assert info == {} and obs.shape == (3, sizes[0]) and obs.dtype == torch.float32 and obs.isfinite().all()
     assert obs.numpy() in env.observation_space
     assert env.episode_length == TASKS[name].episode_length and env.control_dt == 1 / 60
-
-
-@pytest.mark.filterwarnings("ignore:.*Box observation space")
-@pytest.mark.parametrize("name", TASKS)
-def test_gymnasium_makes_both_kinds(name):
-    single = gymnasium.make(IDS[name])
-    check_env(single.unwrapped, skip_render_check=True)
-    obs, _ = single.reset(seed=5)
-    vector = gymnasium.make_vec(IDS[name], num_envs=3)
-    assert isinstance(vector.unwrapped, diffsim.DiffEnv) and vector.num_envs == 3
-    np.testing.assert_array_equal(obs, diffsim.make(name, num_envs=1).reset(seed=5)[0][0])
-    single.close()
-    vector.close()
-
-
-def test_single_environment_ends_as_the_vector_does():
-    single, action = gymnasium.make(IDS["hopper"]), np.ones(3, np.float32)
-    vector = diffsim.make("hopper", num_envs=1, seed=7)
-    single.reset(seed=7)
-    vector.reset(seed=7)
-    for _ in range(1000):
-        obs, reward, terminated, truncated, _ = single.step(action)
-        with torch.no_grad():
-            _, rewards, end, timeout, info = vector.step(torch.ones(1, 3))
-        np.testing.assert_array_equal(obs, info["final_obs"][0])
-        assert (reward, terminated, truncated) == (rewards.item(), end.item(), timeout.item())
-        if terminated or truncated:
-            break
-    assert terminated and isinstance(reward, float) and obs.dtype == np.float32
 
 
 def test_episodes_end_restart_and_are_counted():
@@ -119,6 +93,15 @@ def test_time_limit_truncates():
                 assert info["episode"]["l"].tolist() == [240, 240]
                 np.testing.assert_allclose(info["episode"]["t"], 4.0)
     assert env.episode_step.tolist() == [1, 1]
+
+
+def test_time_limit_can_be_set():
+    env = diffsim.make("cartpole", num_envs=2, max_episode_steps=3)
+    with torch.no_grad():
+        limits = [env.step(torch.zeros(2, 1))[3].tolist() for _ in range(6)]
+    assert limits == [[False] * 2, [False] * 2, [True] * 2] * 2
+    with pytest.raises(ValueError, match="max_episode_steps is 0"):
+        diffsim.make("cartpole", max_episode_steps=0)
 
 
 def test_early_termination_can_be_off():
@@ -172,6 +155,41 @@ def test_reset_with_a_seed_equals_a_fresh_environment():
     assert not torch.equal(fresh, env.reset()[0])
     assert_same(env.reset(seed=12)[0], fresh)
     assert (env.episode_step == 0).all()
+
+
+def test_reset_of_some():
+    """Those begin anew, gradients of the others go on, and so does the window."""
+    env, other = (diffsim.make("hopper", num_envs=3, seed=2, horizon=3) for _ in range(2))
+    actions = random_actions(env, 3).requires_grad_()
+    env.step(actions[0])
+    other.step(actions[0])
+    obs, info = env.reset(options={"reset_mask": np.array([False, True, False])})
+    assert info == {} and env.episode_step.tolist() == [1, 0, 1]
+    assert_same(obs[::2], other._obs[::2])
+    assert (obs[1] != other._obs[1]).all() and obs[1, :5].abs().max() <= 0.05
+    total = env.step(actions[1])[0].sum()
+    (gradient,) = torch.autograd.grad(total, actions, retain_graph=True)
+    assert (gradient[0, [0, 2]] != 0).all() and (gradient[0, 1] == 0).all() and (gradient[1] != 0).all()
+    assert env.np_random_seed == 2
+    env.reset(seed=np.int64(5), options={"reset_mask": torch.tensor([True, True, True])})
+    assert_same(env.qpos, diffsim.make("hopper", num_envs=3, seed=5).qpos)
+    assert env.np_random_seed == 5 and env.episode_step.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(options={"reset_mask": torch.ones(3)}), r"float32 \(3,\), must be bool \(2,\)"),
+        (dict(options={"reset_mask": np.ones(3, bool)}), r"bool \(3,\), must be bool \(2,\)"),
+        (dict(seed=[1, 2]), "one integer"),
+    ],
+)
+def test_reset_refuses(arguments, message):
+    env = diffsim.make("hopper", num_envs=2, seed=0)
+    qpos = env.qpos.clone()
+    with pytest.raises(ValueError, match=message):
+        env.reset(**arguments)
+    assert_same(env.qpos, qpos)
 
 
 @pytest.mark.parametrize("name", ["hopper", "ant"])
@@ -275,6 +293,75 @@ def test_state_dict_continues_exactly():
             assert_same(value, two[key])
 
 
+@pytest.mark.parametrize(
+    "arguments, theirs",
+    [
+        (dict(name="walker"), "3 x walker in torch.float32"),
+        (dict(num_envs=4), "4 x half_cheetah in torch.float32"),
+        (dict(dtype=torch.float64), "3 x half_cheetah in torch.float64"),
+    ],
+)
+def test_a_state_of_another_kind_is_refused(arguments, theirs):
+    """walker and half_cheetah have equally many numbers."""
+    base = dict(name="half_cheetah", num_envs=3, dtype=torch.float32)
+    env, other = diffsim.make(**base, seed=1), diffsim.make(**base | arguments)
+    qpos = env.qpos.clone()
+    with pytest.raises(
+        ValueError, match=f"state is of {theirs}; this environment is 3 x half_cheetah in torch.float32"
+    ):
+        env.load_state_dict(other.state_dict())
+    with pytest.raises(ValueError, match="the state has qpos; that of an environment has task, qpos"):
+        env.load_state_dict({"qpos": qpos})
+    assert_same(env.qpos, qpos)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_second_derivatives_are_refused(integrator):
+    env = diffsim.make("hopper", num_envs=2, integrator=integrator)
+    action = torch.zeros(2, 3, requires_grad=True)
+    reward = env.step(action)[1].sum()
+    with pytest.raises(RuntimeError, match="first derivative only, so no create_graph=True"):
+        torch.autograd.grad(reward, action, create_graph=True)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_environments_cannot_be_copied(copied):
+    env = diffsim.make("cartpole", num_envs=2)
+    for thing in (env, env.sim, diffsim.NumpyVectorEnv(env)):
+        with pytest.raises(TypeError, match=r"cannot be pickled or copied.*state_dict\(\)"):
+            copied(thing)
+    assert_same(copy.deepcopy(env.state_dict())["qpos"], env.qpos)
+
+
+def test_counts_are_integers():
+    counts = dict(num_envs=np.int64(2), horizon=np.int32(3), substeps=np.uint8(8), threads=np.int64(2))
+    env = diffsim.make("hopper", **counts, max_episode_steps=np.int64(2), seed=0)
+    plain = diffsim.make("hopper", num_envs=2, horizon=3, substeps=8, threads=2, max_episode_steps=2, seed=0)
+    for actions in random_actions(plain, 3).requires_grad_():
+        reward, expected = (e.step(actions)[1] for e in (env, plain))
+        assert_same(reward, expected)
+        assert_same(*(torch.autograd.grad(r.sum(), actions, retain_graph=True)[0] for r in (reward, expected)))
+    assert env.episode_step.tolist() == [1, 1] and type(env.num_envs) is int
+    for name in counts:
+        with pytest.raises(ValueError, match=f"{name} is True, must be an integer"):
+            diffsim.make("hopper", **{"num_envs": 2, name: True})
+
+
+def test_more_environments_than_memory(monkeypatch):
+    monkeypatch.setattr(torch, "zeros", None)  # nothing is allocated
+    scene = diffsim.load_scene(HOPPER)
+    with pytest.raises(ValueError, match="100,000,000,000: the start states .* would take .* GiB, but cpu has .* GiB"):
+        diffsim.make("hopper", num_envs=10**11)
+    with pytest.raises(ValueError, match="100,000,000,000: the states and actions would take .* GiB, but cpu has"):
+        diffsim.Simulator(scene, num_envs=10**11)
+
+
+def test_more_checkpoints_than_memory():
+    env = diffsim.make("hopper", num_envs=2, horizon=2, substeps=10**9)
+    with pytest.raises(ValueError, match="num_envs is 2: the checkpoints would take .* GiB, but cpu has"):
+        env.step(torch.zeros(2, 3, requires_grad=True))
+
+
 def test_float64():
     env = diffsim.make("cartpole", num_envs=2, seed=0, dtype=torch.float64)
     assert env.single_observation_space.dtype == np.float64
@@ -294,4 +381,4 @@ def test_finer_substeps_converge():
         ends.append(env.qpos.clone())
     np.testing.assert_allclose((ends[0] - ends[1]).norm() / (ends[1] - ends[2]).norm(), 2.0, rtol=0.1)
     env = diffsim.make("cartpole", 2, integrator="implicit", theta=0.5)
-    assert (env.sim.integrator, env.sim.theta, env.sim.substeps) == ("implicit", 0.5, TASKS["cartpole"].substeps)
+    assert env.sim.integration == diffsim.Integration("implicit", TASKS["cartpole"].substeps, 0.5)

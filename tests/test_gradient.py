@@ -22,10 +22,12 @@ from scenes import (
 )
 
 from diffsim.env import DiffEnv
+from diffsim.integration import Integration
 from diffsim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
+ONE = Integration(substeps=1)
 
 
 def weights(scene, rng):
@@ -74,7 +76,7 @@ def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
     scene = task_scene(name)
     states = acting_states(scene, 8, rng)
     check_that_ground_and_limits_act(scene, *states[:2])
-    check_gradients(scene, states, rng, substeps=TASKS[name].substeps, integrator=integrator, theta=theta)
+    check_gradients(scene, states, rng, integration=Integration(integrator, TASKS[name].substeps, theta))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +86,7 @@ def test_tree_gradient_is_that_of_differences(base, seed, rng):
     scene = tree_scene(base, seed)
     qpos, qvel, ctrl = free_states(scene, 4, rng)
     pass_limits(scene, qpos, rng)
-    check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, substeps=16)
+    check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, integration=Integration(substeps=16))
 
 
 @pytest.mark.parametrize("integrator, theta", INTEGRATORS)
@@ -94,13 +96,13 @@ def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
     qpos, qvel, ctrl = free_states(scene, 8, rng)
     qpos[:, :4] *= np.linspace(0.5, -2.0, 8)[:, None]
     qpos[0, :4] = 1.0, 0.0, 0.0, 0.0
-    check_gradients(scene, (qpos, qvel, ctrl), rng, integrator=integrator, theta=theta)
+    check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(integrator, theta=theta))
 
 
 @pytest.mark.parametrize("model", ["linear", "hill"])
 def test_muscle_gradient_is_that_of_differences(model, rng):
     scene = leg_scene(model)
-    check_gradients(scene, free_states(scene, 16, rng), rng, substeps=8)
+    check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))
 
 
 def test_quaternion_of_any_length(rng):
@@ -116,7 +118,7 @@ def test_quaternion_of_any_length(rng):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_float32_gradient_is_that_of_float64(name, rng):
-    scene, simulator = task_scene(name), {"substeps": TASKS[name].substeps}
+    scene, simulator = task_scene(name), {"integration": TASKS[name].integration("default")}
     states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 16, rng)]
     w = weights(scene, rng)
     single, double = (gradients(scene, states, w, dtype, **simulator) for dtype in (torch.float32, torch.float64))
@@ -136,7 +138,7 @@ def test_gradient_where_contact_has_corners(integrator, theta):
     def at(depth, velocity):
         qpos = np.array([[0.0, 0.0, scene.contact_radius[0] - depth, 1.0, 0.0, 0.0, 0.0]])
         states = [qpos, np.array([[*velocity, 0.0, 0.0, 0.0]]), np.zeros((1, 0))]
-        return gradients(scene, states, weights, substeps=1, integrator=integrator, theta=theta)
+        return gradients(scene, states, weights, integration=Integration(integrator, 1, theta))
 
     sticking, falling = [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]
     assert close(at(1e-3, sticking), at(1e-3, [1e-9, 1e-9, 0.0]))
@@ -148,8 +150,8 @@ def test_gradient_where_a_limit_is_exactly_met():
     """It is that of one side."""
     scene, weights = parse(HINGE), [np.array([1.0]), np.array([2.0])]
 
-    def at(angle):
-        return gradients(scene, [np.array([[x]]) for x in (angle, 0.3, 0.1)], weights, substeps=1)
+    def at(angle):  # moving outwards, else the limit's damper would cancel its spring
+        return gradients(scene, [np.array([[x]]) for x in (angle, 0.3 * np.sign(angle), 0.1)], weights, integration=ONE)
 
     for bound in (scene.lower[1], scene.upper[1]):
         assert close(at(bound), at(bound + 1e-9)) or close(at(bound), at(bound - 1e-9))
@@ -162,11 +164,25 @@ def test_limit_force_in_closed_form():
     inertia = scene.inertia[1][2, 2] + scene.armature[1]
     q, v, u = 0.53, -0.4, 0.7
     leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in (q, v, u)]
-    _, after = Simulator(scene, 1, substeps=1, dtype=torch.float64).step(*leaves)
+    _, after = Simulator(scene, 1, ONE, dtype=torch.float64).step(*leaves)
     torque = 3 * u + 300 * (0.5 - q) - 2 * v
     np.testing.assert_allclose(after.item(), v + h * torque / inertia, rtol=1e-12)
     slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
     np.testing.assert_allclose(slopes, [-300 * h / inertia, 1 - 2 * h / inertia, 3 * h / inertia], rtol=1e-12)
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
+def test_limit_lets_go_of_a_joint_that_returns_fast(integrator):
+    """Its damper would pull harder than its spring pushes."""
+    scene, h = parse(HINGE), 1 / 60
+    inertia = scene.inertia[1][2, 2] + scene.armature[1]
+    for side in (-1, 1):
+        q, v, u = 0.53 * side, -8.0 * side, 0.7
+        leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in (q, v, u)]
+        _, after = Simulator(scene, 1, Integration(integrator, 1), dtype=torch.float64).step(*leaves)
+        np.testing.assert_allclose(after.item(), v + h * 3 * u / inertia, rtol=1e-12)
+        slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
+        np.testing.assert_allclose(slopes, [0, 1, 3 * h / inertia], rtol=1e-12)
 
 
 def test_gradients_add_up_over_control_steps(rng):
@@ -174,8 +190,8 @@ def test_gradients_add_up_over_control_steps(rng):
     scene = task_scene("hopper")
     states = acting_states(scene, 4, rng)
     w = weights(scene, rng)
-    once = gradients(scene, states, w, control_dt=1 / 60, substeps=12)
-    sim = Simulator(scene, 4, control_dt=1 / 180, substeps=4, horizon=3, dtype=torch.float64)
+    once = gradients(scene, states, w, control_dt=1 / 60, integration=Integration(substeps=12))
+    sim = Simulator(scene, 4, Integration(substeps=4), control_dt=1 / 180, horizon=3, dtype=torch.float64)
     leaves = [torch.tensor(x, requires_grad=True) for x in states]
     q, v, u = leaves
     for _ in range(3):

@@ -11,16 +11,17 @@ from scenes import leg_scene, parse, task_scene
 
 import diffsim
 from diffsim.kernels.lanes import divide
-from diffsim.kernels.model import model_of, shape_of
+from diffsim.kernels.model import model_of
+from diffsim.kernels.spec import KernelSpec, kernel_spec
 
-LANES = [(1, 1), (2, 1), (4, 1), (2, 2), (8, 4)]
+TEAMS = [(1, 1), (2, 1), (4, 1), (2, 2), (8, 4)]  # threads of an environment, and how many of them share limbs
 
 
-@pytest.mark.parametrize("lanes", LANES)
+@pytest.mark.parametrize("team", TEAMS)
 @pytest.mark.parametrize("name", diffsim.TASKS)
-def test_everything_is_dealt_once(name: str, lanes: tuple[int, int]) -> None:
+def test_everything_is_dealt_once(name: str, team: tuple[int, int]) -> None:
     scene = task_scene(name)
-    d = divide(scene, *lanes)
+    d = divide(scene, *team)
     muscles = sorted(set(scene.segment_muscle))
     for hands, things in (
         (d.weighs, range(scene.nlink)),
@@ -38,14 +39,14 @@ def test_everything_is_dealt_once(name: str, lanes: tuple[int, int]) -> None:
             assert has >= set(scene.segment_link[scene.segment_muscle == k].flatten())
         # A limb belongs to the sharers of one group alone.
         for other, theirs in enumerate(d.links):
-            assert (has & set(theirs) == set(trunk)) or other // lanes[1] == lane // lanes[1] or has == set(trunk)
+            assert (has & set(theirs) == set(trunk)) or other // team[1] == lane // team[1] or has == set(trunk)
 
 
 @pytest.mark.parametrize(
-    ("name", "lanes", "slots"), [("ant", (4, 1), 3), ("humanoid", (4, 1), 10), ("humanoid_mtu", (8, 4), 10)]
+    ("name", "team", "slots"), [("ant", (4, 1), 3), ("humanoid", (4, 1), 10), ("humanoid_mtu", (8, 4), 10)]
 )
-def test_limbs_make_short_routes(name: str, lanes: tuple[int, int], slots: int) -> None:
-    assert divide(task_scene(name), *lanes).slots == slots
+def test_limbs_make_short_routes(name: str, team: tuple[int, int], slots: int) -> None:
+    assert divide(task_scene(name), *team).slots == slots
 
 
 @pytest.mark.parametrize("name", ["half_cheetah", "humanoid_mtu"])
@@ -53,7 +54,7 @@ def test_the_lanes_models_add_up(name: str) -> None:
     """Entry by entry against the scene: masses, spheres, segments, and parents as slots."""
     scene = task_scene(name)
     d = divide(scene, 8, 4)
-    model = model_of(scene, wp.float64, "cpu", 8, 4)
+    model = model_of(scene, d, wp.float64, "cpu")
     link, mass, parent = (getattr(model, k).numpy().reshape(8, d.slots) for k in ("link", "mass", "parent"))
     count, begin = model.count.numpy(), model.contact_begin.numpy()
     total, spheres = np.zeros(scene.nlink), np.zeros(scene.nlink)
@@ -78,11 +79,17 @@ def test_the_lanes_models_add_up(name: str) -> None:
     assert sorted(seen) == sorted(zip(scene.segment_muscle, *scene.segment_link.T, strict=True))
 
 
-@pytest.mark.parametrize("lanes", [(3, 1), (2, 4), (32, 1), 4])
-def test_lanes_are_checked(lanes: object) -> None:
+@pytest.mark.parametrize("team", [(3, 1), (2, 4), (32, 1), (0, 1), (4, 3)])
+def test_numbers_of_threads_are_checked(team: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=f"threads_per_env is {team[0]} and sharers {team[1]}: both must be one of"):
+        divide(task_scene("cartpole"), *team)
+
+
+def test_a_cpu_has_one_thread_for_an_environment() -> None:
     scene = task_scene("cartpole")
-    with pytest.raises(ValueError, match="lanes is .* must be one of"):
-        diffsim.Simulator(scene, 1, lanes=lanes)  # type: ignore[arg-type]
+    diffsim.Simulator(scene, 1, division=divide(scene))
+    with pytest.raises(ValueError, match="threads_per_env is 2, must be 1 on a CPU"):
+        diffsim.Simulator(scene, 1, division=divide(scene, 2))
 
 
 def motors_among_muscles() -> diffsim.Scene:
@@ -95,12 +102,12 @@ def motors_among_muscles() -> diffsim.Scene:
     return dataclasses.replace(scene, motor_link=link, **segments)
 
 
-@pytest.mark.parametrize("lanes", LANES)
+@pytest.mark.parametrize("team", TEAMS)
 @pytest.mark.parametrize("scene", [task_scene("ant"), leg_scene("hill"), motors_among_muscles()])
-def test_a_motors_gradient_is_written_by_a_lane_that_has_its_link(scene: diffsim.Scene, lanes: tuple[int, int]) -> None:
-    model = model_of(scene, wp.float64, "cpu", *lanes)
-    slots = model.motor_slot.numpy().reshape(lanes[0], scene.nu)
-    link = model.link.numpy().reshape(lanes[0], -1)
+def test_a_motors_gradient_is_written_by_a_lane_that_has_its_link(scene: diffsim.Scene, team: tuple[int, int]) -> None:
+    model = model_of(scene, divide(scene, *team), wp.float64, "cpu")
+    slots = model.motor_slot.numpy().reshape(team[0], scene.nu)
+    link = model.link.numpy().reshape(team[0], -1)
     motors = np.flatnonzero(scene.motor_link)
     assert len(motors)
     for k, lane in zip(motors, model.motor_lane.numpy()[motors], strict=True):
@@ -113,7 +120,11 @@ def test_lanes_skip_inert_links_that_all_of_them_have() -> None:
     slide = '<joint type="slide"/>'
     scene = parse(f"<mujoco><worldbody>{arm.format(slide)}{arm.format('')}</worldbody></mujoco>")
     assert scene.inert == 1
-    assert shape_of(scene, wp.float64, False, True).inert == 1
-    assert shape_of(scene, wp.float64, False, True, 2, 1).inert == 0
-    assert shape_of(scene, wp.float64, False, True, 2, 2).inert == 1
-    assert shape_of(task_scene("half_cheetah"), wp.float64, False, True, 2, 1).inert == 2
+
+    def spec(scene: diffsim.Scene, *team: int) -> KernelSpec:
+        return kernel_spec(scene, divide(scene, *team), wp.float64, implicit=False, env_last=True)
+
+    assert spec(scene).inert == 1
+    assert spec(scene, 2, 1).inert == 0
+    assert spec(scene, 2, 2).inert == 1
+    assert spec(task_scene("half_cheetah"), 2, 1).inert == 2

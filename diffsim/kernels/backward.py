@@ -23,62 +23,42 @@ import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
+from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
-from diffsim.kernels.model import Shape, module_options, types
+from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec, module_options
 
 
 @cache
-def backward_kernel(shape: Shape) -> wp.Kernel:
-    t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
-    T, vec3, vec6, mat3, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
+def backward_kernel(spec: KernelSpec) -> wp.Kernel:
+    t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
+    T, vec3, vec6, mat3, quat, Model = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
     vec6s = wp.array(dtype=vec6)
     join, force_at, point_velocity, momentum = sp.join, sp.force_at, sp.point_velocity, sp.momentum
-    exp_quat, to_tangent, from_tangent = sp.exp_quat, sp.to_tangent, sp.from_tangent
+    exp_quat, exp_adjoint, log_adjoint = sp.exp_quat, sp.exp_adjoint, sp.log_adjoint
+    to_tangent, from_tangent = sp.to_tangent, sp.from_tangent
     load, link_of, place_links, sphere_state = kin.load, kin.link_of, kin.place_links, kin.sphere_state
     qpos_adr, load_quat, load_quat_row, place_balls = kin.qpos_adr, kin.load_quat, kin.load_quat_row, kin.place_balls
     contact = contact_law(T)
     touches, contact_force = contact.touches, contact.contact_force
     contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
-    muscle = muscle_law(shape, adjoint=True)
-    measure, hill, add_pull_adjoint = muscle.measure, muscle.hill, muscle.add_pull_adjoint
-    uses = shape.features
+    muscle = muscle_law(spec, adjoint=True)
+    measure, add_pull_adjoint, hill = muscle.measure, muscle.add_pull_adjoint, hill_law(T).hill
+    uses = spec.features
     passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
     DRAG, drag = "drag" in uses, drag_law(T)
     drag_wrench, drag_adjoint = drag.drag_wrench, drag.drag_adjoint
-    NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
+    NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
-    INERT, FIRST = shape.inert, 0 if FLOATING else 1 + shape.inert  # the first link with inertia
-    VADR, NBALL, BALL_SPRING = shape.dof0 - 1, shape.nball, shape.nball > 0 and "stiffness" in uses
-    BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
-    LANES, SHARERS, TRUNK, SLOTS = shape.lanes, shape.sharers, shape.trunk, shape.slots
-    sums = lane_sums(T, LANES, SHARERS)
-
-    @wp.func
-    def exp_adjoint(r: vec3, g: vec3):
-        """Adjoint of q' = q exp(r): (of r, of q), g and both in the body's tangent space: J_r(r)' g and Exp(r) g."""
-        angle = wp.length(r)
-        k1 = T(0.5) - angle * angle / T(24.0)
-        k2 = T(1.0) / T(6.0) - angle * angle / T(120.0)
-        if angle > T(2e-2):
-            k1 = (T(1.0) - wp.cos(angle)) / (angle * angle)
-            k2 = (angle - wp.sin(angle)) / (angle * angle * angle)
-        rg = wp.cross(r, g)
-        rrg = wp.cross(r, rg)
-        return g + k1 * rg + k2 * rrg, g + (T(1.0) - k2 * angle * angle) * rg + k1 * rrg
-
-    @wp.func
-    def log_adjoint(r: vec3, g: vec3):
-        """Adjoint of log(exp(r) exp(d)) with respect to d, at d = 0: the inverse of J_r(r)'."""
-        angle = wp.length(r)
-        k2 = T(1.0) / T(12.0) + angle * angle / T(720.0)
-        if angle > T(2e-2):
-            k2 = (T(1.0) - T(0.5) * angle / wp.tan(T(0.5) * angle)) / (angle * angle)
-        rg = wp.cross(r, g)
-        return g - T(0.5) * rg + k2 * wp.cross(r, rg)
+    INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
+    VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in uses
+    BASE = 7 * (spec.nlink - 1)  # where the base's factor begins
+    THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
+    sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
 
     @wp.func
     def solve_base(ck_f: t.array3, row: int, e: int, b: vec6):
@@ -165,14 +145,14 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
 
     add_sharers, add_limbs, add = summed(sums.sharers, SLOTS - 1), summed(sums.limbs, TRUNK), sums.all.add
 
-    @wp.kernel(module="unique", module_options=module_options(shape))
+    @wp.kernel(module="unique", module_options=module_options(spec))
     def backward(
         # model
         m: Model,
+        first: int,  # environment of this launch
         h: T,
         theta: T,
         substeps: int,
-        first: int,
         # checkpoint in
         row0: int,
         ck_q: t.array3,
@@ -193,12 +173,12 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
         nonfinite_gradients: wp.array(dtype=int),
     ):
         tid = wp.tid()
-        e = first + tid / LANES
-        lane = tid % LANES
+        e = first + tid / THREADS_PER_ENV
+        lane = tid % THREADS_PER_ENV
         slots = int(SLOTS)
         n = int(SLOTS)
         at = lane * SLOTS
-        if wp.static(LANES > 1):
+        if wp.static(THREADS_PER_ENV > 1):
             n = m.count[lane]
         R = wp.zeros(shape=SLOTS, dtype=mat3)
         x = wp.zeros(shape=SLOTS, dtype=vec3)
@@ -248,10 +228,8 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 for k in range(3):
                     gq[i + k] = gb[k]
         if wp.static(FLOATING):
-            w = vec3(load(ck_v, end, 3, e), load(ck_v, end, 4, e), load(ck_v, end, 5, e))
-            w = w + h * vec3(load(ck_a, end, 3, e), load(ck_a, end, 4, e), load(ck_a, end, 5, e))
-            rot = quat(load(ck_q, end, 4, e), load(ck_q, end, 5, e), load(ck_q, end, 6, e), load(ck_q, end, 3, e))
-            rot = wp.normalize(rot * exp_quat(h * w))
+            w = next_rate(ck_v, ck_a, end, 3, e, h)
+            rot = wp.normalize(load_quat_row(ck_q, end, 3, e) * exp_quat(h * w))
             gp = vec3(g_qpos_out[e, 0], g_qpos_out[e, 1], g_qpos_out[e, 2])
             gr = to_tangent(rot, load_quat(g_qpos_out, e, 3))
             gv = vec3(g_qvel_out[e, 0], g_qvel_out[e, 1], g_qvel_out[e, 2])
@@ -277,7 +255,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                         gq[i + k] = gb_start[k]
                 place_balls(m, lane, turn, R, q)
             if wp.static(FLOATING):
-                rot = quat(load(ck_q, row, 4, e), load(ck_q, row, 5, e), load(ck_q, row, 6, e), load(ck_q, row, 3, e))
+                rot = load_quat_row(ck_q, row, 3, e)
                 v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
                 w = vec3(load(ck_v, row, 3, e), load(ck_v, row, 4, e), load(ck_v, row, 5, e))
                 vdot = vec3(load(ck_a, row, 0, e), load(ck_a, row, 1, e), load(ck_a, row, 2, e)) - m.gravity
@@ -305,7 +283,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
             W[0] = vec6()
             for j in range(1, slots + 1):
                 i = slots - j
-                if wp.static(LANES > SHARERS):
+                if wp.static(THREADS_PER_ENV > SHARERS):
                     if i == TRUNK:
                         add_limbs(W)
                 if i > 0 and i < n:
@@ -359,7 +337,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 add_sharers(adj_p)
             for j in range(1, slots + 1):
                 i = slots - j
-                if wp.static(LANES > SHARERS):
+                if wp.static(THREADS_PER_ENV > SHARERS):
                     if i == TRUNK:
                         add_limbs(adj_a)
                         add_limbs(adj_v)
@@ -375,7 +353,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                     qi = q[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
-                    gain = passive_gain(m, k, qi)
+                    gain = passive_gain(m, k, qi, qd[i])
                     kv = gain[1]
                     if wp.static(IMPLICIT):
                         kv = kv + theta * h * gain[0]
@@ -433,7 +411,7 @@ def backward_kernel(shape: Shape) -> wp.Kernel:
                 k = m.muscle[entry]
                 if not wp.isfinite(g_pull[k]):
                     broken = T(1.0)
-        if wp.static(LANES > 1):
+        if wp.static(THREADS_PER_ENV > 1):
             broken = add(broken)
         finite = broken == T(0.0)
         contained = nonfinite[e]

@@ -1,4 +1,6 @@
-"""One control step: all substeps of all environments in one launch, one thread per environment.
+"""One control step: all substeps of all environments in one launch.
+
+An environment has one thread or, on a GPU, several (lanes.py); no thread serves two.
 
 A substep is Featherstone's articulated-body algorithm (RBDA, Table 7.1) about the carrier's current position in world
 axes, then semi-implicit Euler with the exact quaternion exponential. Its factorisation (U and 1/d of each joint, the
@@ -12,37 +14,40 @@ import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
+from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
-from diffsim.kernels.model import MAX_SPEED, Shape, module_options, types
+from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import MAX_SPEED, KernelSpec, module_options
 
 
 @cache
-def forward_kernel(shape: Shape) -> wp.Kernel:
-    t, sp, kin = types(shape.dtype), spatial(shape.dtype), kinematics(shape)
-    T, vec3, vec6, mat3, mat6, quat, Model = shape.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model
+def forward_kernel(spec: KernelSpec) -> wp.Kernel:
+    t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
+    T, vec3, vec6, mat3, mat6, quat, Model = spec.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model
     mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
     join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
     store, place_links, sphere_state = kin.store, kin.place_links, kin.sphere_state
     link_of, qpos_adr, load_quat, place_balls = kin.link_of, kin.qpos_adr, kin.load_quat, kin.place_balls
     contact = contact_law(T)
     touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
-    uses = shape.features
+    uses = spec.features
     joint = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses)
     passive_force, passive_gain = joint.passive_force, joint.passive_gain
-    muscle = muscle_law(shape, adjoint=False)
-    add_pull, measure, hill = muscle.add_pull, muscle.measure, muscle.hill
+    muscle = muscle_law(spec, adjoint=False)
+    add_pull, measure, hill = muscle.add_pull, muscle.measure, hill_law(T).hill
     DRAG, drag_wrench = "drag" in uses, drag_law(T).drag_wrench
-    NU, FLOATING, CONTACT, IMPLICIT = shape.nu, shape.floating, "contact" in uses, shape.implicit
+    NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
-    INERT, FIRST = shape.inert, 0 if FLOATING else 1 + shape.inert  # the first link with inertia
-    BASE = 7 * (shape.nlink - 1)  # where the base's factor begins
-    VADR = shape.dof0 - 1  # link i's joint in qvel is VADR + i
-    NBALL, LANES, SHARERS, TRUNK, SLOTS = shape.nball, shape.lanes, shape.sharers, shape.trunk, shape.slots
-    LIMIT, sums = MAX_SPEED, lane_sums(T, LANES, SHARERS)
+    INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
+    BASE = 7 * (spec.nlink - 1)  # where the base's factor begins
+    VADR = spec.dof0 - 1  # link i's joint in qvel is VADR + i
+    NBALL, LIMIT = spec.nball, MAX_SPEED
+    THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
+    sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
 
     @wp.func
     def link_inertia(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
@@ -120,15 +125,15 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
 
     add_sharers, add_limbs, add = summed(sums.sharers, SLOTS - 1), summed(sums.limbs, TRUNK), sums.all.add
 
-    @wp.kernel(module="unique", module_options=module_options(shape))
+    @wp.kernel(module="unique", module_options=module_options(spec))
     def forward(
         # model
         m: Model,
+        first: int,  # environment of this launch
         h: T,
         theta: T,
         substeps: int,
         # state in
-        first: int,
         qpos: t.array2,
         qvel: t.array2,
         ctrl: t.array2,
@@ -145,13 +150,13 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
         nonfinite: wp.array(dtype=wp.bool),
     ):
         tid = wp.tid()
-        e = first + tid / LANES
-        lane = tid % LANES
+        e = first + tid / THREADS_PER_ENV
+        lane = tid % THREADS_PER_ENV
         # Variables, not constants: Warp would unroll the loops over links, and their code outgrow a GPU's cache.
         slots = int(SLOTS)
         n = int(SLOTS)
         at = lane * SLOTS
-        if wp.static(LANES > 1):
+        if wp.static(THREADS_PER_ENV > 1):
             n = m.count[lane]
         R = wp.zeros(shape=SLOTS, dtype=mat3)
         x = wp.zeros(shape=SLOTS, dtype=vec3)
@@ -193,7 +198,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
         R[0] = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
             pos = vec3(qpos[e, 0], qpos[e, 1], qpos[e, 2])
-            rot = wp.normalize(quat(qpos[e, 4], qpos[e, 5], qpos[e, 6], qpos[e, 3]))
+            rot = wp.normalize(load_quat(qpos, e, 3))
             v = vec3(qvel[e, 0], qvel[e, 1], qvel[e, 2])
             w = vec3(qvel[e, 3], qvel[e, 4], qvel[e, 5])
 
@@ -255,7 +260,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                 add_sharers(Ia, Ib, Id, P)
             for j in range(1, slots + 1):
                 i = slots - j
-                if wp.static(LANES > SHARERS):
+                if wp.static(THREADS_PER_ENV > SHARERS):
                     if i == TRUNK:
                         add_limbs(Ia, Ib, Id, P)
                 if i > 0 and i < n:
@@ -270,7 +275,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
                     qi = q[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
-                        gain = passive_gain(m, k, qi)
+                        gain = passive_gain(m, k, qi, qd[i])
                         d = d - theta * h * h * gain[0] - h * gain[1]
                     di = T(1.0) / d
                     ui = motor[i] + passive_force(m, k, qi, qd[i]) - wp.dot(S[i], P[i])
@@ -340,7 +345,7 @@ def forward_kernel(shape: Shape) -> wp.Kernel:
             for b in range(m.ball_count[lane]):
                 if not wp.isfinite(turn[b]):
                     broken = T(1.0)
-        if wp.static(LANES > 1):
+        if wp.static(THREADS_PER_ENV > 1):
             broken = add(broken)
         finite = broken == T(0.0)
         nonfinite[e] = not finite

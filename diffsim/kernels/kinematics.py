@@ -5,21 +5,22 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import Shape, types
+from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
 
 
 @cache
-def kinematics(shape: Shape) -> SimpleNamespace:
-    t = types(shape.dtype)
-    T, vec3, vec6, mat3, quat, Model, array = shape.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model, t.array
+def kinematics(spec: KernelSpec) -> SimpleNamespace:
+    t = types(spec.dtype)
+    T, vec3, vec6, mat3, quat, Model, array = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model, t.array
     sp = spatial(T)
     join, point_velocity, log_quat, quat_of = sp.join, sp.point_velocity, sp.log_quat, sp.quat_of
     mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
-    NBALL, CARRIER, QADR = shape.nball, shape.carrier, shape.dof0 - 1 + int(shape.floating)
-    BALL, STIFFNESS = "ball" in shape.features, "stiffness" in shape.features
-    HINGE, SLIDE = "hinge" in shape.features, "slide" in shape.features
-    IMPLICIT, ENV_LAST, LANES = shape.implicit, shape.env_last, shape.lanes
+    NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
+    BALL, STIFFNESS = "ball" in spec.features, "stiffness" in spec.features
+    HINGE, SLIDE = "hinge" in spec.features, "slide" in spec.features
+    IMPLICIT, ENV_LAST, THREADS_PER_ENV = spec.implicit, spec.env_last, spec.threads_per_env
 
     @wp.func
     def load(a: t.array3, row: int, k: int, e: int):
@@ -36,7 +37,7 @@ def kinematics(shape: Shape) -> SimpleNamespace:
 
     @wp.func
     def link_of(m: Model, k: int):
-        if wp.static(LANES > 1):
+        if wp.static(THREADS_PER_ENV > 1):
             return m.link[k]
         return k
 

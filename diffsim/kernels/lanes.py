@@ -1,12 +1,13 @@
 """Several GPU threads for one environment.
 
 One thread per environment leaves a GPU waiting: a substep is ten thousand instructions, most of which wait for the one
-before, and 64 environments keep 64 of its thousands of cores busy. So a few neighbouring threads, `lanes`, share an
-environment. Each simulates a tree of its own: the trunk, which all have, and some limbs; where limbs have much to do,
-several lanes, `sharers`, have the same ones. Masses, contact spheres and muscles are dealt out among the lanes that
-have their links. Poses and velocities need no exchange. On the way in, each lane's inertias and forces are a summand of
-the true ones: they are added up over the sharers before the sweep, and over the limbs where it reaches the trunk. A
-butterfly adds the same numbers in the same tree on every lane: what lanes have in common stays equal to the last bit.
+before, and 64 environments keep 64 of its thousands of cores busy. So a few neighbouring threads may share an
+environment; each is a lane of it. A lane simulates a tree of its own: the trunk, which all have, and some limbs; where
+limbs have much to do, several lanes, `sharers`, have the same ones. Masses, contact spheres and muscles are dealt out
+among the lanes that have their links. Poses and velocities need no exchange. On the way in, each lane's inertias and
+forces are a summand of the true ones: they are added up over the sharers before the sweep, and over the limbs where it
+reaches the trunk. A butterfly adds the same numbers in the same tree on every lane: what lanes have in common stays
+equal to the last bit.
 """
 
 import dataclasses
@@ -19,13 +20,15 @@ import warp as wp
 from diffsim.scene import Scene
 
 SPHERE = 0.5  # what a contact sphere or a muscle costs, in links
+POWERS = (1, 2, 4, 8, 16)
 
 
 @dataclasses.dataclass(frozen=True)
-class Lanes:
-    """Who computes what.
+class Division:
+    """Which lane of an environment computes what.
 
     Attributes:
+        threads_per_env: number of lanes.
         sharers: neighbouring lanes that have the same limbs.
         trunk: number of links, without the base, that all lanes have.
         links: of each lane, the links that it simulates, in the order of the tree: the base, the trunk, its limbs.
@@ -33,6 +36,7 @@ class Lanes:
             Each is dealt to one lane.
     """
 
+    threads_per_env: int
     sharers: int
     trunk: int
     links: list[list[int]]
@@ -42,49 +46,38 @@ class Lanes:
 
     @property
     def slots(self) -> int:
+        """The most links that a lane has."""
         return max(map(len, self.links))
 
 
-def divide(scene: Scene, lanes: int = 1, sharers: int = 1) -> Lanes:
-    """Deals a scene's tree to lanes so that none gets many links.
-
-    The trunk starts as the base and grows into the longest limb for as long as that can help. A muscle must find both
-    ends of each of its segments on one lane.
+def divide(scene: Scene, threads_per_env: int = 1, sharers: int = 1) -> Division:
+    """Deals a scene's tree to lanes so that none gets many links; a muscle finds all links that it joins on one lane.
 
     Args:
         scene: the tree.
-        lanes: threads of an environment, a power of two.
-        sharers: how many of them have the same limbs, a power of two that divides lanes.
+        threads_per_env: number of lanes, a power of two up to 16.
+        sharers: how many of them have the same limbs, a power of two up to threads_per_env.
+
+    Raises:
+        ValueError: another number of lanes or sharers.
     """
-    parent, ball, groups = scene.parent, scene.ball, lanes // sharers
-    below: list[list[int]] = [[] for _ in range(scene.nlink)]  # the subtree of each link
-    for i in reversed(range(scene.nlink)):
-        below[i] = sorted([i] + [k for child in np.flatnonzero(parent[1:] == i) + 1 for k in below[child]])
+    if threads_per_env not in POWERS or sharers not in POWERS or sharers > threads_per_env:
+        raise ValueError(
+            f"threads_per_env is {threads_per_env!r} and sharers {sharers!r}: both must be one of "
+            f"{', '.join(map(str, POWERS))}, and sharers not the larger one"
+        )
     pulled = np.unique(scene.segment_muscle).tolist()  # the other actuators are motors, which go with their links
     ends = [{0} | set(scene.segment_link[scene.segment_muscle == k].flatten()) for k in pulled]
-    trunk, limbs = [0], [below[i] for i in range(1, scene.nlink) if parent[i] == 0]
-    best = [list(range(scene.nlink))] * groups, scene.nlink - 1
-    while limbs:
-        dealt = [list(trunk) for _ in range(groups)]
-        for limb in sorted(limbs, key=len, reverse=True):
-            min(dealt, key=len).extend(limb)
-        reachable = all(any(e <= set(links) for links in dealt) for e in ends)
-        if reachable and max(map(len, dealt)) < max(map(len, best[0])):
-            best = [sorted(trunk) + sorted(links[len(trunk) :]) for links in dealt], len(trunk) - 1
-        longest = max(limbs, key=len)
-        root = longest[: 3 if ball[longest[0]] == 0 else 1]  # a ball joint's links stay together
-        limbs.remove(longest)
-        trunk += root
-        limbs += [below[i] for i in longest if i not in root and parent[i] in root]
-    links = [best[0][lane // sharers] for lane in range(lanes)]
-
-    cost = np.zeros(lanes)
+    trunk, groups = deal_limbs(scene, threads_per_env // sharers, ends)
+    links = [groups[lane // sharers] for lane in range(threads_per_env)]
+    cost = np.zeros(threads_per_env)
 
     def deal(needs: list[set[int]], price: float) -> list[list[int]]:
-        hands: list[list[int]] = [[] for _ in range(lanes)]
+        hands: list[list[int]] = [[] for _ in links]
         # Things that few lanes can have go first.
         for k in sorted(range(len(needs)), key=lambda k: sum(needs[k] <= set(row) for row in links)):
-            lane = min((lane for lane in range(lanes) if needs[k] <= set(links[lane])), key=lambda lane: cost[lane])
+            able = [lane for lane, row in enumerate(links) if needs[k] <= set(row)]
+            lane = min(able, key=lambda lane: cost[lane])
             hands[lane].append(k)
             cost[lane] += price
         return [sorted(hand) for hand in hands]
@@ -92,17 +85,44 @@ def divide(scene: Scene, lanes: int = 1, sharers: int = 1) -> Lanes:
     muscles = [[pulled[k] for k in hand] for hand in deal(ends, SPHERE)]
     spheres = deal([{int(i)} for i in scene.contact_link], SPHERE)
     weighs = deal([{i} for i in range(scene.nlink)], 1.0)
-    return Lanes(sharers, best[1], links, weighs, spheres, muscles)
+    return Division(threads_per_env, sharers, trunk, links, weighs, spheres, muscles)
+
+
+def deal_limbs(scene: Scene, groups: int, ends: list[set[int]]) -> tuple[int, list[list[int]]]:
+    """The trunk's number of links, without the base, and the links of each group of lanes.
+
+    The trunk starts as the base and grows into the longest limb for as long as that can help. Each of `ends`, sets of
+    links, must be on one group.
+    """
+    parent, ball = scene.parent, scene.ball
+    below: list[list[int]] = [[] for _ in range(scene.nlink)]  # the subtree of each link
+    for i in reversed(range(scene.nlink)):
+        below[i] = sorted([i] + [k for child in np.flatnonzero(parent[1:] == i) + 1 for k in below[child]])
+    trunk, limbs = [0], [below[i] for i in range(1, scene.nlink) if parent[i] == 0]
+    best = scene.nlink - 1, [list(range(scene.nlink))] * groups
+    while limbs:
+        dealt = [list(trunk) for _ in range(groups)]
+        for limb in sorted(limbs, key=len, reverse=True):
+            min(dealt, key=len).extend(limb)
+        reachable = all(any(e <= set(links) for links in dealt) for e in ends)
+        if reachable and max(map(len, dealt)) < max(map(len, best[1])):
+            best = len(trunk) - 1, [sorted(trunk) + sorted(links[len(trunk) :]) for links in dealt]
+        longest = max(limbs, key=len)
+        root = longest[: 3 if ball[longest[0]] == 0 else 1]  # a ball joint's links stay together
+        limbs.remove(longest)
+        trunk += root
+        limbs += [below[i] for i in longest if i not in root and parent[i] in root]
+    return best
 
 
 @cache
-def lane_sums(dtype: type, lanes: int, sharers: int) -> SimpleNamespace:
+def lane_sums(dtype: type, threads_per_env: int, sharers: int) -> SimpleNamespace:
     """Sums over the lanes of an environment; all of its lanes must call them together."""
     T, vec6, mat3 = dtype, wp.types.vector(6, dtype), wp.types.matrix((3, 3), dtype)
     neighbour = f"""
 #if defined(__CUDA_ARCH__)
-    const unsigned first = (threadIdx.x & 31u) & ~({lanes}u - 1u);
-    return __shfl_xor_sync({2**lanes - 1}u << first, value, offset);
+    const unsigned first = (threadIdx.x & 31u) & ~({threads_per_env}u - 1u);
+    return __shfl_xor_sync({2**threads_per_env - 1}u << first, value, offset);
 #else
     return value;
 #endif
@@ -135,7 +155,7 @@ def lane_sums(dtype: type, lanes: int, sharers: int) -> SimpleNamespace:
 
         return SimpleNamespace(add=add, add_vec6=add_vec6, add_mat3=add_mat3)
 
-    powers = [2**k for k in range(lanes.bit_length() - 1)]
+    powers = [2**k for k in range(threads_per_env.bit_length() - 1)]
     return SimpleNamespace(
         all=sums(tuple(powers)),
         sharers=sums(tuple(p for p in powers if p < sharers)),

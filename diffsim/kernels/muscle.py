@@ -10,9 +10,9 @@ with e = T/l (1 - n n') w(b); the last term turns W along with the links, as eve
 in the frame of link i, where a is a constant, and for all segments between one pair of links at once. A segment shorter
 than SHORTEST has no direction and pulls nothing.
 
-linear: T = u, the maximum force times the activation. hill: T = u f_L(l) f_V(l') + F f_P(l) with the curves of MuJoCo's
-<muscle>, l the length of the whole path; then adj_l = L dT/dl adds (a x n, n) adj_l to adj_p_j, and adj_l' = L dT/dl'
-is to the twists V what T is to W.
+linear: T = u, the maximum force times the activation. hill: T depends on the length l of the whole path and its rate,
+too (hill.py); then adj_l = L dT/dl adds (a x n, n) adj_l to adj_p_j, and adj_l' = L dT/dl' is to the twists V what T is
+to W.
 """
 
 from functools import cache
@@ -20,19 +20,20 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import Shape, types
+from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
 
 SHORTEST = 1e-6  # m
 
 
 @cache
-def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
-    t, sp = types(shape.dtype), spatial(shape.dtype)
-    T, vec3, vec4, vec6, Model, array = shape.dtype, t.vec3, t.vec4, t.vec6, t.Model, t.array
+def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
+    t, sp = types(spec.dtype), spatial(spec.dtype)
+    T, vec3, vec6, Model, array = spec.dtype, t.vec3, t.vec6, t.Model, t.array
     join, point_velocity = sp.join, sp.point_velocity
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
-    HILL = "hill" in shape.features
+    HILL = "hill" in spec.features
 
     @wp.func
     def outward(R: t.mat3, x: vec3, torque: vec3, force: vec3):
@@ -97,52 +98,6 @@ def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
                     rates[k] = rates[k] + wp.dot(n, point_velocity(v, b))
                     if wp.static(adjoint):
                         powers[k] = powers[k] + wp.dot(n, point_velocity(w, b))
-
-    @wp.func
-    def hill(m: Model, k: int, u: T, path: T, path_rate: T):
-        """(T, dT/du, dT/dl, dT/dl') of muscle k."""
-        p = m.hill[k]  # length within links; of the fibre: l = p1 path + p2, v = p3 path_rate; the curves' corners; F
-        l = p[1] * path + p[2]
-        v = p[3] * path_rate
-        lmin = p[4]
-        lmax = p[5]
-        low = T(0.5) * (lmin + T(1.0))
-        high = T(0.5) * (T(1.0) + lmax)
-        # f_L: four parabolas between lmin and lmax, f_L(1) = 1; s is the slope
-        f = T(0.0)
-        s = T(0.0)
-        if l > lmin and l <= low:
-            f = T(0.5) * (l - lmin) * (l - lmin) / ((low - lmin) * (low - lmin))
-            s = (l - lmin) / ((low - lmin) * (low - lmin))
-        elif l > low and l <= T(1.0):
-            f = T(1.0) - T(0.5) * (T(1.0) - l) * (T(1.0) - l) / ((T(1.0) - low) * (T(1.0) - low))
-            s = (T(1.0) - l) / ((T(1.0) - low) * (T(1.0) - low))
-        elif l > T(1.0) and l <= high:
-            f = T(1.0) - T(0.5) * (l - T(1.0)) * (l - T(1.0)) / ((high - T(1.0)) * (high - T(1.0)))
-            s = (T(1.0) - l) / ((high - T(1.0)) * (high - T(1.0)))
-        elif l > high and l < lmax:
-            f = T(0.5) * (lmax - l) * (lmax - l) / ((lmax - high) * (lmax - high))
-            s = (l - lmax) / ((lmax - high) * (lmax - high))
-        # f_V: a parabola while the fibre shortens, f_V(0) = 1, another up to fvmax while it lengthens
-        y = p[7] - T(1.0)
-        f_v = T(0.0)
-        s_v = T(0.0)
-        if v > T(-1.0) and v <= T(0.0):
-            f_v = (v + T(1.0)) * (v + T(1.0))
-            s_v = T(2.0) * (v + T(1.0))
-        elif v > T(0.0) and v <= y:
-            f_v = p[7] - (y - v) * (y - v) / y
-            s_v = T(2.0) * (y - v) / y
-        elif v > y:
-            f_v = p[7]
-        # f_P: a parabola, then a straight line; F f_P
-        passive = T(0.0)
-        s_p = T(0.0)
-        if l > T(1.0):
-            z = (l - T(1.0)) / (high - T(1.0))
-            passive = p[8] * p[6] * wp.where(l <= high, T(0.5) * z * z, z - T(0.5))
-            s_p = p[8] * p[6] * wp.min(z, T(1.0)) / (high - T(1.0))
-        return vec4(u * f * f_v + passive, f * f_v, (u * s * f_v + s_p) * p[1], u * f * s_v * p[3])
 
     @wp.func
     def add_pull_adjoint(
@@ -210,4 +165,4 @@ def muscle_law(shape: Shape, adjoint: bool) -> SimpleNamespace:
             adj_p[i] = adj_p[i] - gp
             adj_p[j] = adj_p[j] + gp
 
-    return SimpleNamespace(add_pull=add_pull, measure=measure, hill=hill, add_pull_adjoint=add_pull_adjoint)
+    return SimpleNamespace(add_pull=add_pull, measure=measure, add_pull_adjoint=add_pull_adjoint)

@@ -45,6 +45,19 @@ def spatial(dtype: type) -> SimpleNamespace:
         return quat(s * r[0], s * r[1], s * r[2], wp.cos(T(0.5) * angle))
 
     @wp.func
+    def exp_adjoint(r: vec3, g: vec3):
+        """Adjoint of q' = q exp(r): (of r, of q), g and both in the body's tangent space: J_r(r)' g and Exp(r) g."""
+        angle = wp.length(r)
+        k1 = T(0.5) - angle * angle / T(24.0)
+        k2 = T(1.0) / T(6.0) - angle * angle / T(120.0)
+        if angle > T(2e-2):
+            k1 = (T(1.0) - wp.cos(angle)) / (angle * angle)
+            k2 = (angle - wp.sin(angle)) / (angle * angle * angle)
+        rg = wp.cross(r, g)
+        rrg = wp.cross(r, rg)
+        return g + k1 * rg + k2 * rrg, g + (T(1.0) - k2 * angle * angle) * rg + k1 * rrg
+
+    @wp.func
     def log_quat(q: quat):
         """The rotation vector of the unit quaternion q, no longer than pi; the same for q and -q."""
         v = vec3(q[0], q[1], q[2])
@@ -53,6 +66,16 @@ def spatial(dtype: type) -> SimpleNamespace:
         if s > T(1e-3):
             scale = T(2.0) * wp.atan2(s, wp.abs(q[3])) / s
         return v * wp.where(q[3] < T(0.0), -scale, scale)
+
+    @wp.func
+    def log_adjoint(r: vec3, g: vec3):
+        """Adjoint of log(exp(r) exp(d)) with respect to d, at d = 0: the inverse of J_r(r)'."""
+        angle = wp.length(r)
+        k2 = T(1.0) / T(12.0) + angle * angle / T(720.0)
+        if angle > T(2e-2):
+            k2 = (T(1.0) - T(0.5) * angle / wp.tan(T(0.5) * angle)) / (angle * angle)
+        rg = wp.cross(r, g)
+        return g - T(0.5) * rg + k2 * wp.cross(r, rg)
 
     @wp.func
     def quat_of(w: T, x: T, y: T, z: T):
@@ -76,7 +99,9 @@ def spatial(dtype: type) -> SimpleNamespace:
         point_velocity=point_velocity,
         momentum=momentum,
         exp_quat=exp_quat,
+        exp_adjoint=exp_adjoint,
         log_quat=log_quat,
+        log_adjoint=log_adjoint,
         quat_of=quat_of,
         to_tangent=to_tangent,
         from_tangent=from_tangent,

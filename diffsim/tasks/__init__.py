@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from .ant import Ant
-from .base import Accuracy, Integration, Task
+from .base import Accuracy, Task
 from .cartpole import CartPole
 from .half_cheetah import HalfCheetah
 from .hopper import Hopper
 from .humanoid import Humanoid
 from .humanoid_mtu import HumanoidMTU
-from .planar import Swimmer, Walker
+from .swimmer import Swimmer
+from .walker import Walker
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU)}
-PLANAR: dict[str, type[Task]] = {task.name: task for task in (Swimmer, Walker)}  # of guided policy search
+TASKS: dict[str, type[Task]] = {
+    task.name: task for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU, Swimmer, Walker)
+}
+# Those of the SHAC paper, which have presets of every accuracy
+SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
 
-__all__ = ["PLANAR", "TASKS", "Accuracy", "Integration", "Task"]
+__all__ = ["SHAC_TASKS", "TASKS", "Accuracy", "Task"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .base import Integration
+from ..integration import Integration
 from .locomotion import Locomotion
 
 
@@ -14,8 +14,8 @@ class Ant(Locomotion):
     name = "ant"
     asset = "ant.xml"
     substeps = 16
-    fast = Integration("implicit", 0.0, 8)
-    accurate = Integration("extrapolated", 0.0, 16)
+    fast = Integration("implicit", 8)
+    accurate = Integration("extrapolated", 16)
     obs_dim = 37
     num_random = 29
     min_height = 0.27

@@ -7,20 +7,14 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, NamedTuple, get_args
+from typing import ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from ..integration import Integration
+
 Accuracy = Literal["fast", "default", "accurate"]
-
-
-class Integration(NamedTuple):
-    """How the simulator takes a control step; see Simulator."""
-
-    integrator: str
-    theta: float
-    substeps: int
 
 
 class Task:
@@ -56,7 +50,7 @@ class Task:
         if accuracy not in get_args(Accuracy):
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
         if accuracy == "default":
-            return Integration("semi_implicit", 0.0, cls.substeps)
+            return Integration("semi_implicit", cls.substeps)
         if not hasattr(cls, accuracy):
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
         return getattr(cls, accuracy)

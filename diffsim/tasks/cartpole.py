@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from .base import Integration, Task
+from ..integration import Integration
+from .base import Task
 
 
 class CartPole(Task):
@@ -16,8 +17,8 @@ class CartPole(Task):
     name = "cartpole"
     asset = "cartpole.xml"
     substeps = 4
-    fast = Integration("implicit", 0.0, 1)
-    accurate = Integration("extrapolated", 0.0, 4)
+    fast = Integration("implicit", 1)
+    accurate = Integration("extrapolated", 4)
     episode_length = 240
     obs_dim = 5
     num_random = 4

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .base import Integration, Task
+from ..integration import Integration
+from .base import Task
 
 
 class HalfCheetah(Task):
@@ -14,8 +15,8 @@ class HalfCheetah(Task):
     name = "half_cheetah"
     asset = "half_cheetah.xml"
     substeps = 16
-    fast = Integration("implicit", 0.0, 8)
-    accurate = Integration("extrapolated", 0.0, 16)
+    fast = Integration("implicit", 8)
+    accurate = Integration("extrapolated", 16)
     obs_dim = 17
     num_random = 18
     start = (0.0, -0.2) + (0.0,) * 16

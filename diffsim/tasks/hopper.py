@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from .base import Integration, Task, height_reward
+from ..integration import Integration
+from .base import Task, height_reward
 
 
 class Hopper(Task):
@@ -16,8 +17,8 @@ class Hopper(Task):
     name = "hopper"
     asset = "hopper.xml"
     substeps = 16
-    fast = Integration("semi_implicit", 0.0, 8)
-    accurate = Integration("extrapolated", 0.0, 32)
+    fast = Integration("semi_implicit", 8)
+    accurate = Integration("extrapolated", 32)
     obs_dim = 11
     num_random = 12
     min_height = -0.45

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .base import Integration, height_reward
+from ..integration import Integration
+from .base import height_reward
 from .locomotion import Locomotion
 
 
@@ -14,8 +15,8 @@ class Humanoid(Locomotion):
     name = "humanoid"
     asset = "humanoid.xml"
     substeps = 48
-    fast = Integration("implicit", 0.0, 24)
-    accurate = Integration("extrapolated", 0.0, 96)
+    fast = Integration("implicit", 24)
+    accurate = Integration("extrapolated", 96)
     obs_dim = 76
     num_random = 55
     min_height = 0.74

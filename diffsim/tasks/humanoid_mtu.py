@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .base import Integration, height_reward
+from ..integration import Integration
+from .base import height_reward
 from .locomotion import Locomotion
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # of a ball joint, wxyz
@@ -17,8 +18,8 @@ class HumanoidMTU(Locomotion):
     name = "humanoid_mtu"
     asset = "humanoid_mtu.xml"
     substeps = 48
-    fast = Integration("implicit", 0.0, 24)
-    accurate = Integration("extrapolated", 0.0, 96)
+    fast = Integration("implicit", 24)
+    accurate = Integration("extrapolated", 96)
     obs_dim = 53
     num_random = 53
     min_height = 0.46

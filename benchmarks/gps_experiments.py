@@ -1,0 +1,448 @@
+"""Guided policy search: runs its variants on tasks and seeds, and draws and tabulates what came of them.
+
+    python benchmarks/gps_experiments.py                  the runs of docs/gps.md; finished ones are kept
+    python benchmarks/gps_experiments.py --env cartpole --seeds 1 --variants full nonguided    a part of them
+    python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
+    python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
+    python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
+
+Writes results/cpu/gps_runs.csv (every iteration of every run), gps_generalisation.csv (the policy, the DDP controller
+and that of the nearest state, from perturbed starts and under pushes), gps_paths.csv (where the root went) and
+gps_time.csv (one iteration of iLQR), their tables in docs/gps.md, and the pictures docs/figures/gps_variants.png,
+gps_paths.png and gps_generalisation.png: Figures 2, 1 and 3 of the paper. An interrupted run is resumed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from statistics import mean, median
+from typing import Annotated, Any, get_args
+
+import matplotlib
+import numpy as np
+import torch
+import tyro
+from tables import fill, markdown, read_csv, write_csv
+from torch import Tensor
+
+import diffsim
+from diffsim.planning import REAL, ilqr
+from diffsim.training import checkpoint, fail, load_policy, parse_penalty
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT))
+import gps  # noqa: E402
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+HALF = "--iterations 30 --horizon 160 --ilqr-iterations 100"
+SHORT = "--iterations 30 --horizon 100 --ilqr-iterations 100"
+# What docs/gps.md shows, per task: seeds, variants, flags
+SUITE: dict[str, tuple[tuple[int, ...], tuple[gps.Variant, ...], str]] = {
+    "cartpole": ((1, 2, 3, 4, 5), ("full", "unregularized"), "--iterations 30"),
+    "hopper": ((1,), ("full", "policy-gradient", "single-example"), HALF),
+    "swimmer": ((1,), ("full",), HALF),
+    "walker": ((1,), ("full",), SHORT),
+    "ant": ((1,), ("full",), SHORT),
+}
+RUN = ("env", "variant", "seed")
+KEPT = (  # columns of progress.csv
+    "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
+    "gps_guides gps_guides_std gps_fit eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
+    "gps_ess gps_guide_share sim_model_steps"
+).split()
+TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (250, 400)}  # returns to which learners are compared
+STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
+COLOURS = {variant: f"C{i}" for i, variant in enumerate(get_args(gps.Variant))}
+CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
+STYLES = {"plan": ("k", 2.0, 3), "guides": ("0.6", 0.8, 1), "policy": ("C0", 0.8, 2)}  # colour, width, order
+AXES = {"cartpole": ("x (m)", "angle (rad)"), "swimmer": ("x (m)", "y (m)"), "ant": ("x (m)", "y (m)")}
+Row = dict[str, Any]
+Act = Callable[[int, Tensor], Tensor]
+
+
+@dataclass
+class Args:
+    env: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--env-id"])] = tuple(SUITE)
+    """tasks"""
+    seeds: tuple[int, ...] = ()
+    """seeds (default: the suite's)"""
+    variants: tuple[gps.Variant, ...] = ()
+    """variants (default: the suite's)"""
+    jobs: int = 1
+    """runs at a time, each with one thread"""
+    arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
+    count: int = 20
+    """perturbed starts and pushes of each size"""
+    runs: Path = ROOT / "runs" / "gps"
+    """directory of the runs: {runs}/{env}__{variant}__{seed}"""
+    results: Path = ROOT / "results" / "cpu"
+    """directory of the csv files"""
+    docs: Path = ROOT / "docs"
+    """directory of gps.md, whose tables are filled, and of figures/"""
+    draw_only: bool = False
+    """train nothing: collect, draw and tabulate the runs there are"""
+    record: Path | None = None
+    """write a demonstration, the trajectory of --actor's deterministic policy, here; nothing else is done"""
+    actor: Path | None = None
+    """checkpoint of any script that --record follows"""
+    steps: int = 500
+    """control steps of a recording"""
+
+    def table(self, name: str) -> Path:
+        return self.results / f"gps_{name}.csv"
+
+
+# Demonstrations -------------------------------------------------------------------------------------------------------
+
+
+def environment(path: Path, **options: Any) -> diffsim.DiffEnv:
+    """One environment, as that in which a checkpoint's policy was trained."""
+    args = checkpoint.load(path)["args"]
+    options |= {name: args[name] for name in ("integrator", "substeps", "theta")}
+    return diffsim.make(args["env"], 1, horizon=1, penalty=parse_penalty(args["penalty"]), **options)
+
+
+@torch.no_grad()
+def record(path: Path, actor: Path | None, steps: int) -> None:
+    """The trajectory of a script's policy from the task's unperturbed start: qpos, qvel and action."""
+    if actor is None:
+        fail("--record needs --actor, a checkpoint of any script")
+    env = environment(actor, stochastic_init=False, early_termination=False)
+    env.episode_length = steps + 1  # no reset within the recording
+    policy, (obs, _) = load_policy(actor).network, env.reset()
+    states, actions = [(env.qpos, env.qvel)], []
+    for _ in range(steps):
+        actions.append(policy(obs).clamp(-1, 1))
+        obs = env.step(actions[-1])[0]
+        states.append((env.qpos, env.qvel))
+    qpos, qvel = (torch.cat(parts).numpy() for parts in zip(*states, strict=True))
+    with path.open("wb") as file:
+        np.savez(file, qpos=qpos, qvel=qvel, action=torch.cat(actions).numpy())
+    print(f"{env.task.name}, {steps} control steps: {path}")
+
+
+# Runs -----------------------------------------------------------------------------------------------------------------
+
+
+def train(directory: Path, flags: Sequence[str]) -> str:
+    """Trains, or resumes, or finds that it is done; returns what there is to say."""
+    path, (env, variant, seed) = directory / "checkpoint.pt", directory.name.split("__")
+    start = ["--env", env, "--variant", variant, "--seed", seed]
+    if path.exists():
+        state = checkpoint.load(path, "gps")
+        if state["iteration"] >= state["args"]["iterations"]:
+            return f"{directory.name}: done before"
+        start = ["--resume", str(path)]
+    command = [sys.executable, str(ROOT / "gps.py"), *start, "--run-dir", str(directory), "--threads", "1", *flags]
+    with (directory.parent / f"{directory.name}.log").open("a") as log:
+        code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT).returncode
+    return f"{directory.name}: {'done' if code == 0 else f'exit code {code}, see {log.name}'}"
+
+
+def train_all(args: Args) -> None:
+    args.runs.mkdir(parents=True, exist_ok=True)
+    jobs = []
+    for env in args.env:
+        seeds, variants, flags = SUITE.get(env, ((1,), ("full",), "--iterations 30"))
+        names = [f"{env}__{v}__{seed}" for v in args.variants or variants for seed in args.seeds or seeds]
+        jobs += [(args.runs / name, [*flags.split(), *args.arguments]) for name in names]
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for text in pool.map(lambda job: train(*job), jobs):
+            print(text, flush=True)
+
+
+def time_ilqr(env: str = "hopper", horizon: int = 500, repeats: int = 5) -> list[Row]:
+    """Seconds of an iLQR iteration of one trajectory: Jacobians and quadratics, backward pass, line search."""
+    rows = []
+    for threads in (1, 0):
+        flags = ["--env", env, "--horizon", str(horizon), "--device", "cpu", "--threads", str(threads)]
+        search = gps.Search(gps.parse(gps.Args, flags), diffsim.make(env, 1))
+        system, rng = search.system, torch.Generator().manual_seed(1)
+        u = 0.1 * torch.randn(1, horizon, system.nu, generator=rng, dtype=REAL)
+        x, _, _ = system.rollout(system.start(), horizon, lambda t, _, u=u: u[:, t])  # type: ignore[misc]
+        ilqr(system, search.cost, x, u, 1)  # compiles
+        wall, cpu = time.perf_counter(), time.process_time()  # the second is not disturbed by other work on the machine
+        ilqr(system, search.cost, x, u, repeats)
+        wall, cpu = (time.perf_counter() - wall) / repeats, (time.process_time() - cpu) / repeats
+        seconds = {"seconds": round(wall, 3), "seconds of CPU": round(cpu, 3)}
+        rows.append(dict(env=env, horizon=horizon, threads=threads or "all cores") | seconds)
+    return rows
+
+
+# Generalisation -------------------------------------------------------------------------------------------------------
+
+
+def load_search(path: Path) -> gps.Search:
+    state = checkpoint.load(path, "gps")
+    search = gps.Search(gps.Args(**state["args"]), environment(path))
+    checkpoint.restore(search, state)
+    return search
+
+
+def controllers(search: gps.Search) -> dict[str, Act]:
+    """The policy's mean; the DDP controller; and the DDP controller of the nearest state (TBDP), in scaled tangents."""
+    system, policy, guide = search.system, search.network, search.guides[0]
+    path = guide.x[:-1]
+    scale = system.difference(path, path[:1]).std(0).clamp(min=1e-3)
+    if search.args.env != "cartpole":
+        scale[0] = math.inf  # wherever it is along x
+
+    def nearest(_: int, x: Tensor) -> Tensor:
+        distance = (system.difference(x.unsqueeze(1), path.unsqueeze(0)) / scale).square().sum(-1)
+        t = distance.argmin(1)
+        return guide.u[t] + (guide.K[t] @ system.difference(x, path[t]).unsqueeze(-1)).squeeze(-1)
+
+    return {
+        "policy": lambda _, x: policy.mean(policy.theta, system.observe(x)),
+        "ddp": lambda t, x: guide.mean(system, t, x),
+        "tbdp": nearest,
+    }
+
+
+def generalisation(search: gps.Search, count: int) -> list[Row]:
+    """Each controller from the same perturbed starts and under the same pushes.
+
+    A start differs by a normal vector of `size` times the standard deviation of each coordinate over the plan; a push
+    changes the root's velocity along x by `size` m/s in either direction, a quarter of the time in. A trajectory is
+    kept if its return is within a quarter of the guides' mean.
+    """
+    system, horizon, rows = search.system, search.args.horizon, []
+    path = search.guides[0].x[:-1]
+    spread = system.difference(path, path[:1]).std(0)
+    draws = torch.randn(count, system.nd, generator=torch.Generator().manual_seed(gps.EVALUATION_SEED), dtype=REAL)
+    kick = torch.zeros_like(draws)
+    kick[:, system.nv] = draws[:, 0].sign()
+    cases = [("start", size) for size in STARTS] + [("push", size) for size in PUSHES]
+    for kind, size in cases:
+        start, push = path[:1].expand(count, -1), None
+        if kind == "start":
+            start = system.retract(start, size * spread * draws)
+        else:
+            push = horizon // 4, size * kick
+        for name, act in controllers(search).items():
+            returns = search.measure(*system.rollout(start, horizon, act, push)).returns
+            kept = returns >= search.guide_return[0] - 0.25 * abs(search.guide_return[0])
+            numbers = dict(mean=returns.mean().item(), std=returns.std(correction=0).item())
+            rows.append(dict(kind=kind, size=size, controller=name, **numbers, kept=kept.double().mean().item()))
+    return rows
+
+
+def paths(search: gps.Search, count: int = 10) -> list[Row]:
+    """Where plan, guiding samples and the noisy policy's trajectories go: the first two coordinates."""
+    guides = search.guides[0].sample(search.system, search.noise(count))[0]
+    policy = search.roll_out(search.network.theta, search.noise(count)).x
+    rows = []
+    for name, x in (("plan", search.guides[0].x[None]), ("guides", guides), ("policy", policy)):
+        for i, trajectory in enumerate(x[..., :2].tolist()):
+            rows += [dict(what=name, number=i, step=t, x=a, y=b) for t, (a, b) in enumerate(trajectory)]
+    return rows
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------
+
+
+def number(text: str) -> float:
+    return float(text) if text else math.nan
+
+
+def grouped(rows: Iterable[dict[str, str]], *keys: str) -> dict[tuple[str, ...], list[dict[str, str]]]:
+    groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return groups
+
+
+def collect(args: Args) -> None:
+    """From the runs to the csv files; rows of runs that are not here stay as they are there."""
+    tables: dict[str, list[Row]] = {"runs": [], "generalisation": [], "paths": []}
+    for directory in sorted(path for path in args.runs.glob("*__*__*") if (path / "progress.csv").is_file()):
+        run = dict(zip(RUN, directory.name.split("__"), strict=True))
+        horizon = json.loads((directory / "args.json").read_text())["horizon"]
+        for row in read_csv(directory / "progress.csv"):
+            kept = {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT}
+            tables["runs"].append(run | dict(horizon=horizon) | kept)
+        if run["variant"] == "full" and (directory / "checkpoint.pt").is_file():
+            if not (directory / "generalisation.csv").is_file():
+                search = load_search(directory / "checkpoint.pt")
+                write_csv(directory / "generalisation.csv", generalisation(search, args.count))
+                write_csv(directory / "paths.csv", paths(search))
+            for name in ("generalisation", "paths"):
+                tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
+    first: dict[str, str] = {}  # one seed a task is drawn, every fourth step
+    drawn = [row for row in tables["paths"] if row["seed"] == first.setdefault(row["env"], row["seed"])]
+    tables["paths"] = [row | {k: f"{float(row[k]):.4g}" for k in "xy"} for row in drawn if int(row["step"]) % 4 == 0]
+    for name, rows in tables.items():
+        here = {tuple(row[key] for key in RUN) for row in rows}
+        rows += [row for row in read_csv(args.table(name)) if tuple(row[key] for key in RUN) not in here]
+        write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)))
+
+
+def summarise(run: tuple[str, ...], rows: list[dict[str, str]]) -> Row:
+    first, last, half = rows[0], rows[-1], rows[len(rows) // 2 :]
+    final = next((row for row in reversed(rows) if row["eval_objective"]), dict.fromkeys(KEPT, ""))
+    objective, plan = number(final["eval_objective"]), number(first["gps_plan"])
+    return dict(zip(("task", "variant", "seed"), run, strict=True)) | {
+        "T": first["horizon"],
+        "plan": f"{plan:.1f}",
+        "guides": f"{number(first['gps_guides']):.1f} ± {number(first['gps_guides_std']):.1f}",
+        "fit": f"{number(first['gps_fit']):.2f}",
+        "pretrained": f"{number(first['gps_objective']):.1f}",
+        "iterations": last["iteration"],
+        "accepted": sum(number(row["gps_accepted"]) == 1 for row in rows),
+        "proposals, last half": f"{mean(number(row['gps_objective']) for row in half):.1f}",
+        "final policy": f"{objective:.1f} ± {number(final['eval_objective_std']):.1f}",
+        "reaches plan": "yes" if objective >= plan else "no",
+        "own return": final["eval_return"],
+        "speed": final["eval_speed"],
+        "control steps": f"{number(last['control_steps']):,.0f}",
+        "of planning": f"{number(last['sim_model_steps']):,.0f}",
+        "seconds": f"{number(last['seconds']):.0f}",
+    }
+
+
+def tabulate(args: Args) -> dict[str, str]:
+    """The tables of docs/gps.md, by the names of their places."""
+    runs, kept = grouped(read_csv(args.table("runs")), *RUN), []
+    for (env, kind), rows in grouped(read_csv(args.table("generalisation")), "env", "kind").items():
+        cells = dict.fromkeys(map(str, sorted({*STARTS, *PUSHES})), "")
+        for (size,), own in grouped(rows, "size").items():
+            shares = (mean(float(row["kept"]) for row in own if row["controller"] == name) for name in CONTROLLERS)
+            cells[size] = " / ".join(f"{share:.0%}" for share in shares)
+        kept.append({"task": env, "perturbed": kind} | cells)
+    return {
+        "runs": markdown([summarise(run, rows) for run, rows in runs.items()]),
+        "generalisation": markdown(kept),
+        "samples": markdown(compare(args)),
+        "time": markdown(read_csv(args.table("time"))),
+    }
+
+
+def compare(args: Args) -> list[Row]:
+    """Control steps of samples until the mean return of training first passes a target: of the seeds that do, median.
+
+    Returns are the task's own over our horizon T; an episode of another length counts as T times its mean step.
+    """
+    runs, table = grouped(read_csv(args.table("runs")), *RUN), []
+    for env, targets in TARGETS.items():
+        learners = {"gps": [rows for (task, variant, _), rows in runs.items() if (task, variant) == (env, "full")]}
+        for name in ("shac", "ppo_baseline"):
+            learners[name] = list(grouped(read_csv(args.results / f"{name}_{env}.csv"), "seed").values())
+        if not learners["gps"]:
+            continue
+        T = float(learners["gps"][0][0]["horizon"])
+        planning = median(float(rows[0]["sim_model_steps"]) for rows in learners["gps"])
+        for target in targets:
+            cells = {}
+            for name, seeds in learners.items():
+                steps = [first_pass(rows, target, T) for rows in seeds]
+                reached = [count for count in steps if count < math.inf]
+                cells[name] = f"{median(reached):,.0f}" if reached else "never"
+                cells[name] += f" ({len(reached)} of {len(seeds)})"
+            table.append({"task": env, "T": f"{T:.0f}", "return": target} | cells | {"of planning": f"{planning:,.0f}"})
+    return table
+
+
+def first_pass(rows: list[dict[str, str]], target: float, T: float) -> float:
+    passed = (row for row in rows if number(row["return"]) * T / float(row.get("length") or T) >= target)
+    return next((float(row["control_steps"]) for row in passed), math.inf)
+
+
+# Pictures -------------------------------------------------------------------------------------------------------------
+
+
+def draw_variants(ax: plt.Axes, env: str, runs: dict[tuple[str, ...], list[dict[str, str]]]) -> None:
+    """Mean return of the proposals: thin, each run; bold, their median; grey, two deviations of the guiding samples."""
+    low, high = list[float](), list[float]()
+    for variant in sorted({v for e, v, _ in runs if e == env}):
+        seeds = [rows for (e, v, _), rows in runs.items() if (e, v) == (env, variant)]
+        curves = [[number(row["gps_objective"]) for row in rows] for rows in seeds]
+        for rows, curve in zip(seeds, curves, strict=True):
+            ax.plot(range(len(curve)), curve, color=COLOURS[variant], lw=0.6, alpha=0.5)
+            plan, guides = number(rows[0]["gps_plan"]), number(rows[0]["gps_guides"])
+            low, high = [*low, plan, guides, np.percentile(curve, 20)], [*high, plan, *curve]
+        guides, std = (number(seeds[0][0][key]) for key in ("gps_guides", "gps_guides_std"))
+        ax.axhspan(guides - 2 * std, guides + 2 * std, color="0.6", alpha=0.4, lw=0)
+        length = min(map(len, curves))
+        middle = np.median([curve[:length] for curve in curves], 0)
+        ax.plot(range(length), middle, color=COLOURS[variant], lw=2, label=variant)
+    bottom, top = min(low), max(high)
+    ax.set_ylim(bottom - 0.3 * (top - bottom), top + 0.1 * (top - bottom))
+    ax.set(title=env, xlabel="iteration", ylabel="mean return of the proposed policy")
+
+
+def draw_paths(ax: plt.Axes, env: str, rows: list[dict[str, str]]) -> None:
+    for (what, count), track in grouped(rows, "what", "number").items():
+        colour, width, order = STYLES[what]
+        xy = [[float(row[key]) for row in track] for key in "xy"]
+        ax.plot(*xy, color=colour, lw=width, zorder=order, label=what if count == "0" else None)
+    ax.set(title=env, **dict(zip(("xlabel", "ylabel"), AXES.get(env, ("x (m)", "height (m)")), strict=True)))
+
+
+def draw_kept(ax: plt.Axes, env: str, kind: str, rows: list[dict[str, str]]) -> None:
+    for name, colour in CONTROLLERS.items():
+        sizes = grouped((row for row in rows if row["controller"] == name), "size")
+        kept = {float(size): 100 * mean(float(row["kept"]) for row in own) for (size,), own in sizes.items()}
+        ax.plot(list(kept), list(kept.values()), "o-", color=colour, label=name)
+    unit = "perturbation of the start" if kind == "start" else "push (m/s)"
+    ax.set(title=env, xlabel=unit, ylabel="kept (%)", ylim=(-5, 105))
+
+
+def draw(args: Args) -> None:
+    runs, tracks = grouped(read_csv(args.table("runs")), *RUN), grouped(read_csv(args.table("paths")), "env")
+    groups = grouped(read_csv(args.table("generalisation")), "env", "kind")
+    pictures: dict[str, list[list[Callable[[plt.Axes], None]]]] = {
+        "variants": [[partial(draw_variants, env=env, runs=runs) for env in sorted({env for env, _, _ in runs})]],
+        "paths": [[partial(draw_paths, env=env, rows=rows) for (env,), rows in tracks.items()]],
+        "generalisation": [
+            [partial(draw_kept, env=env, kind=kind, rows=rows) for (env, k), rows in groups.items() if k == kind]
+            for kind in ("start", "push")
+        ],
+    }
+    for name, grid in pictures.items():
+        if not grid[0]:
+            continue
+        figure, axes = plt.subplots(len(grid), len(grid[0]), figsize=(4 * len(grid[0]), 3 * len(grid)), squeeze=False)
+        for ax, panel in zip(axes.flat, chain(*grid), strict=True):
+            panel(ax)
+            ax.legend(fontsize=7)
+        figure.tight_layout()
+        (args.docs / "figures").mkdir(parents=True, exist_ok=True)
+        figure.savefig(args.docs / "figures" / f"gps_{name}.png", dpi=110)
+        plt.close(figure)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    argv = [*(sys.argv[1:] if argv is None else argv), "--"]
+    args = tyro.cli(Args, args=argv[: argv.index("--")], description=__doc__)
+    args.arguments = tuple(argv[argv.index("--") + 1 : -1])
+    torch.set_num_threads(1)
+    if args.record:
+        record(args.record, args.actor, args.steps)
+        return
+    for env in args.env:
+        if env not in diffsim.TASKS:
+            fail(f"unknown task {env!r}: choose from {', '.join(diffsim.TASKS)}")
+    if not args.draw_only:
+        train_all(args)
+        write_csv(args.table("time"), time_ilqr())
+    collect(args)
+    draw(args)
+    for name, text in tabulate(args).items():
+        fill(args.docs / "gps.md", f"gps {name}", text)
+    print(f"written to {args.results} and {args.docs}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""What is installed and what is missing; a demonstration; small copies of policies.
+
+python -m diffsim                                  tasks, devices, versions, and hints about usual troubles
+python -m diffsim demo [TASK] [--output FILE]      film a policy that comes with the package; needs no display
+python -m diffsim check ROBOT.xml                  what of an MJCF file is used, approximated and refused
+python -m diffsim export CHECKPOINT OUTPUT         the policy of a checkpoint alone, in a small file
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+import warp as wp
+
+from diffsim import TASKS, check, load_scene, render, startup
+from diffsim.launcher import available_cores
+
+POLICIES = files("diffsim") / "policies"
+DEMO_EPISODES = 8  # of which the one of median return is filmed
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    sys.argv[0] = "diffsim"  # in messages
+    parser = argparse.ArgumentParser(
+        prog="python -m diffsim", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", metavar="{demo,check,export}")
+    film = commands.add_parser("demo", help="film a policy that comes with the package")
+    film.add_argument("task", nargs="?", default="ant", help="which task (default: ant)")
+    film.add_argument("--output", type=Path, default=Path("demo.mp4"), help=".mp4 or .gif (default: demo.mp4)")
+    robot = commands.add_parser("check", help="say what of an MJCF file is used, approximated and refused")
+    robot.add_argument("robot", type=Path)
+    copy = commands.add_parser("export", help="write the policy of a checkpoint alone")
+    copy.add_argument("checkpoint", type=Path)
+    copy.add_argument("output", type=Path)
+    args = parser.parse_args(argv)
+    if args.command == "demo":
+        demo(args.task, args.output)
+    elif args.command == "check":
+        text, fits = check.report(args.robot)
+        print(text)
+        sys.exit(0 if fits else 1)
+    elif args.command == "export":
+        export(args.checkpoint, args.output)
+    else:
+        print(report())
+
+
+def demo(task: str, output: Path) -> None:
+    """Film the task's policy; the kernel of the gradient is not compiled, for nothing is differentiated."""
+    from diffsim.training import evaluate, fail, load_policy, make_policy_env
+
+    if task not in TASKS:
+        fail(f"unknown task {task!r}: choose from {', '.join(TASKS)}")
+    policy = POLICIES / f"{task}.pt"
+    if not policy.is_file():
+        there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
+        fail(f"no policy of {task} comes with this version; there are: {', '.join(there) or 'none'}")
+    try:
+        render.check_video(output)
+        render.check_opengl()
+        torch.set_num_threads(1)
+        saved = load_policy(Path(str(policy)))
+        evaluation = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
+        print(f"{task}, {saved.script}.py, iteration {saved.iteration}, {DEMO_EPISODES} episodes: {evaluation}")
+        print(f"video: {evaluation.save_video(output)}")
+    except (OSError, RuntimeError, ValueError) as error:
+        fail(error)
+
+
+def export(checkpoint: Path, output: Path) -> None:
+    from diffsim.training import export_policy, fail, load_policy
+
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        export_policy(checkpoint, output)
+    except (OSError, RuntimeError) as error:
+        fail(error)
+    saved = load_policy(output)
+    size = output.stat().st_size / 1e3
+    print(f"{output}: {saved.args['env']}, {saved.script}.py, iteration {saved.iteration}, {size:.0f} kB")
+
+
+# The report -----------------------------------------------------------------------------------------------------------
+
+
+def report() -> str:
+    """All that a question about an installation needs, in some twenty lines."""
+    blocks = ["\n".join(describe_tasks()), "\n".join(f"{name:<10} {text}" for name, text in describe_machine().items())]
+    hints = find_troubles()
+    if hints:
+        blocks.append("\n".join(f"! {hint}" for hint in hints))
+    return "\n\n".join(blocks)
+
+
+def describe_tasks() -> list[str]:
+    lines = [f"{'task':<14} {'obs':>4} {'act':>4}  {'episode':<18} {'substeps':>8}  demo"]
+    for name, task in TASKS.items():
+        scene = load_scene(str(files("diffsim") / "assets" / task.asset))
+        episode = f"{task.episode_length} steps, {task.episode_length * task.control_dt:.1f} s"
+        shipped = "yes" if (POLICIES / f"{name}.pt").is_file() else "-"
+        lines.append(f"{name:<14} {task.obs_dim:>4} {scene.nu:>4}  {episode:<18} {task.substeps:>8}  {shipped}")
+    return lines
+
+
+def describe_machine() -> dict[str, str]:
+    devices = [f"cpu, {available_cores()} cores"]
+    for k in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(k)
+        devices.append(f"cuda:{k}, {properties.name}, {properties.total_memory / 2**30:.0f} GiB")
+    packages = ("torch", "warp-lang", "mujoco", "gymnasium", "numpy")
+    try:
+        drawing = render.opengl_name()
+    except RuntimeError:
+        drawing = "none"
+    return {
+        "diffsim": f"{_version('diffsim')}, {files('diffsim')}",
+        "versions": ", ".join([f"python {platform.python_version()}", *(f"{p} {_version(p)}" for p in packages)]),
+        "devices": "; ".join(devices),
+        "kernels": _kernel_cache(),
+        "OpenGL": drawing,
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def _kernel_cache() -> str:
+    try:
+        folder = startup.check_kernel_cache()
+    except ValueError:
+        return "none"
+    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    kernels = sum(1 for path in folder.iterdir() if path.is_dir())
+    return f"{folder}, {kernels} kernels, {sum(sizes) / 1e6:.0f} MB"
+
+
+def find_troubles() -> list[str]:
+    """What is likely to disappoint on this machine, each with its remedy."""
+    hints = []
+    driver = startup.nvidia_driver() or shutil.which("nvidia-smi") is not None
+    if driver and not torch.cuda.is_available():
+        if torch.version.cuda is None:
+            hints.append("this torch is a build for the CPU: see https://pytorch.org/get-started for one with CUDA")
+        elif "CUDA_VISIBLE_DEVICES" in os.environ:
+            shown = os.environ["CUDA_VISIBLE_DEVICES"]
+            hints.append(f"torch sees no GPU with CUDA_VISIBLE_DEVICES={shown!r}: unset it")
+        else:
+            hints.append(f"torch sees no GPU: the driver may be older than CUDA {torch.version.cuda}, see nvidia-smi")
+    elif torch.cuda.is_available() and not wp.is_cuda_available():
+        hints.append("torch sees a GPU and Warp does not: the driver is too old for Warp, see nvidia-smi")
+    for works in (startup.check_kernel_cache, render.check_opengl, lambda: render.check_video("demo.mp4")):
+        try:
+            works()
+        except (RuntimeError, ValueError) as error:
+            hints.append(str(error))
+    return hints
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""How a control step is integrated: the choice of integrator and the number of its steps."""
+
+from __future__ import annotations
+
+from numbers import Integral
+from typing import NamedTuple
+
+INTEGRATORS = ("semi_implicit", "implicit", "extrapolated")
+
+
+class Integration(NamedTuple):
+    """How the simulator takes a control step; docs/physics.md has the equations.
+
+    Attributes:
+        integrator: "semi_implicit" (Euler), "implicit" (linearly implicit in damping, friction and, scaled by theta,
+            stiffness) or "extrapolated" (from two semi-implicit steps, one of half the substeps; second order at 1.5
+            times the cost).
+        substeps: integration steps in one control step; even if extrapolated.
+        theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); 0 unless implicit.
+    """
+
+    integrator: str = "semi_implicit"
+    substeps: int = 16
+    theta: float = 0.0
+
+    def replaced(self, integrator: str | None, substeps: int | None, theta: float | None) -> Integration:
+        """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
+        new = self
+        if integrator is not None and integrator != self.integrator:
+            new = Integration(integrator, self.substeps)
+        if substeps is not None:
+            new = new._replace(substeps=substeps)
+        return new if theta is None else new._replace(theta=theta)
+
+    def check(self) -> Integration:
+        """Itself, with substeps a plain int; raises ValueError, with what is allowed, if it cannot be integrated so."""
+        if self.integrator not in INTEGRATORS:
+            raise ValueError(f"unknown integrator {self.integrator!r}; choose from {', '.join(INTEGRATORS)}")
+        substeps = check_count("substeps", self.substeps)
+        if self.integrator == "extrapolated" and substeps % 2:
+            raise ValueError(f"substeps is {self.substeps}, must be even for the extrapolated integrator")
+        if not 0 <= self.theta <= 1:
+            raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
+        if self.theta and self.integrator != "implicit":
+            raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
+        return self._replace(substeps=substeps)
+
+
+def check_count(name: str, value: int) -> int:
+    """The value as an int, be it NumPy's; raises ValueError unless it is an integer of at least 1. True is none."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
+    return int(value)

@@ -1,0 +1,322 @@
+"""MJCF -> Scene, by way of MuJoCo's compiler; obstacles.py refuses what is not simulated."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from diffsim.approximations import approximations
+from diffsim.ground import PairLaw, disabled_flags, ground_pairs, pair_law
+from diffsim.obstacles import floating, is_motor, obstacles, text
+from diffsim.penalty import contact_constants, limit_constants, mobilities
+from diffsim.scene import Array, Scene, SceneError
+
+
+def load_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read an MJCF file.
+
+    Raises:
+        SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise SceneError(f"robot file {str(path)!r} does not exist")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except ValueError as error:
+        raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
+    _obey_flags(model)
+    if found := obstacles(model):
+        lines = found if len(found) == 1 else [f"{len(found)} things keep it from being simulated:", *found]
+        raise SceneError(f"{file.name}: " + "\n  ".join(lines))
+    scene = _Reader(model, file).scene()
+    return dataclasses.replace(scene, approximations=approximations(scene))
+
+
+def _obey_flags(m: mujoco.MjModel) -> None:
+    """Take out of the compiled model what <flag ...="disable"/> switches off."""
+    off = disabled_flags(m)
+    if "constraint" in off:
+        off |= {"contact", "equality", "frictionloss", "limit"}
+    if "passive" in off:
+        off |= {"spring", "damper"}
+    gone = {
+        "contact": (m.geom_contype, m.geom_conaffinity),
+        "damper": (m.dof_damping, m.tendon_damping),
+        "equality": (m.eq_active0,),
+        "frictionloss": (m.dof_frictionloss, m.tendon_frictionloss),
+        "gravity": (m.opt.gravity,),
+        "limit": (m.jnt_limited, m.tendon_limited),
+        "spring": (m.jnt_stiffness, m.tendon_stiffness),
+    }
+    for flag in off & gone.keys():
+        for values in gone[flag]:
+            values[:] = 0
+    if {"spring", "damper"} <= off:
+        m.opt.density = m.opt.viscosity = 0
+        m.body_gravcomp[:] = 0
+
+
+class Sphere(NamedTuple):
+    """What may touch the ground, in the frame of its link; geom says what it is part of."""
+
+    link: int
+    centre: Array
+    radius: float
+    geom: int
+
+
+class _Reader:
+    """Walks a compiled MjModel once, body by body."""
+
+    def __init__(self, model: mujoco.MjModel, file: Path) -> None:
+        self.m = model
+        self.file = file
+        self.links: list[dict[str, Any]] = []
+        self.joint_link: dict[int, int] = {}
+        self.k_limit, self.d_limit = self._limits()
+        # Of each body: its link (-1: fixed to the world of a floating scene) and its pose in the link's frame.
+        self.body: list[tuple[int, Array, Array]] = [(-1, np.eye(3), np.zeros(3))]
+
+    def scene(self) -> Scene:
+        m = self.m
+        if not floating(m):
+            self._add_link(parent=0)
+            self.body[0] = (0, np.eye(3), np.zeros(3))
+        for body in range(1, m.nbody):
+            self._read_body(body)
+        columns: dict[str, Any] = {key: np.array([link[key] for link in self.links]) for key in self.links[0]}
+        mass = columns.pop("mass")
+        com = columns.pop("moment") / np.where(mass > 0, mass, 1.0)[:, None]
+        about_origin = columns.pop("inertia")
+        inertia = about_origin + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
+        columns |= {key: columns[key].astype(np.int32) for key in ("parent", "ball")}
+        return Scene(
+            name=self.file.stem,
+            path=str(self.file),
+            mj_model=m,
+            floating=floating(m),
+            nq=m.nq,
+            nv=m.nv,
+            mass=mass,
+            com=com,
+            inertia=inertia,
+            gravity=np.array(m.opt.gravity),
+            density=float(m.opt.density),
+            viscosity=float(m.opt.viscosity),
+            **columns,
+            **self._actuators(),
+            **self._contacts(float(mass.sum())),
+        )
+
+    def _add_link(self, parent: int, joint: int = -1, ball: int = -1, **values: Any) -> int:
+        m = self.m
+        dof, adr = (m.jnt_dofadr[joint], m.jnt_qposadr[joint]) if joint >= 0 else (-1, -1)
+        moving = joint >= 0 and m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE
+        limited, scalar = moving and m.jnt_limited[joint], moving and ball < 0
+        axis = np.array(m.jnt_axis[joint]) if scalar else np.zeros(3)
+        link = {
+            "parent": parent,
+            "slide": moving and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE,
+            "ball": ball,
+            "rotation": np.eye(3),
+            "position": np.zeros(3),
+            "axis": np.eye(3)[ball] if ball >= 0 else axis,
+            "joint_ref": m.qpos0[adr] if scalar else 0.0,
+            "armature": m.dof_armature[dof] if moving else 0.0,
+            "damping": m.dof_damping[dof] if moving else 0.0,
+            "stiffness": m.jnt_stiffness[joint] if moving else 0.0,
+            "spring_ref": m.qpos_spring[adr] if scalar else 0.0,  # a ball's is the identity in every MJCF
+            "lower": m.jnt_range[joint, 0] if limited else -np.inf,
+            "upper": m.jnt_range[joint, 1] if limited else np.inf,
+            "k_limit": self.k_limit[dof] if limited else 0.0,
+            "d_limit": self.d_limit[dof] if limited else 0.0,
+            "mass": 0.0,
+            "moment": np.zeros(3),
+            "inertia": np.zeros((3, 3)),
+        }
+        self.links.append(link | values)
+        self.joint_link[joint] = len(self.links) - 1
+        return len(self.links) - 1
+
+    def _read_body(self, body: int) -> None:
+        m = self.m
+        link, parent_rotation, parent_position = self.body[m.body_parentid[body]]
+        rotation = parent_rotation @ _matrix(m.body_quat[body])
+        position = parent_position + parent_rotation @ m.body_pos[body]
+        joints = range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])
+        if joints and m.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE:
+            link = self._add_link(parent=0, joint=joints[0])
+            rotation, position = np.eye(3), np.zeros(3)
+        else:
+            for joint in joints:
+                anchor = np.array(m.jnt_pos[joint])
+                position = position + rotation @ anchor
+                for ball in range(3) if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else (-1,):
+                    link = self._add_link(link, joint, ball, rotation=rotation, position=position)
+                    rotation, position = np.eye(3), np.zeros(3)
+                position = -anchor
+        self.body.append((link, rotation, position))
+        if link >= 0:
+            self._add_inertia(self.links[link], body, rotation, position)
+
+    def _add_inertia(self, link: dict[str, Any], body: int, rotation: Array, position: Array) -> None:
+        m = self.m
+        mass = m.body_mass[body]
+        principal = rotation @ _matrix(m.body_iquat[body])
+        com = position + rotation @ m.body_ipos[body]
+        link["mass"] += mass
+        link["moment"] = link["moment"] + mass * com
+        about_com = principal @ np.diag(m.body_inertia[body]) @ principal.T
+        link["inertia"] = link["inertia"] + about_com - mass * _skew(com) @ _skew(com)
+
+    def _actuators(self) -> dict[str, Any]:
+        m = self.m
+        rows = [
+            self._muscle(a) if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON else self._motor(a)
+            for a in range(m.nu)
+        ]
+        segments = sorted((s for row in rows for s in row["segments"]), key=lambda s: (s[0], s[2]))
+        return {
+            "motor_link": np.array([row["link"] for row in rows], np.int32),
+            "gear": np.array([row["scale"] * (row["high"] - row["low"]) / 2 for row in rows]),
+            "motor_bias": np.array([row["scale"] * (row["high"] + row["low"]) / 2 for row in rows]),
+            "segment_link": np.array([links for links, _, _ in segments], np.int32).reshape(-1, 2),
+            "segment_position": np.array([ends for _, ends, _ in segments]).reshape(-1, 2, 3),
+            "segment_muscle": np.array([muscle for _, _, muscle in segments], np.int32),
+            "hill": np.array([row["hill"] for row in rows]).reshape(-1, 9),
+            "muscle_model": text(m, "muscle_model", "linear"),
+        }
+
+    def _motor(self, a: int) -> dict[str, Any]:
+        m = self.m
+        joint, axis = m.actuator_trnid[a, 0], 0
+        ball = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
+        if ball:  # a torque about one axis of the turned body's frame
+            axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
+        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
+        link = self.joint_link[joint] + (axis - 2 if ball else 0)
+        scale = m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
+        return {"link": link, "scale": scale, "low": low, "high": high, "segments": [], "hill": [np.nan] * 9}
+
+    def _muscle(self, a: int) -> dict[str, Any]:
+        m = self.m
+        strength = self._numeric("muscle_strength", 1.0)
+        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (0.0, 1.0)
+        gain = m.actuator_gainprm[a, :9]
+        scale = -strength * m.actuator_gear[a, 0] * gain[0]
+        constant, segments = self._path(m.actuator_trnid[a, 0], a)
+        hill = [np.nan] * 9
+        if not is_motor(m, a):
+            start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
+            scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
+            near, far = m.actuator_lengthrange[a]
+            fibre = (far - near) / (end - start)  # m, where the muscle is strongest
+            hill = [constant, 1 / fibre, start - near / fibre, 1 / (fibre * vmax), lmin, lmax, fpmax, fvmax, scale]
+        return {"link": 0, "scale": scale, "low": low, "high": high, "segments": segments, "hill": hill}
+
+    def _path(self, tendon: int, actuator: int) -> tuple[float, list[tuple[tuple[int, int], Array, int]]]:
+        """Of a tendon the length within links, and the segments between two: (links, end points, actuator)."""
+        m = self.m
+        points: list[tuple[int, Array]] = []
+        for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
+            link, rotation, position = self.body[m.site_bodyid[site]]
+            points.append((link, position + rotation @ m.site_pos[site]))
+        constant, segments = 0.0, []
+        for (i, a), (j, b) in zip(points, points[1:], strict=False):
+            if i == j:
+                constant += float(np.linalg.norm(b - a))
+            else:
+                segments.append(((i, j) if i < j else (j, i), np.array([a, b] if i < j else [b, a]), actuator))
+        return constant, segments
+
+    def _contacts(self, mass: float) -> dict[str, Any]:
+        m = self.m
+        data = mujoco.MjData(m)
+        mujoco.mj_kinematics(m, data)
+        pairs = ground_pairs(m)
+        spheres = self._outer_spheres([sphere for _, geom in pairs for sphere in self._spheres(geom)])
+        points = []  # the lowest one of each sphere in the reference pose
+        for sphere in spheres:
+            body = m.geom_bodyid[sphere.geom]
+            _, rotation, position = self.body[body]
+            centre = data.xpos[body] + data.xmat[body].reshape(3, 3) @ rotation.T @ (sphere.centre - position)
+            points.append((body, centre - [0.0, 0.0, sphere.radius]))
+        laws = [pair_law(m, pairs[0][0], sphere.geom) for sphere in spheres]
+        return self._contact_constants(mass, points, laws) | {
+            "contact_link": np.array([sphere.link for sphere in spheres], np.int32),
+            "contact_position": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
+            "contact_radius": np.array([sphere.radius for sphere in spheres]),
+            "ground_height": float(data.geom_xpos[pairs[0][0], 2]) if pairs else 0.0,
+        }
+
+    def _contact_constants(self, mass: float, points: list[tuple[int, Array]], laws: list[PairLaw]) -> dict[str, float]:
+        """k_n, k_d, k_t, mu after the lowest point's law; a file that names k_n alone keeps the damping ratio."""
+        if not points:
+            return dict.fromkeys(("k_n", "k_d", "k_t", "mu"), 0.0)
+        law = laws[min(range(len(points)), key=lambda k: round(float(points[k][1][2]), 9))]
+        default = contact_constants(mass, mobilities(self.m, points), law.solref)
+        k_n = self._numeric("k_n", default["k_n"])
+        return {
+            "k_n": k_n,
+            "k_d": self._numeric("k_d", default["k_d"] * (k_n / default["k_n"] if default["k_n"] > 0 else 1.0)),
+            "k_t": self._numeric("k_t", default["k_t"]),
+            "mu": self._numeric("mu", law.friction if law.condim > 1 else 0.0),
+        }
+
+    def _spheres(self, geom: int) -> list[Sphere]:
+        m, kind = self.m, mujoco.mjtGeom
+        link, rotation, position = self.body[m.geom_bodyid[geom]]
+        axes = rotation @ _matrix(m.geom_quat[geom])
+        centre = position + rotation @ m.geom_pos[geom]
+        size = m.geom_size[geom]
+        if m.geom_type[geom] == kind.mjGEOM_SPHERE:
+            return [Sphere(link, centre, size[0], geom)]
+        if m.geom_type[geom] == kind.mjGEOM_CAPSULE:
+            return [Sphere(link, centre + s * size[1] * axes[:, 2], size[0], geom) for s in (-1.0, 1.0)]
+        signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
+        return [Sphere(link, centre + axes @ (s * size), 0.0, geom) for s in signs]
+
+    def _outer_spheres(self, spheres: list[Sphere]) -> list[Sphere]:
+        """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""
+
+        def seen_from_parent(sphere: Sphere) -> Sphere:
+            # A centre on the hinge's anchor does not move in the parent's frame.
+            link, centre = sphere.link, sphere.centre
+            while link > 0 and not self.links[link]["slide"] and np.linalg.norm(centre) < 1e-6:
+                centre, link = self.links[link]["position"], self.links[link]["parent"]
+            return Sphere(link, centre, sphere.radius, sphere.geom)
+
+        kept: list[Sphere] = []
+        for sphere in sorted(spheres, key=lambda sphere: -sphere.radius):
+            seen = seen_from_parent(sphere)
+            others = [other for other in map(seen_from_parent, kept) if other.link == seen.link]
+            if not any(np.linalg.norm(o.centre - seen.centre) + seen.radius <= o.radius + 1e-6 for o in others):
+                kept.append(sphere)
+        return sorted(kept, key=lambda sphere: sphere.link)
+
+    def _limits(self) -> tuple[Array, Array]:
+        """k_limit, d_limit (nv,); a file that names k_limit alone keeps the damping ratio."""
+        k, d = limit_constants(self.m)
+        k_limit = np.array([self._numeric("k_limit", x) for x in k])
+        ratio = np.sqrt(np.divide(k_limit, k, out=np.ones_like(k), where=k > 0))
+        return k_limit, np.array([self._numeric("d_limit", x) for x in d * ratio])
+
+    def _numeric(self, name: str, default: float) -> float:
+        index = mujoco.mj_name2id(self.m, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+        return float(self.m.numeric_data[self.m.numeric_adr[index]]) if index >= 0 else default
+
+
+def _matrix(quaternion: Array) -> Array:
+    result = np.zeros(9)
+    mujoco.mju_quat2Mat(result, np.asarray(quaternion, float))
+    return result.reshape(3, 3)
+
+
+def _skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

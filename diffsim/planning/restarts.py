@@ -1,0 +1,62 @@
+"""Trajectory optimisation from nothing: from many random action sequences, of which the best are kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from diffsim.planning.dynamics import REAL, Dynamics
+from diffsim.planning.ilqr import Cost, ilqr
+
+
+def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Generator) -> Tensor:
+    """Where to start from: (count, steps, nu) nothing, then by turns a sinusoid per motor, a random walk, white noise.
+
+    dt is the control step in seconds; rng is on the CPU, as the result.
+    """
+    t = dt * torch.arange(steps, dtype=REAL).view(-1, 1)
+    result = [torch.zeros(steps, nu, dtype=REAL)]
+    for i in range(1, count):
+        amplitude = torch.rand(1, nu, generator=rng, dtype=REAL)
+        if i % 3 == 1:
+            frequency, phase = torch.rand(2, 1, nu, generator=rng, dtype=REAL)
+            result.append(amplitude * torch.sin(2 * math.pi * (2.0 * frequency * t + phase)))
+        else:
+            white = torch.randn(steps, nu, generator=rng, dtype=REAL)
+            result.append(amplitude * (white.cumsum(0) * dt**0.5 if i % 3 == 2 else 0.5 * white))
+    return torch.stack(result[:count])
+
+
+def best_of_random_starts(
+    system: Dynamics,
+    cost: Cost,
+    start: Tensor,
+    actions: Tensor,
+    keep: int,
+    iterations: int,
+    show: Callable[[int, Tensor], None] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Optimises trajectories from one state, side by side and for a few iterations.
+
+    Args:
+        start: (nx,) the state.
+        actions: (R, T, nu) where to start from, see starting_actions; those that diverge are left out.
+        keep: at most so many trajectories are returned.
+        iterations, show: see ilqr.
+
+    Returns:
+        x (keep, T + 1, nx), u (keep, T, nu), the cheapest first.
+
+    Raises:
+        ValueError: all of them diverged.
+    """
+    x, u, finite = system.rollout(start.expand(len(actions), -1), actions.shape[1], lambda t, _: actions[:, t])
+    whole = finite.all(1)
+    if not bool(whole.any()):
+        raise ValueError("every random start of the planner left the finite numbers: give more substeps")
+    plan = ilqr(system, cost, x[whole], u[whole], iterations, show=show)
+    best = plan.cost.argsort()[:keep]
+    return plan.x[best], plan.u[best]

@@ -1,0 +1,130 @@
+"""MuJoCo and Warp, started without noise. The package imports this before everything else that needs them."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from weakref import WeakSet
+
+import warp as wp
+
+NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+_announced: set[str] = set()
+_watched: WeakSet[Any] = WeakSet()
+
+
+def import_mujoco() -> None:
+    """Import MuJoCo even where MUJOCO_GL names an OpenGL that is not there: only drawing needs it, and says so."""
+    try:
+        importlib.import_module("mujoco")
+    except Exception:  # AttributeError among them
+        wanted = os.environ.get("MUJOCO_GL")
+        if wanted is None:
+            raise
+        os.environ["MUJOCO_GL"] = "disable"
+        try:
+            importlib.import_module("mujoco")
+        finally:
+            os.environ["MUJOCO_GL"] = wanted
+
+
+def start_warp() -> None:
+    """Start Warp if there is no NVIDIA driver, without the warning that it prints then, from C.
+
+    With a driver there is no warning, and Warp starts when it is first used: CUDA must not begin at an import.
+    """
+    wp.config.log_level = wp.LOG_WARNING
+    if not nvidia_driver():
+        try:
+            check_kernel_cache()
+        except ValueError:
+            pass  # repeated when kernels are wanted
+
+
+def nvidia_driver() -> bool:
+    """Whether the library of the NVIDIA driver can be loaded."""
+    for name in ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so", "libcuda.so.1"):
+        try:
+            ctypes.CDLL(name)
+            return True
+        except OSError:
+            pass
+    return False
+
+
+def check_kernel_cache() -> Path:
+    """Start Warp; the folder where it keeps compiled kernels.
+
+    Raises:
+        ValueError: it cannot be written.
+    """
+    wanted = wp.config.kernel_cache_dir
+    try:
+        with _without(NO_DRIVER):
+            wp.init()
+        if not os.access(str(wp.config.kernel_cache_dir), os.W_OK):
+            raise PermissionError
+    except OSError as error:
+        folder, wp.config.kernel_cache_dir = wp.config.kernel_cache_dir, wanted
+        raise ValueError(
+            f"cannot write to Warp's kernel cache {folder}: set WARP_CACHE_PATH to another folder"
+        ) from error
+    return Path(str(wp.config.kernel_cache_dir))
+
+
+def announce_compilation(kernels: Iterable[wp.Kernel], name: str) -> None:
+    """Say in one line on stderr when Warp begins to compile the first of the kernels; nothing if its cache has them."""
+    for kernel in kernels:
+        if kernel.module not in _watched:
+            _watched.add(kernel.module)
+            _watch(kernel.module, name)
+
+
+def _watch(module: Any, name: str) -> None:
+    load = module.load
+
+    def announcing_load(device: Any, block_dim: int | None = None, *args: Any, **kwargs: Any) -> Any:
+        if name not in _announced and not _is_compiled(module, wp.get_device(device), block_dim):
+            _announced.add(name)
+            if os.environ.get("RANK", "0") == "0":
+                print(f"compiling kernels for {name} (once, about 10 s) ...", file=sys.stderr, flush=True)
+        return load(device, block_dim, *args, **kwargs)
+
+    module.load = announcing_load
+
+
+def _is_compiled(module: Any, device: wp.Device, block_dim: int | None) -> bool:
+    folder = Path(str(wp.config.kernel_cache_dir)) / module.get_module_identifier(block_dim)
+    return any(folder.glob("*.o" if device.is_cpu else "*.sm*"))
+
+
+@contextmanager
+def _without(message: bytes) -> Iterator[None]:
+    """Hold back what is written to stderr, by C as well, and let all lines through but those with the message."""
+    try:
+        stderr = os.dup(2)
+    except OSError:  # closed
+        yield
+        return
+    reader, writer = os.pipe()
+    os.dup2(writer, 2)
+    os.close(writer)
+    try:
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        with open(reader, "rb") as pipe:
+            for line in pipe:
+                if message not in line:
+                    os.write(2, line)
+
+
+import_mujoco()
+start_warp()

@@ -1,0 +1,174 @@
+"""Steppers: control steps as nodes of torch's graph, with the checkpoints that their adjoints need."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+import warp as wp
+
+from diffsim.integration import Integration
+from diffsim.launcher import Launcher, check_memory
+
+State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
+
+
+class Checkpoint(NamedTuple):
+    """Where a stepper keeps what the backward pass of one control step needs."""
+
+    slot: int
+    version: int  # of the slot, which serves a new step after each round of the ring
+
+
+class ControlStep(torch.autograd.Function):
+    """qpos, qvel, ctrl -> qpos and qvel side by side. The stepper's checkpoint holds what backward needs."""
+
+    @staticmethod
+    def forward(ctx: Any, stepper: Stepper, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> torch.Tensor:
+        ctx.stepper, ctx.checkpoint = stepper, stepper.next_checkpoint()
+        return stepper.forward(ctx.checkpoint.slot, qpos, qvel, ctrl)
+
+    @staticmethod
+    def backward(ctx: Any, g_end: torch.Tensor) -> tuple[Any, ...]:
+        if torch.is_grad_enabled():  # create_graph=True; without this, second derivatives would lack their larger part
+            raise RuntimeError(
+                "a simulated step has a first derivative only, so no create_graph=True: take finite differences of it"
+            )
+        return (None, *ctx.stepper.backward(ctx.checkpoint, g_end))
+
+
+class Stepper:
+    """Control steps by the kernels; see Simulator.
+
+    Args:
+        launcher: runs the kernels.
+        integration: semi-implicit or implicit, as the launcher's kernels.
+        control_dt, horizon: see Simulator.
+    """
+
+    def __init__(self, launcher: Launcher, integration: Integration, control_dt: float, horizon: int) -> None:
+        spec, n, slots = launcher.spec, launcher.num_envs, horizon + 1  # the last slot serves steps without gradient
+        h = spec.dtype(control_dt / integration.substeps)
+
+        def tensor(*size: int, of: torch.dtype = launcher.dtype) -> torch.Tensor:
+            return torch.zeros(size, dtype=of, device=launcher.device)
+
+        self._launcher, self._horizon, self._substeps = launcher, horizon, integration.substeps
+        self._scalars = [h, spec.dtype(integration.theta), integration.substeps]
+        # One buffer for qpos, qvel and ctrl side by side: torch copies each in one operation, the kernels see parts.
+        self._widths = (spec.nq, spec.nv, spec.nu)
+        self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
+        self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
+        self._nonfinite = tensor(slots, n, of=torch.bool)
+        self._checkpoint: list[wp.array] | None = None
+        self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
+        self._slot, self._last = 0, horizon
+        self._version = [0] * horizon
+
+    @property
+    def nonfinite(self) -> torch.Tensor:
+        return self._nonfinite[self._last]
+
+    def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
+        if torch.is_grad_enabled() and (qpos.requires_grad or qvel.requires_grad or ctrl.requires_grad):
+            end = ControlStep.apply(self, qpos, qvel, ctrl)
+        else:
+            end = self.forward(self._horizon, qpos, qvel, ctrl)
+        return end.split(self._widths[:2], dim=1)
+
+    def rewind(self) -> None:
+        self._slot = 0
+
+    def next_checkpoint(self) -> Checkpoint:
+        """The next slot of the ring, which from now on is this step's."""
+        slot = self._slot
+        self._slot = (slot + 1) % self._horizon
+        self._version[slot] += 1
+        return Checkpoint(slot, self._version[slot])
+
+    def forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
+        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl)."""
+        torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
+        self._last = slot
+        self._launcher.launch("forward", self._command("forward", slot))
+        return self._end.clone()
+
+    def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The adjoints of qpos, qvel and ctrl from that of the state (N, nq + nv) after the step.
+
+        Raises:
+            RuntimeError: the checkpoint serves another step by now.
+        """
+        if self._version[checkpoint.slot] != checkpoint.version:
+            raise RuntimeError(
+                f"backward through a control step whose checkpoint was overwritten: at most {self._horizon} "
+                "differentiable steps can be alive; build the simulator with a larger horizon"
+            )
+        self._g_end.copy_(g_end)
+        self._launcher.launch("backward", self._command("backward", checkpoint.slot))
+        return self._g_start.clone().split(self._widths, dim=1)
+
+    def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
+        key = (kernel, slot)
+        if key not in self._commands:
+            self._commands[key] = self._launcher.command(kernel, self._inputs(kernel, slot))
+        return self._commands[key]
+
+    def _inputs(self, kernel: str, slot: int) -> list[Any]:
+        record = slot < self._horizon
+        if record and self._checkpoint is None:
+            self._checkpoint = self._rows(self._horizon * self._substeps)
+        rows = self._checkpoint if record and self._checkpoint else self._rows(0)
+        row0 = slot * self._substeps if record else 0
+        qpos, qvel, ctrl = self._parts(self._start[slot], 3)
+        nonfinite = wp.from_torch(self._nonfinite[slot])
+        if kernel == "forward":
+            return [*self._scalars, qpos, qvel, ctrl, int(record), row0, *rows, *self._parts(self._end, 2), nonfinite]
+        gradients = [*self._parts(self._g_end, 2), *self._parts(self._g_start, 3)]
+        blown_up = wp.from_torch(self._launcher.nonfinite_gradients)
+        return [*self._scalars, row0, *rows, qpos, ctrl, nonfinite, *gradients, blown_up]
+
+    def _rows(self, count: int) -> list[wp.array]:
+        """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
+        spec, n, device = self._launcher.spec, self._launcher.num_envs, str(self._launcher.device)
+        widths = (spec.nq, spec.nv, spec.nv, spec.nfactor)
+        numbers = count * sum(widths)
+        check_memory("checkpoints", n, numbers * self._launcher.dtype.itemsize, self._launcher.device)
+        sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
+        return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
+
+    def _parts(self, buffer: torch.Tensor, count: int) -> list[Any]:
+        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl."""
+        return [wp.from_torch(part) for part in buffer.split(self._widths[:count], dim=1)]
+
+
+class ExtrapolatedStepper:
+    """Richardson's extrapolation of two semi-implicit steppers, one of half the substeps: 2 fine - coarse.
+
+    An error proportional to the substep cancels in it. Same interface and arguments as Stepper.
+    """
+
+    def __init__(self, launcher: Launcher, integration: Integration, control_dt: float, horizon: int) -> None:
+        fine = Integration("semi_implicit", integration.substeps)
+        coarse = Integration("semi_implicit", integration.substeps // 2)
+        self._fine, self._coarse = (Stepper(launcher, part, control_dt, horizon) for part in (fine, coarse))
+        first = launcher.scene.quaternion_adr
+        self._quaternions = torch.tensor([range(k, k + 4) for k in first], device=launcher.device)
+
+    @property
+    def nonfinite(self) -> torch.Tensor:
+        return self._fine.nonfinite | self._coarse.nonfinite
+
+    def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
+        fine, coarse = (stepper.step(qpos, qvel, ctrl) for stepper in (self._fine, self._coarse))
+        end_qpos, end_qvel = (2.0 * b - a for a, b in zip(coarse, fine, strict=True))
+        if len(self._quaternions):
+            unit = F.normalize(end_qpos[:, self._quaternions], dim=2)
+            end_qpos = end_qpos.index_copy(1, self._quaternions.flatten(), unit.flatten(1))
+        bad = self.nonfinite.unsqueeze(1)
+        return torch.where(bad, qpos.detach(), end_qpos), torch.where(bad, qvel.detach(), end_qvel)
+
+    def rewind(self) -> None:
+        self._fine.rewind()
+        self._coarse.rewind()

@@ -1,0 +1,31 @@
+"""Swimmer of guided policy search (Levine and Koltun 2013, appendix B): a snake of three links swims in a fluid.
+
+It has no reward of its own here but the paper's: the squared error of velocity, and a cost of torque.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .base import Task
+
+
+class Swimmer(Task):
+    """qpos = (x, y, yaw, 2 joints) [m, rad]; action: 100 N m per joint."""
+
+    name = "swimmer"
+    asset = "swimmer.xml"
+    substeps = 10
+    obs_dim = 8
+    num_random = 10
+    start = (0.0,) * 10
+    spread = (0.1,) * 10
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        """All of the state but where it is: yaw, 2 joints, then the rates of x, y, yaw and joints."""
+        return torch.cat((qpos[..., 2:], qvel), dim=-1)
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """-(v_x - 2)^2 - 1e-4 |a|^2."""
+        return -(obs[..., 3] - 2.0).square() - 1e-4 * action.square().sum(-1)

@@ -1,0 +1,59 @@
+"""What surrounds every learner and is part of no algorithm: flags, runs, checkpoints, logs, evaluation, CUDA graphs.
+
+The physics knows nothing of this package.
+"""
+
+from __future__ import annotations
+
+from diffsim.training import distributed
+from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, export_policy, load_policy
+from diffsim.training.errors import fail
+from diffsim.training.evaluation import Evaluation, evaluate
+from diffsim.training.flags import (
+    Count,
+    Decay,
+    Finite,
+    Flags,
+    Fraction,
+    Natural,
+    NonNegative,
+    ParallelFlags,
+    Positive,
+    Widths,
+    parse,
+    parse_penalty,
+)
+from diffsim.training.normalizer import ObsNormalizer, moments
+from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.run import Run, episode_metrics, evaluate_checkpoint, make_policy_env
+
+__all__ = [
+    "ClippedAdam",
+    "Count",
+    "Decay",
+    "Evaluation",
+    "Finite",
+    "Flags",
+    "Fraction",
+    "Learner",
+    "Natural",
+    "NonNegative",
+    "ObsNormalizer",
+    "ParallelFlags",
+    "Positive",
+    "Run",
+    "SavedPolicy",
+    "Stateful",
+    "Widths",
+    "distributed",
+    "episode_metrics",
+    "evaluate",
+    "evaluate_checkpoint",
+    "export_policy",
+    "fail",
+    "load_policy",
+    "make_policy_env",
+    "moments",
+    "parse",
+    "parse_penalty",
+]

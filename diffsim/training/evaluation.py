@@ -1,0 +1,116 @@
+"""Evaluate a policy: the first episode of each of many fresh environments."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffsim import render
+from diffsim.env import DiffEnv
+from diffsim.scene import Scene
+
+SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
+
+
+@dataclass
+class Evaluation:
+    """One episode each of n environments.
+
+    Attributes:
+        returns: (n,) undiscounted.
+        lengths: (n,) control steps.
+        speed: mean forward speed, m/s; None for a robot that does not travel.
+        qpos: (T, n, nq) before each step; valid up to an episode's length.
+        action: (T, n, nu) of each step.
+        scene, control_dt: what the episodes are of, to draw them.
+        others: what else a script measured, by name.
+    """
+
+    returns: Tensor
+    lengths: Tensor
+    speed: float | None
+    qpos: Tensor
+    action: Tensor
+    scene: Scene
+    control_dt: float
+    others: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def length(self) -> float:
+        return self.lengths.float().mean().item()
+
+    def scalars(self) -> dict[str, float]:
+        values = {"eval/return": self.returns.median().item(), "eval/length": self.length}
+        values |= {} if self.speed is None else {"eval/speed": self.speed}
+        return values | {f"eval/{name}": value for name, value in self.others.items()}
+
+    def __str__(self) -> str:
+        r = self.returns
+        speed = "" if self.speed is None else f", forward speed {self.speed:.2f} m/s"
+        spread = f"mean {r.mean():.1f}, std {r.std(correction=0):.1f}, min {r.min():.1f}"
+        others = "".join(f", {name.replace('_', ' ')} {value:.2f}" for name, value in self.others.items())
+        return f"return median {r.median():.1f}, {spread}, length {self.length:.1f}{speed}{others}"
+
+    def write_json(self, path: Path, settings: Mapping[str, Any]) -> None:
+        """Write the scalars, every episode's return and length, and what they were measured with."""
+        values = {
+            "return": self.returns.median().item(),
+            "length": self.length,
+            "speed": self.speed,
+            **self.others,
+            "returns": self.returns.tolist(),
+            "lengths": self.lengths.tolist(),
+            "settings": dict(settings),
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(values, indent=2, default=str) + "\n")
+
+    def median_episode(self, seconds: float = render.VIDEO_SECONDS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """qpos (T, nq) and action (T, nu) of the first seconds of the episode of median return."""
+        episode = self.returns.argsort()[(len(self.returns) - 1) // 2]
+        steps = min(int(self.lengths[episode]), max(1, round(seconds / self.control_dt)))
+        return self.qpos[:steps, episode].cpu().numpy(), self.action[:steps, episode].cpu().numpy()
+
+    def save_video(self, path: Path) -> Path:
+        """Film the first 10 s of the episode of median return, as .mp4 or .gif; returns the file.
+
+        Raises:
+            OSError, RuntimeError: what is missing to draw or to write, see render.film.
+        """
+        qpos, action = self.median_episode()
+        return render.film(path, self.scene, qpos, self.control_dt, action)
+
+
+def travels(scene: Scene) -> bool:
+    """Whether a ground or a fluid carries the robot, whose first coordinate is then its x."""
+    return bool(scene.features & {"contact", "drag"})
+
+
+@torch.no_grad()
+def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED) -> Evaluation:
+    """The first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu)."""
+    obs, _ = env.reset(seed=seed)
+    alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+    returns, lengths = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long)
+    qpos, actions = [], []
+    while alive.any():
+        qpos.append(env.qpos)
+        actions.append(policy(obs))
+        obs, reward, terminated, truncated, _ = env.step(actions[-1])
+        returns += torch.where(alive, reward, torch.zeros_like(reward))
+        lengths += alive
+        alive &= ~(terminated | truncated)
+    path = torch.stack(qpos)
+    speed = None
+    if travels(env.scene):
+        distance = path[..., 0].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, 0]
+        speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
+    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt)

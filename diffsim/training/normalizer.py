@@ -1,0 +1,57 @@
+"""Running mean and variance."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from diffsim.training import distributed
+
+
+class ObsNormalizer(nn.Module):
+    """Normalizes by the running mean and variance of what it has seen; constant between updates.
+
+    The statistics are buffers, so they are saved with the policy that depends on them.
+
+    Args:
+        size: numbers of an observation; None: what is normalized are scalars.
+    """
+
+    count: Tensor
+    mean: Tensor
+    var: Tensor
+    std: Tensor
+
+    def __init__(self, size: int | None = None) -> None:
+        super().__init__()
+        self.size = size
+        shape = () if size is None else (size,)
+        self.register_buffer("count", torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
+        self.register_buffer("mean", torch.zeros(shape))
+        self.register_buffer("var", torch.ones(shape))
+        self.register_buffer("std", torch.ones(shape))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self.mean) / self.std
+
+    def inverse(self, x: Tensor) -> Tensor:
+        return x * self.std + self.mean
+
+    @torch.no_grad()
+    def update(self, x: Tensor) -> None:
+        """Adds x (..., size) or (...) of all ranks to the statistics (Chan et al.'s parallel variance)."""
+        x = x.reshape(-1, *self.mean.shape)
+        var, mean = moments(x)
+        new = len(x) * distributed.size()
+        total, delta = self.count + new, mean - self.mean
+        self.var.copy_((self.var * self.count + var * new + delta**2 * self.count * new / total) / total)
+        self.mean.add_(delta * new / total)
+        self.count.copy_(total)
+        self.std.copy_((self.var + 1e-5).sqrt())
+
+
+def moments(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Variance and mean of x (B, ...) over the B of all ranks."""
+    var, own = torch.var_mean(x, dim=0, correction=0)
+    mean = distributed.average(own.clone())
+    return distributed.average(var + (own - mean) ** 2), mean

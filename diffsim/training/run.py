@@ -1,0 +1,434 @@
+"""One training run: its directory and schedule, its log, written without waiting for the device, its checkpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+import diffsim
+from diffsim.env import DiffEnv
+from diffsim.simulator import check_device
+from diffsim.training import checkpoint, distributed, graph
+from diffsim.training.checkpoint import Learner, SavedPolicy
+from diffsim.training.errors import fail
+from diffsim.training.evaluation import Evaluation, evaluate
+from diffsim.training.flags import Args, Flags, ParallelFlags, parse_penalty
+from diffsim.training.progress import EpisodeStatistics, ProgressLog
+
+L = TypeVar("L", bound=Learner)
+Metrics = dict[str, Tensor]
+
+EPISODES = ("episodes/count", "episodes/return", "episodes/length")  # sums of an iteration, see episode_metrics
+TOTALS = ("sim/nonfinite", "sim/nonfinite_gradients")  # counts of an iteration, logged as running totals
+RANK_SEED = 1_000_003  # between the seeds of two ranks
+
+
+def episode_metrics(env: DiffEnv, done: Tensor, episode: Mapping[str, Tensor], nonfinite: Tensor) -> Metrics:
+    """What `Run` makes episode statistics of: sums over a window of (H, N) steps.
+
+    Args:
+        done: which steps ended an episode.
+        episode: "r" and "l", return and length of the episode so far, as in the info of DiffEnv.step.
+        nonfinite: which steps left the finite numbers.
+    """
+    sums = (done.sum(), (done * episode["r"]).sum(), (done * episode["l"]).sum())
+    gradients = env.sim.nonfinite_gradients.sum()
+    env.sim.nonfinite_gradients.zero_()
+    return dict(zip(EPISODES, sums, strict=True)) | dict(zip(TOTALS, (nonfinite.sum(), gradients), strict=True))
+
+
+class Mark:
+    """A moment in a device's work; a GPU is not waited for until someone asks."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.time, self.event = time.perf_counter(), None
+        if device.type == "cuda":
+            self.event = torch.cuda.Event(enable_timing=True)
+            self.event.record(torch.cuda.current_stream(device))
+
+    def wait(self) -> None:
+        if self.event is not None:
+            self.event.synchronize()
+
+    def since(self, earlier: Mark) -> float:
+        """Seconds from an earlier mark to this one, which must have been waited for."""
+        if self.event is not None and earlier.event is not None:
+            return earlier.event.elapsed_time(self.event) / 1e3
+        return self.time - earlier.time
+
+
+@dataclass
+class Entry:
+    """An iteration that is not written yet: the device may still work on it."""
+
+    iteration: int
+    control_steps: int
+    names: list[str]
+    numbers: Tensor  # of the names, then how many signals have arrived
+    scalars: dict[str, float]  # that are known already
+    begin: Mark
+    end: Mark
+    timings: list[tuple[str, Mark, Mark]] = field(default_factory=list)
+    evaluation: Evaluation | None = None
+
+
+def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> DiffEnv:
+    """The task as the flags ask for it; what is wrong with them ends the script."""
+    try:
+        return diffsim.make(
+            args.env,
+            num_envs,
+            args.device,
+            seed,
+            horizon,
+            substeps=args.substeps,
+            integrator=args.integrator,
+            theta=args.theta,
+            penalty=parse_penalty(args.penalty),
+            threads=args.threads or None,
+        )
+    except ValueError as error:
+        fail(error)
+
+
+def make_policy_env(saved: SavedPolicy, num_envs: int, **changes: Any) -> DiffEnv:
+    """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
+    names = {field.name for field in dataclasses.fields(Flags)} & saved.args.keys()
+    args = Flags(**{name: saved.args[name] for name in names} | {"device": "cpu", "threads": 0} | changes)
+    return make_env(args, num_envs)
+
+
+def check_writable(directory: Path) -> None:
+    """End the script if nothing can be written to a directory, which need not exist; leaves nothing behind."""
+    try:
+        existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        fail(f"cannot write to run directory {directory}: {error.strerror}")
+
+
+def evaluate_checkpoint(
+    args: Args,
+    learner: Callable[[Args, DiffEnv], L] | None = None,
+    method: Callable[[L], Evaluation] | None = None,
+) -> None:
+    """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video.
+
+    Args:
+        args: the script's arguments.
+        learner, method: how a restored learner is evaluated, if not by `evaluate` of its policy.
+    """
+    assert args.evaluate and args.run_dir
+    check_writable(args.run_dir)
+    torch.set_num_threads(1)
+    env, state = make_env(args, args.eval_episodes), checkpoint.load(args.evaluate, args.script())
+    if learner and method:
+        restored = learner(args, env)
+        checkpoint.restore(restored, state)
+        evaluation = method(restored)
+    else:
+        evaluation = evaluate(env, checkpoint.load_policy(args.evaluate).network.to(env.device))
+    print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
+    write_evaluation(args, evaluation, state["iteration"])
+
+
+def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int) -> None:
+    """evaluation.json and, if asked for, the video, in the run's directory."""
+    assert args.run_dir
+    names = ("env", "integrator", "substeps", "theta", "penalty", "device", "eval_episodes")
+    settings = {name: getattr(args, name) for name in names}
+    evaluation.write_json(args.run_dir / "evaluation.json", settings | dict(script=args.script(), iteration=iteration))
+    if args.capture_video:
+        try:
+            print(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
+        except (OSError, RuntimeError) as error:
+            fail(error)
+
+
+class Run:
+    """Iterate over it: it yields the number of each iteration, and evaluates, saves and stops when due.
+
+    `log` neither waits for the device nor writes: on a GPU an iteration is written while the next one is computed. Of
+    several ranks only the first writes anything.
+
+    Args:
+        args: the script's arguments, complete. Random numbers are seeded by args.seed here.
+
+    Attributes:
+        iteration: the present one.
+        directory: where it writes.
+        device: where it computes.
+    """
+
+    def __init__(self, args: Flags) -> None:
+        assert args.run_dir
+        self.args, self.directory = args, args.run_dir
+        self.writes = distributed.rank() == 0
+        self._state = checkpoint.load(args.resume, args.script()) if args.resume else None
+        if self.writes:
+            self._check_directory()
+        try:
+            self.device = check_device(args.device)
+        except ValueError as error:
+            fail(error)
+        distributed.initialize(self.device)
+        torch.set_num_threads(1)  # operations this small gain little from more; idle threads disturb the simulator's
+        torch.manual_seed(args.seed)
+        self.iteration, self.seconds, self.control_steps = 0, 0.0, 0
+        self.last = min(args.iterations, args.stop_after or args.iterations)
+        self._totals, self._episodes = dict.fromkeys(TOTALS, 0), EpisodeStatistics()
+        self._env: DiffEnv | None = None
+        self._samples = 0  # control steps of an iteration, of all ranks
+        self._learner: Learner | None = None
+        self._log: ProgressLog | None = None
+        self._pending: deque[Entry] = deque()
+        self._timings: list[tuple[str, Mark, Mark]] = []
+        self._evaluation: tuple[int, Evaluation] | None = None
+        self._scalars: dict[str, float] = {}
+        self._mark = Mark(self.device)
+        self._simulated: dict[str, float] = {}
+        self._signals: list[int] = []
+        self._handlers: dict[int, Any] = {}
+        self._stopping = False
+
+    # Setting up ------------------------------------------------------------------------------------------------------
+
+    def make_env(self, num_envs: int, horizon: int) -> DiffEnv:
+        """This rank's share of the training environments, with its own random start states."""
+        self._samples = num_envs * horizon
+        seed = self.args.seed + distributed.rank() * RANK_SEED
+        self._env = make_env(self.args, num_envs // distributed.size(), horizon, seed)
+        return self._env
+
+    def make_eval_env(self) -> DiffEnv:
+        return make_env(self.args, self.args.eval_episodes)
+
+    def restore(self, learner: L) -> L:
+        """Register the learner, which checkpoints hold from now on, and continue it if the run is resumed.
+
+        All ranks start with equal weights; from here on they draw different random numbers.
+        """
+        self._learner, rank = learner, distributed.rank()
+        if rank > 0:
+            torch.manual_seed(self.args.seed + rank * RANK_SEED)
+        if state := self._state:
+            checkpoint.restore(learner, state)
+            own = state["ranks"][rank]
+            if self._env is not None:
+                self._env.load_state_dict(own["env"])
+            self._random_numbers().set_state(own["rng"])
+            self.iteration, self.seconds, self.control_steps = (
+                state[name] for name in ("iteration", "seconds", "control_steps")
+            )
+            self._totals |= state["totals"]
+            self._episodes.windows.extend(state["episodes"])
+        return learner
+
+    def capture(self, function: Callable[[], Metrics], env: DiffEnv | None = None) -> Callable[[], Metrics]:
+        """Half an iteration, timed as time/{name}; on a GPU its calls replay one CUDA graph. See graph.capture."""
+        graphs = isinstance(self.args, ParallelFlags) and self.args.cuda_graph
+        call = graph.capture(function, self.device, env) if graphs else function
+
+        def timed() -> Metrics:
+            begin = Mark(self.device)
+            metrics = call()
+            self._timings.append((f"time/{function.__name__}", begin, Mark(self.device)))
+            return metrics
+
+        return timed
+
+    # Iterating -------------------------------------------------------------------------------------------------------
+
+    @property
+    def evaluation_due(self) -> bool:
+        """Whether this iteration ends with an evaluation, on the rank that evaluates."""
+        return self.writes and self._evaluates()
+
+    def _evaluates(self) -> bool:
+        every = self.args.eval_every
+        return self.iteration == self.args.iterations or (every > 0 and self.iteration % every == 0)
+
+    def __iter__(self) -> Iterator[int]:
+        self._open()
+        self._start_clock()
+        try:
+            while self.iteration < self.last and not self._stopping:
+                self.iteration += 1
+                yield self.iteration
+                self._end_iteration()
+        finally:
+            self._close()
+        self._summarise()
+        if self._signals:
+            sys.exit(128 + self._signals[0])
+
+    def log(self, metrics: Mapping[str, Tensor | float], control_steps: int | None = None) -> None:
+        """Take an iteration's metrics: () tensors, averaged over the ranks, and numbers.
+
+        Args:
+            metrics: by their names in tensorboard; those of `episode_metrics` become episode statistics and totals.
+            control_steps: of experience so far; by default every iteration has a window of all environments.
+        """
+        self._open()
+        names = [name for name, value in metrics.items() if isinstance(value, Tensor)]
+        tensors = [value.detach() for value in metrics.values() if isinstance(value, Tensor)]
+        numbers = torch.stack([*tensors, torch.full((), float(len(self._signals)), device=self.device)])
+        numbers = distributed.average(numbers).to("cpu", non_blocking=True)
+        scalars = {name: float(value) for name, value in metrics.items() if not isinstance(value, Tensor)}
+        if self._env is not None and self.device.type == "cpu":
+            for kernel, seconds in self._env.sim.seconds.items():
+                scalars[f"time/sim_{kernel}"] = seconds - self._simulated[kernel]
+        steps = self.iteration * self._samples if control_steps is None else control_steps
+        begin, end = self._mark, Mark(self.device)
+        self._pending.append(Entry(self.iteration, steps, names, numbers, scalars, begin, end, self._timings))
+        self._start_clock(end)
+
+    def log_evaluation(self, evaluation: Evaluation) -> None:
+        """Take the evaluation of the iteration that was logged last."""
+        entry = self._pending[-1]
+        entry.evaluation = evaluation
+        entry.scalars |= evaluation.scalars()
+        self._evaluation = self.iteration, evaluation
+
+    def message(self, text: str) -> None:
+        """Print a line above the progress bar, unless --quiet."""
+        if self._log is not None:
+            self._log.message(text)
+        elif self.writes and not self.args.quiet:
+            print(text, flush=True)
+
+    def _start_clock(self, mark: Mark | None = None) -> None:
+        self._mark, self._timings = mark or Mark(self.device), []
+        if self._env is not None:
+            self._simulated = dict(self._env.sim.seconds)
+
+    def _end_iteration(self) -> None:
+        every = self.args.save_every
+        saving = self.iteration == self.last or (every > 0 and self.iteration % every == 0)
+        behind = int(self.device.type == "cuda")  # the GPU works on this iteration while the one before is written
+        while self._pending and (len(self._pending) > behind or self._evaluates() or saving or self._stopping):
+            self._write(self._pending.popleft())
+        if saving or self._stopping:
+            self._save()
+        if saving or self._evaluates():
+            self._start_clock()
+
+    def _write(self, entry: Entry) -> None:
+        """Write an iteration that the device has finished."""
+        entry.end.wait()
+        ranks, (*numbers, signals) = distributed.size(), entry.numbers.tolist()
+        self._stopping = self._stopping or signals > 0
+        seconds, steps = entry.end.since(entry.begin), entry.control_steps - self.control_steps
+        self.seconds, self.control_steps = self.seconds + seconds, entry.control_steps
+        scalars = dict(zip(entry.names, numbers, strict=True)) | entry.scalars
+        if EPISODES[0] in scalars:
+            self._episodes.add(*(ranks * scalars.pop(name) for name in EPISODES))
+            for name in TOTALS:
+                self._totals[name] += round(ranks * scalars[name])
+                scalars[name] = self._totals[name]
+            if self._episodes.windows:
+                scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
+        scalars |= {"charts/SPS": steps / seconds, "time/total": seconds}
+        scalars |= {name: end.since(begin) for name, begin, end in entry.timings}
+        self._scalars = scalars
+        if entry.evaluation is not None:
+            self.message(f"iteration {entry.iteration}: {entry.evaluation}")
+        if self._log is not None:
+            self._log.write(entry.iteration, entry.control_steps, self.seconds, scalars)
+
+    # Files and signals -----------------------------------------------------------------------------------------------
+
+    def _check_directory(self) -> None:
+        """That a run can be written there; leaves nothing behind."""
+        path, args = self.directory, self.args
+        existing = path / "checkpoint.pt"
+        if existing.exists() and (args.resume is None or not args.resume.samefile(existing)):
+            fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
+        check_writable(path)
+        if args.track:
+            try:
+                import wandb  # noqa: F401
+            except ImportError:
+                fail("--track needs Weights & Biases: pip install wandb")
+
+    def _open(self) -> None:
+        """Begin to write and to receive signals, once."""
+        if self._handlers:
+            return
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._handlers[number] = signal.signal(number, self._receive)
+        if not self.writes:
+            return
+        self.directory.mkdir(parents=True, exist_ok=True)
+        arguments = dataclasses.asdict(self.args)
+        (self.directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
+        if self.args.track:
+            import wandb
+
+            options = dict(name=self.directory.name, dir=self.directory, config=arguments, sync_tensorboard=True)
+            wandb.init(project="diffsim", **options)
+        start = self.directory, self.iteration, self.control_steps
+        self._log = ProgressLog(*start, arguments, self.args.iterations, self.args.quiet)
+
+    def _receive(self, number: int, _frame: FrameType | None) -> None:
+        """Stop after the present iteration; the same signal a second time has its usual effect."""
+        self._signals.append(number)
+        signal.signal(number, self._handlers[number])
+
+    def _random_numbers(self) -> torch.Generator:
+        return (
+            torch.cuda.default_generators[self.device.index] if self.device.type == "cuda" else torch.default_generator
+        )
+
+    def _save(self) -> None:
+        assert self._learner is not None
+        env = self._env.state_dict() if self._env is not None else None
+        ranks = distributed.gather({"env": env, "rng": self._random_numbers().get_state()})
+        if not self.writes:
+            return
+        args = {k: None if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.args).items()}
+        args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
+        state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
+        state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
+        checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
+
+    def _close(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        if self._log is not None:
+            self._log.close()
+        distributed.finalize()
+
+    def _summarise(self) -> None:
+        if not self.writes:
+            return
+        args, path = self.args, self.directory
+        print(
+            f"{args.env}: {self.iteration} iterations, {self.control_steps:,} control steps, "
+            f"{self.seconds:.1f} s of training"
+        )
+        if "grad/skipped" in self._scalars:
+            states, gradients = (self._totals[name] for name in TOTALS)
+            skipped = int(self._scalars["grad/skipped"])
+            print(f"skipped {skipped} updates, contained {states} non-finite states and {gradients} gradients")
+        if self._evaluation:
+            iteration, evaluation = self._evaluation
+            print(f"evaluation of iteration {iteration}, {args.eval_episodes} episodes: {evaluation}")
+        print(f"written to {path}")
+        if self.iteration < args.iterations:
+            print(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} goes on")
+        elif self._evaluation:
+            write_evaluation(args, self._evaluation[1], self.iteration)

@@ -1,0 +1,81 @@
+"""benchmarks/gps_experiments.py on a small run."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import gps_experiments as experiments
+import numpy as np
+import pytest
+import torch
+from learners import run
+from tables import read_csv
+
+import bptt
+import diffsim
+import gps
+
+SMALL = (
+    "--env cartpole --horizon 12 --restarts 2 --screening 2 --ilqr-iterations 10 --pretraining 20 --gate 1 --hidden 8 "
+    "--pretraining-samples 8 --guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 1 "
+    "--lbfgs-iterations 3 --eval-episodes 2 --quiet"
+).split()
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs")
+    run(gps, directory / "cartpole__full__1", *SMALL)
+    return directory
+
+
+def test_tables_and_pictures(runs: Path, tmp_path: Path) -> None:
+    """Of a run; a second time from the tables alone."""
+    docs, results = tmp_path / "docs", tmp_path / "results"
+    options = ["--results", str(results), "--docs", str(docs), "--count", "4", "--draw-only"]
+    experiments.main([*options, "--runs", str(runs)])
+    rows = read_csv(results / "gps_generalisation.csv")
+    assert {row["controller"] for row in rows} == {"policy", "ddp", "tbdp"}
+    plan = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt").plan_return
+    ddp = next(row for row in rows if row["controller"] == "ddp" and float(row["size"]) == 0)
+    assert float(ddp["mean"]) == pytest.approx(plan, rel=1e-9)  # unperturbed, it repeats the plan
+    assert "| cartpole | full | 1 | 12 |" in (docs / "gps.md").read_text()
+    before = {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
+    experiments.main([*options, "--runs", str(tmp_path / "nowhere")])
+    assert before == {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
+    assert len(list((docs / "figures").glob("gps_*.png"))) == 3
+
+
+def test_nearest_controller_acts_by_the_nearest_state(runs: Path) -> None:
+    search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
+    guide, act = search.guides[0], experiments.controllers(search)
+    torch.testing.assert_close(act["tbdp"](0, guide.x[8:9]), guide.u[8:9])
+    torch.testing.assert_close(act["ddp"](8, guide.x[8:9]), guide.u[8:9])
+    assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
+
+
+def test_a_finished_run_is_kept(runs: Path) -> None:
+    before = (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns
+    assert experiments.train(runs / "cartpole__full__1", []) == "cartpole__full__1: done before"
+    assert (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns == before
+
+
+def test_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the policy of another script does, without a reset: a demonstration for gps.py."""
+    run(bptt, tmp_path, *"--env cartpole --num-envs 2 --iterations 1 --eval-episodes 1 --substeps 2 --quiet".split())
+    path, actor = tmp_path / "demo.npz", tmp_path / "checkpoint.pt"
+    experiments.main(["--record", str(path), "--actor", str(actor), "--steps", "250"])
+    data = np.load(path)
+    assert data["qpos"].shape == (251, 2) and np.abs(np.diff(data["qpos"], axis=0)).max() < 1  # no reset
+    qpos, qvel, action = (torch.tensor(data[name]) for name in ("qpos", "qvel", "action"))
+    sim = diffsim.make("cartpole", 250, substeps=2).sim
+    for value, expected in zip(sim.step(qpos[:-1], qvel[:-1], action), (qpos[1:], qvel[1:]), strict=True):
+        torch.testing.assert_close(value, expected)
+    search = run(gps, tmp_path / "gps", *SMALL, "--demonstration", path)["modules"]["search"]
+    assert search["guides"][0][0][0].tolist() == [*data["qpos"][0], *data["qvel"][0]]
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["gps_experiments.py"])
+    with pytest.raises(SystemExit) as exit:
+        experiments.main(["--record", str(path)])
+    assert exit.value.code == 2 and "--record needs --actor" in capsys.readouterr().err

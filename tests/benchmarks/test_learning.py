@@ -1,0 +1,98 @@
+"""The benchmark of learning: what it reads off the curves, and that an interrupted call goes on."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import common
+import learning
+import numpy as np
+import pytest
+import runner
+
+from diffsim.training import checkpoint
+
+
+def write_run(folder: Path, returns: np.ndarray, steps: int, seconds: float, finished: bool = True) -> None:
+    """A run whose k-th iteration ends after k * steps control steps and k * seconds; its first has no episode's end."""
+    folder.mkdir(parents=True)
+    rows = [
+        dict(iteration=k, control_steps=k * steps, seconds=k * seconds, length=1000, eval_return="")
+        | {"return": value if k > 1 else ""}
+        for k, value in enumerate(returns, start=1)
+    ]
+    if finished:
+        rows[-1]["eval_return"] = returns[-1] + 100
+        settings = dict(iteration=len(rows), integrator="semi_implicit", substeps=16)
+        for path, value in ((folder, returns[-1] + 100), (folder / "explicit_64", returns[-1])):
+            path.mkdir(exist_ok=True)
+            found = {"return": value, "speed": 6.5, "lengths": [1000, 400], "settings": settings}
+            (path / "evaluation.json").write_text(json.dumps(found))
+    with (folder / "progress.csv").open("w") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SHAC passes 5,000 at iteration 501, PPO at 2,501 of ten times the steps; BPTT never, and has not finished."""
+    runs, output = tmp_path / "runs", tmp_path / "results" / "cpu"
+    monkeypatch.setattr(common, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(common, "DOCS", tmp_path)
+    (tmp_path / "experiments.md").write_text("<!-- comparison -->\n<!-- /comparison -->\n")
+    for seed in (1, 2):
+        write_run(runs / "shac" / f"ant__{seed}", np.arange(0, 7000, 10.0), 2048, 0.5)
+        write_run(runs / "ppo_baseline" / f"ant__{seed}", np.arange(0, 6000, 2.0), 20480, 0.05)
+    write_run(runs / "bptt" / "ant__1", np.arange(300.0), 4096, 0.5, finished=False)
+    args = learning.Args(experiment="comparison", env=("ant",), runs=runs, output=output, draw_only=True)
+    learning.main(args)
+    _, learners, tasks = learning.EXPERIMENTS["comparison"]
+    rows = {row["learner"]: {k: str(v) for k, v in row.items()} for row in learning.table(args, learners, tasks)}
+    shac, ppo, bptt = (rows[learner] for learner in ("shac", "ppo_baseline", "bptt"))
+    assert shac["s to target"] == "250" and float(shac["steps to target"][:-2]) == pytest.approx(
+        501 * 2048e-6, rel=1e-2
+    )
+    assert ppo["s to target"] == "125" and float(ppo["steps to target"][:-2]) == pytest.approx(
+        2501 * 20480e-6, rel=1e-2
+    )
+    assert bptt["s to target"] == bptt["steps to target"] == "never" and bptt["last evaluation"] == ""
+    assert ppo["best return of training"] == "5998 ± 0" and ppo["published"] == "6605"
+    assert bptt["best return of training"] == "299" and bptt["seeds"] == "1"
+    assert "| ppo_baseline | 2 | 5998 ± 0 |" in (tmp_path / "experiments.md").read_text()
+    for path in (tmp_path / "figures" / "comparison.png", output / "bptt_ant.csv", output / "learning.csv"):
+        assert path.stat().st_size > 0
+    summary = {row["learner"]: row for row in args.read("learning")}
+    assert list(summary) == ["shac", "ppo_baseline"]  # of finished runs
+    shac = summary["shac"]
+    assert (shac["seeds"], shac["iterations"], shac["training (s)"]) == ("1 2", "700", "350")
+    assert (shac["return"], shac["explicit, substeps x4"], shac["in the reference"]) == ("7090", "6990", "6990")
+    assert (shac["kept"], shac["falls per episode"]) == ("0.986", "0.50 0.50")
+    assert shac["return passes"] == "5000 after 250 s; 7300 not; 7661 not"
+
+
+def test_a_return_that_some_seeds_pass() -> None:
+    assert runner.words(5000, [100.0, 120.0, np.inf]) == "5000 after 120 s"
+    assert runner.words(5000, [np.inf, 120.0, np.inf]) == "5000 by 1 of 3, after 120 s"
+
+
+def test_a_stopped_call_goes_on_where_it_was(tmp_path: Path) -> None:
+    places = dict(runs=tmp_path, output=tmp_path / "results", device="cpu")
+    flags = "--num-envs", "2", "--horizon", "8", "--eval-every", "0", "--eval-episodes", "1", "--iterations"
+    folder = tmp_path / "bptt" / "cartpole__1"
+    case = runner.Case(folder, "cartpole", 1, "bptt")
+    for limit in (10.0, 20.0, 40.0, 80.0):  # until the script has begun before its time is up
+        args = learning.Args(**places, time_limit=limit, arguments=(*flags, "100000"))
+        assert not runner.Runner(args).train(case)
+        if (folder / "checkpoint.pt").is_file():
+            break
+    done = checkpoint.load(folder / "checkpoint.pt")["iteration"]
+    assert 0 < done < 100000 and not (folder / "evaluation.json").exists()
+    args = learning.Args(algorithm="bptt", env=("cartpole",), seeds=(1,), device="cpu", runs=tmp_path, output=tmp_path)
+    args.arguments = (*flags, str(done + 30))
+    learning.main(args)
+    assert [int(row["iteration"]) for row in learning.read_csv(folder / "progress.csv")] == list(range(1, done + 31))
+    (row,) = args.read("learning")
+    assert row["substeps"] == "4" and row["iterations"] == str(done + 30) and float(row["return"]) < 0
+    assert runner.evaluation(folder / "explicit_16")["settings"]["substeps"] == 16

@@ -1,0 +1,72 @@
+"""What the benchmarks write: rows that say where they come from, and the marked parts of pages."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import common
+import pytest
+import tables
+
+
+def test_rows_replace_those_of_their_key_and_origins_those_of_their_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.csv"
+    for flags, rows in (
+        (["--first"], [{"task": "ant", "us": 1.0, "error": 0.5}, {"task": "hopper", "us": 2.0, "error": 0.25}]),
+        (["--second", "one two"], [{"task": "ant", "us": 1234.56}]),
+        (["--second", "one two"], [{"task": "ant", "us": 3.0}]),
+    ):
+        monkeypatch.setattr(sys, "argv", ["speed.py", *flags])
+        tables.origin.cache_clear()
+        tables.merge_csv(path, rows, ("task",))
+    tables.origin.cache_clear()
+    assert tables.read_csv(path) == [
+        {"task": "ant", "us": "3", "error": "0.5"},
+        {"task": "hopper", "us": "2", "error": "0.25"},
+    ]
+    first, second = tables.origins(path)
+    assert first.endswith("speed.py --first\n") and second.endswith("speed.py --second 'one two'\n")
+    assert first.startswith("# ") and "; python 3." in first and "torch " in first and "; revision " in first
+
+
+def test_only_its_own_part_of_a_page_is_filled(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- a -->\nold\n<!-- /a -->\nbetween\n<!-- b -->\n<!-- /b -->\nafter\n")
+    for name, text in (("a", "new\n"), ("b", "b\n"), ("a", "newer\n"), ("c", "c\n")):
+        tables.fill(page, name, text)
+    parts = "before\n<!-- a -->\nnewer\n<!-- /a -->\nbetween\n<!-- b -->\nb\n<!-- /b -->\nafter\n"
+    assert page.read_text() == parts + "<!-- c -->\nc\n<!-- /c -->\n"
+
+
+def test_results_of_a_gpu_have_places_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda _: "NVIDIA H100 80GB HBM3")
+    gpu, cpu, elsewhere = (
+        common.CommonFlags(device="cuda:0"),
+        common.CommonFlags(),
+        common.CommonFlags(output=Path("/elsewhere")),
+    )
+    assert gpu.csv("speed") == common.RESULTS / "h100" / "speed.csv" and gpu.link("speed") == "figures/h100/speed.png"
+    assert cpu.csv("speed") == common.RESULTS / "cpu" / "speed.csv" and cpu.link("speed") == "figures/speed.png"
+    assert elsewhere.picture("speed") == Path("/elsewhere/speed.png")
+
+
+def test_every_result_says_where_it_comes_from() -> None:
+    paths = list(common.RESULTS.glob("*/*.csv"))
+    assert paths and all(len(line.split("; ")) == 4 for path in paths for line in tables.origins(path))
+    assert all(tables.origins(path) and tables.read_csv(path) for path in paths)
+
+
+def test_without_matplotlib_one_line_says_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    common.can_draw.cache_clear()
+    for _ in range(2):
+        common.plot(tmp_path / "a.png", [[common.Panel([common.Line([1], [1])])]])
+    common.can_draw.cache_clear()
+    assert capsys.readouterr().err == "pictures need matplotlib: pip install -e '.[test]'\n"
+    assert not list(tmp_path.iterdir())

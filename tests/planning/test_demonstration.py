@@ -1,0 +1,56 @@
+"""Recorded trajectories: what is read, what is refused, and how a system follows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from systems import normal, task_system
+
+from diffsim.planning import follow_demonstration, load_demonstration
+
+
+def write(path: Path, steps: int, **changes: np.ndarray) -> Path:
+    arrays = dict(qpos=np.zeros((steps + 1, 2)), qvel=np.ones((steps + 1, 2)), action=np.full((steps, 1), 0.5))
+    np.savez(path, **arrays | changes)
+    return path
+
+
+def test_reading(tmp_path: Path) -> None:
+    x, u = load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 9), 6)
+    assert x.tolist() == [[0.0, 0.0, 1.0, 1.0]] * 7
+    torch.testing.assert_close(torch.tanh(u), torch.full((6, 1), 0.5).double())
+    bounds = np.array([[1.0], [-1.0]])  # whose atanh is infinite
+    u = load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 2, action=bounds), 2)[1]
+    torch.testing.assert_close(torch.tanh(u), torch.tensor([[0.995], [-0.995]]).double())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"qpos": np.zeros((9, 2))}, r"qpos has shape \(9, 2\), must be at least \(10, 2\) for 9 steps"),
+        ({"qvel": np.zeros((20, 3))}, r"qvel has shape \(20, 3\), must be at least \(10, 2\)"),
+        ({"qpos": np.full((20, 2), np.nan)}, "qpos holds numbers that are not finite"),
+        ({"action": np.array(["a"], dtype=object)}, "is not an .npz with qpos, qvel and action"),
+    ],
+)
+def test_refusals(changes: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 9, **changes), 9)
+
+
+def test_a_controller_brings_the_system_along(rng: np.random.Generator) -> None:
+    """What the system can do it repeats; of what it cannot it makes a trajectory of its own nearby."""
+    system = task_system("cartpole")
+    actions = 0.2 * normal(rng, 20, 1)
+    x, u, _ = system.rollout(system.start(), 20, lambda t, _: actions[t : t + 1])
+    same_x, same_u = follow_demonstration(system, x[0], u[0], 1.0)
+    torch.testing.assert_close(same_x, x)
+    torch.testing.assert_close(same_u, u)
+    shaken = x[0] + 0.01 * normal(rng, 21, 4)
+    own, own_u = follow_demonstration(system, shaken, u[0], 1.0)
+    torch.testing.assert_close(own, system.rollout(shaken[:1], 20, lambda t, _: own_u[:, t])[0])
+    open_loop = system.rollout(shaken[:1], 20, lambda t, _: actions[t : t + 1])[0]
+    assert (own - shaken).norm() < (open_loop - shaken).norm()

@@ -1,0 +1,92 @@
+"""What `python -m diffsim check` says of a file, and what a scene says of itself."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+from scenes import parse, pendulum, robot, task_scene, tendon
+
+from diffsim.__main__ import main
+from diffsim.check import report
+from diffsim.tasks import TASKS
+
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+
+
+def test_report_of_a_robot():
+    text, fits = report(ASSETS / "hopper.xml")
+    assert fits
+    for line in (
+        "hopper: can be simulated",
+        "  links      6 of one degree of freedom, base fixed",
+        "  joints     2 slide, 4 hinge; 3 limited",
+        "  controls   3 motors",
+        "  contact    6 points, ground at z = 0 m",
+        "default: mass, shared by 4 contact points, and solref",
+        "  - The robot's parts pass through each other: 3 pairs of geoms, such as 'torso_geom' and 'leg_geom'",
+        "  - One coefficient of friction, 2, serves all geoms; the file has 1 to 2.",
+    ):
+        assert line in text
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_names_its_constants(name):
+    scene = task_scene(name)
+    text, fits = report(scene.path)
+    assert fits and "the file" in text and "default" not in text
+    assert not scene.d_limit.any()
+
+
+def test_command(tmp_path, capsys):
+    good, bad = ASSETS / "ant.xml", ASSETS / "pusher_v5.xml"
+    for path, code in ((good, 0), (tmp_path / "nowhere.xml", 1), (bad, 1)):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as exit:
+            main(["check", str(path)])
+        printed = capsys.readouterr().out
+        assert exit.value.code == code and ("ant: can be simulated" in printed) == (path == good)
+    assert printed.startswith("Cannot be simulated.") and "geom number 18 of body 'object': only spheres" in printed
+    done = subprocess.run([sys.executable, "-m", "diffsim", "check", str(bad)], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (1, printed)
+
+
+@pytest.mark.parametrize(
+    "mjcf, sentence",
+    [
+        (pendulum(rest='<actuator><motor name="m" joint="hinge"/></actuator>'), "actuators without ctrlrange: 'm'."),
+        (pendulum(inside='<geom size="0.1" margin="0.2"/>'), "not at their margin of up to 0.2 m."),
+        (pendulum('range="-1 1" margin="0.1"'), "not at their margin of up to 0.1."),
+        (
+            pendulum('range="-1 1" solreflimit="1e-4 1"'),
+            "faster than substeps of 1/960 s can follow is slowed down: 'hinge'.",
+        ),
+        (pendulum('axis="0 1 0" damping="1e4"'), "joint 'hinge': semi_implicit needs 20 substeps of 1/60 s"),
+        (pendulum(inside='<geom size="0.1"/><geom size="0.05"/>'), "inside others in every pose are left out: 1."),
+        (pendulum(inside='<geom size="0.1" solref="0.1 1"/>'), "One solref serves all geoms"),
+        (
+            robot('<body><freejoint/><geom size="0.1" solref="1e-3 1" priority="1"/></body>'),
+            "The ground is softer than solref asks",
+        ),
+        (
+            tendon(actuator='<muscle tendon="string" force="5" lengthrange="1 2"/>'),
+            "A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves.",
+        ),
+        (
+            robot(
+                '<body><freejoint/><geom name="a" size="0.1"/><body><joint/><geom size="0.1"/>'
+                '<body pos="0 0 1"><joint/><geom name="b" size="0.1"/></body></body></body>'
+            ),
+            "The robot's parts pass through each other: the geoms 'a' and 'b', would collide in MuJoCo.",
+        ),
+    ],
+)
+def test_approximations_are_told(mjcf, sentence):
+    assert any(sentence in told for told in parse(mjcf).approximations)
+
+
+def test_a_robot_that_meets_nothing_is_not_approximated():
+    assert parse(pendulum(world="")).approximations == ()

@@ -1,0 +1,203 @@
+"""The pages: their figures are in the csv files that they name; links, files and flags that they mention exist."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import functools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+# Tables of these pages use the column names of the csv file that the text below them names.
+CHECKED = [README, *(ROOT / "docs" / name for name in ("shac.md", "bptt.md", "ppo.md", "experiments.md"))]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+
+
+# Figures --------------------------------------------------------------------------------------------------------------
+
+
+class Table(NamedTuple):
+    header: list[str]
+    rows: list[list[str]]
+    source: Path | None  # the csv file named between the table and the next table or heading
+
+    def columns(self) -> list[str]:
+        """Those that the csv file has, too."""
+        return [name for name in self.header if self.source and name in read_csv(self.source)[0]]
+
+
+def tables(page: Path) -> Iterator[Table]:
+    parts = re.split(r"((?:^\|.*\n)+)", page.read_text(), flags=re.MULTILINE)
+    for block, text in zip(parts[1::2], parts[2::2], strict=True):
+        header, _, *rows = ([plain(cell) for cell in line.strip()[1:-1].split("|")] for line in block.splitlines())
+        below = re.split(r"^#", text, flags=re.MULTILINE)[0]
+        source = re.search(r"results/\w+/\w+\.csv", below)
+        yield Table(header, rows, ROOT / source[0] if source else None)
+
+
+def plain(cell: str) -> str:
+    """A cell without markup and thousands separators."""
+    cell = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", cell)
+    return re.sub(r"(?<=\d),(?=\d{3})", "", cell.replace("`", "").replace("*", "")).strip()
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    lines = path.read_text().splitlines()
+    return list(csv.DictReader(line for line in lines if not line.startswith("# ")))  # without where it comes from
+
+
+def same(shown: str, measured: str) -> bool:
+    try:
+        return float(shown) == float(measured)
+    except ValueError:
+        return shown == measured
+
+
+@pytest.mark.parametrize("page", CHECKED, ids=lambda page: page.stem)
+def test_tables_agree_with_the_csv_files_that_they_name(page: Path) -> None:
+    for table in tables(page):
+        if not table.source or len(columns := table.columns()) < 2:
+            continue
+        measured = read_csv(table.source)
+        for row in table.rows:
+            shown = dict(zip(table.header, row, strict=False))
+            key, *figures = columns
+            if all(shown[key] != line[key] for line in measured):  # not measured, so nothing may be claimed
+                assert not any(re.search(r"\d", shown[name]) for name in figures), f"{table.source.name} lacks {shown}"
+                continue
+            assert any(all(same(shown[c], line[c]) for c in columns) for line in measured), f"{table.source}: {shown}"
+
+
+def test_readme_has_the_return_of_every_task() -> None:
+    returns = [table for table in tables(README) if "return" in table.header]
+    assert returns
+    for table in returns:
+        assert table.source and {"task", "return", "training (s)"} <= {*table.columns()}
+        trained = {line["task"] for line in read_csv(table.source) if line["learner"] == "shac"}
+        assert trained <= {row[table.header.index("task")] for row in table.rows}
+
+
+def test_every_csv_file_says_where_it_comes_from() -> None:
+    paths = sorted((ROOT / "results").glob("*/*.csv"))
+    assert paths and not [path for path in (ROOT / "results").rglob("*") if path.is_file() and path not in paths]
+    for path in paths:
+        origin = path.read_text().splitlines()[0]
+        assert re.match(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python \w+", origin), path
+
+
+@each_page
+def test_no_spread_of_a_single_seed(page: Path) -> None:
+    assert not re.search(r"±\s*0(?![.\d])", page.read_text()), "the spread of one run is not 0: print the seed count"
+
+
+# Links and files ------------------------------------------------------------------------------------------------------
+
+
+def anchors(page: Path) -> set[str]:
+    """GitHub's names of a page's headings."""
+    names: list[str] = []
+    for heading in re.findall(r"^#+ +(.+)$", FENCE.sub("", page.read_text()), re.MULTILINE):
+        name = re.sub(r"[^\w\- ]", "", plain(heading).lower()).replace(" ", "-")
+        names.append(f"{name}-{names.count(name)}" if name in names else name)
+    return {*names}
+
+
+@each_page
+def test_relative_links_and_pictures_exist(page: Path) -> None:
+    text = re.sub(r"`[^`\n]*`", "", FENCE.sub("", page.read_text()))
+    links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r"""\b(?:src|href)=["']([^"']+)""", text)
+    for link in links:
+        if re.match(r"\w+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{page.name} links to {link}"
+        assert not anchor or anchor in anchors(target), f"{page.name}: {link} has no such heading"
+
+
+def test_what_is_where_names_files_that_exist_and_all_of_the_package() -> None:
+    (section,) = re.findall(r"^## What is where\n(.*?)(?=^## |\Z)", README.read_text(), re.MULTILINE | re.DOTALL)
+    named, folder = set(), ""
+    for line in section.splitlines():
+        names = re.findall(r"[\w.-]+(?:\.(?:py|md)\b|/)", line)
+        if names and line.startswith(names[0]):
+            folder = names[0] if names[0].endswith("/") else ""
+        for name in names:
+            found = (ROOT / name).exists() or any((ROOT / folder).glob(name)) or any((ROOT / folder).glob(f"*/{name}"))
+            assert found, f"README names {folder}{name}, which does not exist"
+        named.update(names)
+    scripts = {path.name for path in ROOT.glob("*.py")}
+    modules = {path.name for path in (ROOT / "diffsim").glob("*.py")} - {"__init__.py"}
+    packages = {f"{path.parent.name}/" for path in (ROOT / "diffsim").glob("*/__init__.py")}
+    assert scripts | modules | packages <= named, f"not in README: {sorted(scripts | modules | packages - named)}"
+
+
+# Flags ----------------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def classes(path: Path) -> dict[str, ast.ClassDef]:
+    return {node.name: node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef)}
+
+
+SHARED = classes(ROOT / "diffsim" / "training" / "flags.py")
+BENCHMARKS = [ROOT / "benchmarks" / f"{name}.py" for name in ("common", "runner", "motions")]
+SHARED |= {name: node for path in BENCHMARKS for name, node in classes(path).items()}
+SCRIPTS = [*ROOT.glob("*.py"), *ROOT.glob("benchmarks/*.py"), *ROOT.glob("tools/*.py")]
+
+
+@functools.cache
+def flags(script: Path) -> set[str]:
+    """The flags that a script takes: of the fields of its dataclass Args and of that one's bases."""
+    known = SHARED | classes(script)
+    found, todo = {"--help"}, ["Args"]
+    while todo:
+        node = known.get(todo.pop())
+        if node is None:
+            continue
+        todo += [getattr(base, "id", getattr(base, "attr", "")) for base in node.bases]
+        for field in node.body:
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                name = field.target.id.replace("_", "-")
+                aliases = [word.value for word in ast.walk(field.annotation) if isinstance(word, ast.Constant)]
+                found |= {f"--{name}", *(word for word in aliases if isinstance(word, str))}
+                if isinstance(field.annotation, ast.Name) and field.annotation.id == "bool":
+                    found.add(f"--no-{name}")
+    return found
+
+
+ANY = {flag for script in SCRIPTS for flag in flags(script)}
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """The words of every shell command and of every piece of inline code, without comments."""
+    text = page.read_text()
+    shell = "".join(code for kind, code in FENCE.findall(text) if kind == "sh").replace("\\\n", " ")
+    for code in shell.splitlines() + re.findall(r"`([^`\n]+)`", FENCE.sub("", text)):
+        for command in re.split(r"&&|;|\|", re.sub(r"(^|\s)#.*", "", code)):
+            yield command.split()
+
+
+@each_page
+def test_flags_exist(page: Path) -> None:
+    for words in commands(page):
+        scripts = [k for k, word in enumerate(words) if re.fullmatch(r"[\w./-]+\.py", word)]
+        if not scripts and not (words and words[0].startswith("--")):
+            continue  # another program's
+        own = words[scripts[0] + 1 :] if scripts else words
+        own = own[: own.index("--")] if "--" in own else own  # what follows "--" goes to another script
+        mentioned = {word.partition("=")[0] for word in own if re.match(r"--[a-z]", word)}
+        known, name = ANY, "no script"  # of a flag without its script
+        if mentioned and scripts:
+            script, name = ROOT / words[scripts[0]], words[scripts[0]]
+            assert script.is_file(), f"{page.name} mentions {name}, which does not exist"
+            known = flags(script) if "Args" in classes(script) else ANY
+        assert mentioned <= known, f"{page.name}: {name} has no {sorted(mentioned - known)}"

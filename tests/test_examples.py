@@ -1,0 +1,149 @@
+"""The examples run, in small, and show what they say; those with another library where it is installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"examples_{name}", EXAMPLES / f"{name}.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Some examples write runs/; SHAC's classes and CleanRL's script draw from torch's generator."""
+    monkeypatch.chdir(tmp_path)
+    state = torch.get_rng_state()
+    yield
+    torch.set_rng_state(state)
+
+
+# The simulator on its own ---------------------------------------------------------------------------------------------
+
+
+def test_own_robot() -> None:
+    first, last = load("own_robot").train(iterations=3, num_envs=4)
+    assert first.returns.isfinite().all() and (last.returns != first.returns).any()
+    assert (last.lengths == 300).all()
+
+
+def test_trajectory_optimisation() -> None:
+    path, costs = load("trajectory_optimisation").optimise(guesses=16, iterations=25)
+    assert path.shape == (90, 2) and costs.shape == (25, 16)
+    assert costs[-1].median() < 0.6 * costs[0].median()
+
+
+def test_learned_controller() -> None:
+    distances = load("learned_controller").train(num_envs=16, iterations=50)
+    assert np.mean(distances[-5:]) < 0.3 * np.mean(distances[:5])
+
+
+def test_system_identification() -> None:
+    module = load("system_identification")
+    for noise, tolerance in ((0.0, 1e-6), (1e-2, 0.02)):
+        found = module.identify(count=32, noise=noise, iterations=5)
+        torch.testing.assert_close(found, module.TRUTH, rtol=tolerance, atol=0)
+
+
+def test_first_steps() -> None:
+    """All cells of the notebook, in order and with fewer iterations; it holds no outputs."""
+    cells = json.loads((EXAMPLES / "first_steps.ipynb").read_text())["cells"]
+    codes = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert len(codes) >= 4 and not any(cell["outputs"] or cell["execution_count"] for cell in codes)
+    names: dict[str, object] = {}
+    for cell in codes:
+        exec("".join(cell["source"]).replace("iterations = 150", "iterations = 2"), names)
+    torch.testing.assert_close(names["gradient"][:, 0], names["difference"], rtol=1e-5, atol=0)  # type: ignore[index]
+    assert names["iterations"] == 2 and 0 <= names["upright"].float().mean() <= 1  # type: ignore[attr-defined]
+
+
+# Other libraries ------------------------------------------------------------------------------------------------------
+
+
+def test_stable_baselines3() -> None:
+    pytest.importorskip("stable_baselines3")
+    sb3_ppo = load("sb3_ppo")
+    env, plain = (gymnasium.make_vec("diffsim/Hopper-numpy-v0", num_envs=3, max_episode_steps=30) for _ in range(2))
+    venv = sb3_ppo.DiffVecEnv(env)
+    venv.seed(5)
+    np.testing.assert_array_equal(venv.reset(), plain.reset(seed=5)[0])
+    for _ in range(30):
+        obs, reward, done, infos = venv.step(np.zeros((3, 3)))
+        expected = plain.step(np.zeros((3, 3)))
+        np.testing.assert_array_equal(obs, expected[0])
+        np.testing.assert_array_equal(reward, expected[1])
+        np.testing.assert_array_equal(done, expected[2] | expected[3])
+    assert done.all() and all(info["TimeLimit.truncated"] for info in infos)
+    np.testing.assert_array_equal(infos[1]["terminal_observation"], expected[4]["final_obs"][1])
+    ppo = sb3_ppo.train("diffsim/Hopper-numpy-v0", num_envs=4, timesteps=300)
+    assert ppo.num_timesteps >= 300 and ppo.predict(np.zeros(11))[0].shape == (3,)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_skrl() -> None:
+    pytest.importorskip("skrl")
+    agent = load("skrl_ppo").train("diffsim/Hopper-numpy-v0", num_envs=4, timesteps=40)
+    assert all(parameter.isfinite().all() for parameter in agent.policy.parameters())
+
+
+def test_rsl_rl() -> None:
+    pytest.importorskip("rsl_rl")
+    runner = load("rsl_rl_ppo").train("hopper", num_envs=4, iterations=2)
+    policy = runner.get_inference_policy()
+    assert policy(runner.env.get_observations()).shape == (4, 3)
+    assert [*Path("runs").glob("hopper__rsl_rl__1/model_*.pt")]
+
+
+CLEANRL = """
+import argparse, numpy as np, gymnasium as gym
+flags = argparse.ArgumentParser()
+for name, kind in (("--env-id", str), ("--num-envs", int), ("--gamma", float), ("--steps", int)):
+    flags.add_argument(name, type=kind)
+args = flags.parse_args()
+
+def make_env(env_id):
+    def thunk():
+        raise AssertionError("made one by one")
+    return thunk
+
+if __name__ == "__main__":
+    envs = gym.vector.SyncVectorEnv([make_env(args.env_id) for i in range(args.num_envs)])
+    assert isinstance(envs.single_action_space, gym.spaces.Box)
+    obs, _ = envs.reset(seed=1)
+    returns, seen = [], [obs]
+    for step in range(args.steps):
+        obs, reward, terminations, truncations, infos = envs.step(np.ones((args.num_envs, 3), np.float32))
+        seen.append(obs)
+        if "final_info" in infos:
+            for info in infos["final_info"]:
+                if info and "episode" in info:
+                    returns.append((info["episode"]["r"], info["episode"]["l"]))
+"""
+
+
+def test_cleanrl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A script that uses what CleanRL's use, as they do."""
+    monkeypatch.setattr(gymnasium.vector, "SyncVectorEnv", gymnasium.vector.SyncVectorEnv)
+    monkeypatch.setattr("sys.argv", ["pytest"])
+    (tmp_path / "script.py").write_text(CLEANRL)
+    arguments = ["--env-id", "diffsim/Hopper-numpy-v0", "--num-envs", "3", "--steps", "150"]
+    script = load("cleanrl_ppo").main([str(tmp_path / "script.py"), *arguments])
+    assert script["args"].gamma == 0.99 and len(script["returns"]) >= 3
+    assert all(10 < length < 150 for _, length in script["returns"])
+    seen = np.stack(script["seen"])
+    assert seen.shape == (151, 3, 11) and seen.dtype == np.float32 and np.abs(seen).max() <= 10

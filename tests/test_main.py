@@ -1,0 +1,168 @@
+"""python -m diffsim: the report, the demonstration, small copies of policies; and a start without noise."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import warp as wp
+
+import diffsim
+import shac
+from diffsim import __main__ as command
+from diffsim import render, startup
+from diffsim.training import load_policy
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = "--env cartpole --device cpu --iterations 1 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet".split()
+
+
+@pytest.fixture(autouse=True)
+def named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["diffsim"])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs") / "cartpole"
+    shac.main([*SMALL, "--run-dir", str(directory)])
+    return directory / "checkpoint.pt"
+
+
+# The report -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_report_names_tasks_devices_versions_and_cache(capsys: pytest.CaptureFixture[str]) -> None:
+    command.main([])
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line for line in lines if line}
+    assert rows["ant"].split()[1:7] == ["37", "8", "1000", "steps,", "16.7", "s"] and rows["ant"].split()[7] == "16"
+    assert set(diffsim.TASKS) < set(rows)
+    assert f"torch {torch.__version__}" in rows["versions"] and f"warp-lang {wp.__version__}" in rows["versions"]
+    assert rows["devices"].split()[1] == "cpu," and str(wp.config.kernel_cache_dir) in rows["kernels"]
+    assert max(map(len, lines)) < 160
+
+
+def test_troubles_come_with_their_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("no OpenGL: install it")
+
+    monkeypatch.setattr(render, "check_opengl", broken)
+    monkeypatch.setattr(startup, "nvidia_driver", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", "/proc/nowhere")
+    monkeypatch.setattr(torch.version, "cuda", None)
+    cpu, cache, opengl = command.find_troubles()
+    assert "a build for the CPU" in cpu and "set WARP_CACHE_PATH" in cache and opengl == "no OpenGL: install it"
+    monkeypatch.setattr(torch.version, "cuda", "12.8")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
+    assert "CUDA_VISIBLE_DEVICES='7': unset it" in command.find_troubles()[0]
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    assert "older than CUDA 12.8" in command.find_troubles()[0]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
+    assert "Warp does not" in command.find_troubles()[0]
+
+
+# Demonstration and export ---------------------------------------------------------------------------------------------
+
+
+def test_a_demonstration_of_an_exported_policy(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        render.check_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    policy, video = tmp_path / "policies" / "cartpole.pt", tmp_path / "new" / "demo.mp4"
+    monkeypatch.setattr(command, "POLICIES", policy.parent)
+    command.main(["export", str(trained), str(policy)])
+    assert "cartpole, shac.py, iteration 1, " in capsys.readouterr().out
+    command.main(["demo", "cartpole", "--output", str(video)])
+    assert video.stat().st_size > 1000
+    assert f"video: {video}" in capsys.readouterr().out
+    assert "cartpole" in command.describe_tasks()[1] and command.describe_tasks()[1].endswith("yes")
+
+
+def test_an_export_is_the_policy_alone(trained: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small.pt"
+    command.main(["export", str(trained), str(small)])
+    assert small.stat().st_size < 0.5 * trained.stat().st_size
+    before, after, obs = load_policy(trained), load_policy(small), torch.randn(3, 5)
+    assert torch.equal(before.network(obs), after.network(obs))
+    assert (before.args, before.script, before.iteration) == (after.args, after.script, after.iteration)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("demo nothing", "unknown task 'nothing': choose from cartpole, hopper"),
+        ("demo hopper", "no policy of hopper comes with this version; there are: none"),
+        ("export {tmp}/nothing.pt {tmp}/new/out.pt", "no such checkpoint: {tmp}/nothing.pt"),
+        ("export {trained} {trained}/out.pt", "File exists"),
+    ],
+)
+def test_mistakes_are_one_line(
+    arguments: str,
+    message: str,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(command, "POLICIES", tmp_path / "none")
+    with pytest.raises(SystemExit) as exit:
+        command.main(arguments.format(tmp=tmp_path, trained=trained).split())
+    error = capsys.readouterr().err
+    assert exit.value.code == 2 and error.startswith("diffsim: ") and error.count("\n") == 1
+    assert message.format(tmp=tmp_path) in error
+
+
+def test_a_policy_alone_cannot_be_resumed(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command.main(["export", str(trained), str(tmp_path / "small.pt")])
+    with pytest.raises(SystemExit):
+        shac.main(["--resume", str(tmp_path / "small.pt")])
+    assert "holds a policy alone" in capsys.readouterr().err
+
+
+# The start ------------------------------------------------------------------------------------------------------------
+
+
+def test_only_a_compilation_is_announced(tmp_path: Path) -> None:
+    step = "import torch, diffsim; env = diffsim.make('cartpole', 1, horizon=1)\n"
+    step += "with torch.no_grad(): env.step(torch.zeros(1, 1)), env.step(torch.zeros(1, 1))"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(tmp_path), "MUJOCO_GL": "osmesa"}
+    result = subprocess.run([sys.executable, "-c", step], capture_output=True, text=True, env=environment)
+    assert (result.returncode, result.stdout) == (0, "")
+    assert result.stderr == "compiling kernels for cartpole (once, about 10 s) ...\n"
+
+
+def test_what_is_compiled_already_is_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    env = diffsim.make("cartpole", 1)
+    with torch.no_grad():
+        env.step(torch.zeros(1, 1))
+    module, cpu = env.sim._stepper._launcher._kernels["forward"].module, wp.get_device("cpu")
+    assert startup._is_compiled(module, cpu, 1)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    assert not startup._is_compiled(module, cpu, 1)
+
+
+def test_only_the_warning_is_held_back(capfd: pytest.CaptureFixture[str]) -> None:
+    with startup._without(b"noise"):
+        os.write(2, b"first\nmuch noise here\nlast\n")
+    assert capfd.readouterr().err == "first\nlast\n"
+    with pytest.raises(OSError, match="why"), startup._without(b"noise"):
+        os.write(2, b"an error")
+        raise OSError("why")
+    os.write(2, b", and on")
+    assert capfd.readouterr().err == "an error, and on"
+
+
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", "/proc/nowhere")
+    with pytest.raises(ValueError, match="cannot write to Warp's kernel cache /proc/nowhere: set WARP_CACHE_PATH"):
+        diffsim.make("cartpole", 1)

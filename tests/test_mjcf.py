@@ -1,0 +1,225 @@
+"""MJCF to Scene: what is read."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import reference
+from scenes import (
+    BALL,
+    MUSCLE,
+    SHOULDER,
+    free_states,
+    leg_scene,
+    parse,
+    pendulum,
+    robot,
+    task_scene,
+    tendon,
+    tree_scene,
+)
+
+from diffsim.mjcf import load_scene
+from diffsim.scene import SceneError
+
+
+def test_welded_bodies_are_merged():
+    scene = parse(
+        robot("""
+        <body>
+          <joint axis="0 1 0"/> <inertial pos="1 0 0" mass="1" diaginertia="0.1 0.2 0.25"/>
+          <body pos="0 0 2" quat="0 1 0 0">
+            <inertial pos="3 0 1" mass="3" diaginertia="0.3 0.4 0.5"/>
+            <geom type="sphere" size="0.1" pos="0 1 0"/>
+          </body>
+        </body>""")
+    )
+    assert scene.nlink == 2 and scene.mass[1] == 4
+    # The welded body's centre of mass is (3, 0, 1) in the link's frame, so the two lie (2, 0, 1) apart.
+    np.testing.assert_allclose(scene.com[1], [2.5, 0, 0.75])
+    apart = np.array([2.0, 0.0, 1.0])
+    steiner = 1 * 3 / (1 + 3) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
+    np.testing.assert_allclose(scene.inertia[1], np.diag([0.4, 0.6, 0.75]) + steiner)
+    np.testing.assert_allclose(scene.contact_position, [[0, -1, 2]], atol=1e-15)
+
+
+def test_body_with_several_joints_becomes_links_in_a_row():
+    scene = parse(
+        robot("""
+        <body pos="0 0 3" quat="0.6 0 0.8 0">
+          <joint type="slide" axis="2 0 0" pos="0.1 0.2 0.3"/>
+          <joint type="hinge" axis="0 1 0" pos="0.4 0 0" ref="0.3"/>
+          <geom type="sphere" size="0.1" pos="0 0 1"/>
+          <body pos="1 0 0"> <joint axis="0 0 1"/> <geom type="sphere" size="0.2"/> </body>
+        </body>""")
+    )
+    assert scene.nlink == 4 and not scene.floating
+    np.testing.assert_array_equal(scene.parent, [0, 0, 1, 2])
+    np.testing.assert_array_equal(scene.slide, [False, True, False, False])
+    np.testing.assert_allclose(scene.axis[1:], [[1, 0, 0], [0, 1, 0], [0, 0, 1]], atol=1e-15)
+    np.testing.assert_array_equal(scene.joint_ref, [0, 0, 0.3, 0])
+    np.testing.assert_array_equal(scene.qpos0, [0, 0.3, 0])
+    assert scene.mass[0] == scene.mass[1] == 0 and (scene.mass[2:] > 0).all()
+    np.testing.assert_allclose(scene.position[2:], [[0.3, -0.2, -0.3], [0.6, 0, 0]])
+
+
+def test_ball_joint_becomes_three_links():
+    scene = parse(SHOULDER)
+    np.testing.assert_array_equal(scene.ball, [-1, 0, 1, 2, -1])
+    np.testing.assert_array_equal(scene.parent, [0, 0, 1, 2, 3])
+    np.testing.assert_array_equal(scene.qpos_adr[1:], [0, 1, 2, 4])
+    np.testing.assert_array_equal(scene.axis[1:4], np.eye(3))
+    np.testing.assert_array_equal(scene.mass, [0, 0, 0, 1.5, 1])
+    np.testing.assert_array_equal(scene.armature[1:4], 0.05)
+    np.testing.assert_array_equal(scene.motor_link, [2, 3])
+    np.testing.assert_allclose(scene.gear, [5, -6])
+    np.testing.assert_allclose(scene.motor_bias, [0, -6])
+    assert (scene.nq, scene.nv, scene.nball) == (5, 4, 1)
+    assert scene.features == {"ball", "slide", "stiffness", "damping", "motor"}
+
+
+@pytest.mark.parametrize("base", ["floating", "fixed", "planar", "ball"])
+def test_links_are_where_mujoco_has_them(base, rng):
+    """Centres of mass of the bodies and of the spheres that touch the ground, in random poses."""
+    scene = tree_scene(base, 3)
+    model, data = scene.mj_model, mujoco.MjData(scene.mj_model)
+    spheres = 0
+    for qpos in free_states(scene, 5, rng)[0]:
+        data.qpos = qpos
+        mujoco.mj_forward(model, data)
+        links = reference.kinematics(scene, qpos, np.zeros(scene.nv))
+        whole = sum(m * (x.position + x.rotation @ c) for m, x, c in zip(scene.mass, links, scene.com, strict=True))
+        np.testing.assert_allclose(whole / scene.mass.sum(), data.subtree_com[0], atol=1e-12)
+        found = {
+            tuple(np.round([*(links[i].position + links[i].rotation @ c), r], 9))
+            for i, c, r in zip(scene.contact_link, scene.contact_position, scene.contact_radius, strict=True)
+        }
+        expected = set()
+        for g in range(1, model.ngeom):
+            axes, size = data.geom_xmat[g].reshape(3, 3), model.geom_size[g]
+            offsets = {
+                mujoco.mjtGeom.mjGEOM_SPHERE: [np.zeros(3)],
+                mujoco.mjtGeom.mjGEOM_CAPSULE: [axes[:, 2] * size[1], -axes[:, 2] * size[1]],
+                mujoco.mjtGeom.mjGEOM_BOX: [
+                    axes @ (size * (i, j, k)) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)
+                ],
+            }[mujoco.mjtGeom(model.geom_type[g])]
+            radius = 0.0 if len(offsets) == 8 else size[0]
+            expected |= {tuple(np.round([*(data.geom_xpos[g] + o), radius], 9)) for o in offsets}
+        assert found <= expected
+        spheres += len(found)
+    assert spheres > 0
+
+
+def test_box_touches_with_its_corners():
+    scene = parse(robot('<body pos="0 0 1"><freejoint/><geom type="box" size="1 2 3" pos="5 0 0"/></body>'))
+    assert scene.floating and scene.ncontact == 8
+    np.testing.assert_array_equal(scene.contact_radius, 0)
+    corners = {tuple(p) for p in scene.contact_position}
+    assert corners == {(5 + x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)}
+
+
+def test_spheres_inside_another_are_dropped():
+    """Inside on the same link, or on a hinge whose parent has the same sphere there; a shifted or larger one stays."""
+    scene = parse(
+        robot("""
+        <body>
+          <freejoint/>
+          <geom type="sphere" size="0.5"/> <geom type="capsule" fromto="0 0 0 1 0 0" size="0.1"/>
+          <body pos="1 0 0">
+            <joint axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 1 0 0" size="0.1"/>
+            <body pos="1 0 0"> <joint axis="0 1 0"/> <geom type="capsule" fromto="0 0 0 1 0 0" size="0.2"/> </body>
+            <body pos="1 0 0"> <joint type="slide"/> <geom type="sphere" size="0.1"/> </body>
+          </body>
+        </body>""")
+    )
+    spheres = np.column_stack([scene.contact_link, scene.contact_position, scene.contact_radius])
+    # The forearm's end (link 1, x = 1, r = 0.1) lies in the larger one of link 2; that on the slide may leave.
+    expected = [[0, 0, 0, 0, 0.5], [0, 1, 0, 0, 0.1], [2, 0, 0, 0, 0.2], [2, 1, 0, 0, 0.2], [3, 0, 0, 0, 0.1]]
+    np.testing.assert_allclose(spheres[np.lexsort(spheres.T[::-1])], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "name, count",
+    {"cartpole": 0, "hopper": 6, "half_cheetah": 16, "ant": 13, "humanoid": 35, "humanoid_mtu": 88}.items(),
+)
+def test_contact_spheres_of_the_tasks(name, count):
+    assert task_scene(name).ncontact == count
+
+
+def test_only_what_may_touch_the_ground_touches():
+    bits = '<geom type="sphere" size="0.1" contype="{}" conaffinity="{}"/>'
+    for contype, conaffinity, touches in ((0, 0, 0), (2, 0, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (2, 1, 1)):
+        scene = parse(robot(f"<body><freejoint/>{bits.format(contype, conaffinity)}</body>"))
+        assert scene.ncontact == touches
+    exclude = '<contact><exclude body1="world" body2="arm"/></contact>'
+    assert parse(pendulum()).ncontact == 1 and parse(pendulum(rest=exclude)).ncontact == 0
+    assert parse(pendulum(world="")).ncontact == 0
+    drawn = '<geom type="cylinder" size="0.1 0.1" contype="0" conaffinity="0"/>'
+    assert parse(pendulum(inside=drawn)).ncontact == 1
+
+
+def test_ground_height():
+    assert parse(BALL).ground_height == 0
+    assert parse(pendulum(world='<geom type="plane" size="1 1 1" pos="3 4 -0.5"/>')).ground_height == -0.5
+
+
+def test_joint_and_motor_numbers():
+    scene = parse(
+        pendulum(
+            'armature="0.1" damping="0.2" stiffness="0.3" springref="0.4" range="-0.5 0.6" axis="0 3 4"',
+            rest='<actuator><motor joint="hinge" gear="10" ctrlrange="-1 2" ctrllimited="true"/>'
+            '<motor joint="hinge" gear="-3"/></actuator>',
+        )
+    )
+    numbers = [getattr(scene, n)[1] for n in ("armature", "damping", "stiffness", "spring_ref", "lower", "upper")]
+    assert numbers == [0.1, 0.2, 0.3, 0.4, -0.5, 0.6]
+    np.testing.assert_allclose(scene.axis[1], [0, 0.6, 0.8])
+    # ctrl in [-1, 1] over [-1, 2]: 1.5 ctrl + 0.5; an unlimited motor takes it as it is.
+    np.testing.assert_array_equal(scene.motor_link, [1, 1])
+    np.testing.assert_allclose(scene.gear, [15, -3])
+    np.testing.assert_allclose(scene.motor_bias, [5, 0])
+
+
+def test_unlimited_joint_has_infinite_bounds():
+    scene = parse(pendulum())
+    assert scene.lower[1] == -np.inf and scene.upper[1] == np.inf and "limit" not in scene.features
+
+
+def test_muscles():
+    """Segments between two links, by pairs of links; the rest of a path has a constant length."""
+    scene = leg_scene("hill")
+    pelvis, thigh, shin = 0, 3, 4
+    np.testing.assert_array_equal(scene.motor_link, [0, 0, shin, 0, 0])
+    np.testing.assert_allclose(scene.gear, [200, 150, 7, 125, 50])
+    np.testing.assert_allclose(scene.motor_bias, [200, 150, 0, 125, 50])  # N, at half the activation
+    pairs = [(pelvis, thigh)] * 3 + [(pelvis, shin)] + [(thigh, shin)] * 4
+    np.testing.assert_array_equal(scene.segment_link, pairs)
+    np.testing.assert_array_equal(scene.segment_muscle, [0, 1, 3, 4, 1, 3, 4, 4])
+    np.testing.assert_allclose(scene.segment_position[3], [[0.05, 0.1, 0.05], [-0.03, 0, -0.05]])
+    np.testing.assert_allclose(scene.hill[:, 0], [0, np.hypot(0.02, 0.15), np.nan, np.hypot(0.06, 0.1), 0])
+    assert {"muscle", "hill", "ball"} < scene.features and "hill" not in leg_scene("linear").features
+    bare = scene.without("muscle")
+    assert bare.features == scene.features - {"muscle", "hill"} and bare.nu == 5
+
+
+def test_strength_of_muscles():
+    strength = '<numeric name="muscle_strength" data="0.36"/>'
+    scene = parse(tendon(actuator=f"<muscle {MUSCLE}/>", custom=strength))
+    np.testing.assert_allclose([scene.gear[0], scene.motor_bias[0], scene.hill[0, -1]], [0.9, 0.9, 1.8])
+    half = tendon(actuator=f'<muscle {MUSCLE} ctrllimited="true" ctrlrange="0 0.5"/>')
+    np.testing.assert_allclose([parse(half).gear[0], parse(half).motor_bias[0]], [1.25, 1.25])
+
+
+def test_missing_and_broken_files(tmp_path):
+    with pytest.raises(SceneError, match="nowhere.xml"):
+        load_scene(tmp_path / "nowhere.xml")
+    with pytest.raises(SceneError):
+        load_scene(tmp_path)
+    for text in ("<mujoco><worldbody>", "no xml at all", "<mujoco><worldbody><bogus/></worldbody></mujoco>", ""):
+        broken = tmp_path / "broken.xml"
+        broken.write_text(text)
+        with pytest.raises(SceneError, match="broken.xml") as error:
+            load_scene(broken)
+        assert "\n" not in str(error.value)

@@ -1,0 +1,171 @@
+"""PPO's parts against plain reference implementations."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from learners import read_progress, run
+from torch.distributions import Normal, kl_divergence
+
+import diffsim
+import ppo_baseline as ppo
+from diffsim.training import parse
+
+
+@pytest.mark.parametrize("lam", [0.0, 0.9, 1.0])
+@pytest.mark.parametrize("horizon", [1, 12])
+def test_gae_is_the_weighted_sum_of_all_its_n_step_advantages(
+    rng: np.random.Generator, lam: float, horizon: int
+) -> None:
+    """Schulman et al. 2016, Eq. 11-16, with ends of both kinds at random."""
+    gamma, size = 0.97, (horizon, 50)
+    kind = rng.choice(3, size=size, p=(0.8, 0.1, 0.1))
+    terminated, done = kind == 1, kind > 0
+    reward, value, following = (rng.normal(size=size) for _ in range(3))
+    following[terminated] = 0.0  # V(s_{t+1}): of the last state where time ran out, nothing where the episode failed
+    for t, i in zip(*np.nonzero(~done[:-1]), strict=True):
+        following[t, i] = value[t + 1, i]
+
+    expected = np.zeros(size)
+    for i in range(size[1]):
+        for t in range(horizon):
+            n = next((k for k in range(1, horizon - t) if done[t + k - 1, i]), horizon - t)  # steps to the end
+            advantages = []
+            for k in range(1, n + 1):
+                rewards = sum(gamma**j * reward[t + j, i] for j in range(k))
+                advantages.append(rewards + gamma**k * following[t + k - 1, i] - value[t, i])
+            weights = [(1 - lam) * lam ** (k - 1) for k in range(1, n)] + [lam ** (n - 1)]
+            expected[t, i] = np.dot(weights, advantages)
+    tensors = (torch.tensor(x) for x in (reward, value, following, done))
+    np.testing.assert_allclose(ppo.gae(*tensors, gamma, lam), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_values_after_a_rollout_are_of_the_last_states_before_any_reset() -> None:
+    """Of three ants that run out of time, fall, and do neither, the values and rewards that GAE gets."""
+    torch.manual_seed(0)
+    env = diffsim.make("ant", num_envs=3, seed=0, horizon=8)
+    args = parse(ppo.Args, "--env ant --device cpu --horizon 8 --hidden 16".split())
+    policy = ppo.PPO(args, env).actor_critic
+    env.episode_step[1] = env.episode_length - 4
+    qpos, qvel = env.qpos.clone(), env.qvel.clone()
+    qpos[2, 2], qvel[2, 2] = 0.3, -6.0
+    env.set_state(qpos, qvel)
+    noise = torch.randn(8, 3, 8)
+    rollout = ppo.collect(env, policy, noise)
+    truncated = rollout.done & ~rollout.terminated
+    assert truncated.nonzero().tolist() == [[3, 1]] and rollout.terminated.any(0).tolist() == [False, False, True]
+    assert not any(tensor.requires_grad for tensor in rollout)
+    same = rollout.next_obs[:-1] == rollout.obs[1:]
+    torch.testing.assert_close(same.all(-1), ~rollout.done[:-1])
+    mean, value = policy(policy.normalizer(rollout.obs))
+    torch.testing.assert_close(rollout.mean, mean)
+    torch.testing.assert_close(rollout.value, value)
+    torch.testing.assert_close(rollout.action, mean + policy.log_std.exp() * noise)
+    torch.testing.assert_close(policy.deterministic()(rollout.obs), mean)
+
+
+def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Advantages of values in the rewards' units, zero after a termination; both are normalized for the update."""
+    torch.manual_seed(0)
+    args = parse(ppo.Args, "--env ant --device cpu --horizon 8 --hidden 16".split())
+    env = diffsim.make("ant", num_envs=3, seed=0, horizon=8)
+    learner = ppo.PPO(args, env)
+    learner.return_normalizer.update(5.0 + 3.0 * torch.randn(50))
+    learner.actor_critic.normalizer.update(torch.randn(50, 37))
+    normalizer, returns = (
+        copy.deepcopy(module) for module in (learner.actor_critic.normalizer, learner.return_normalizer)
+    )
+    qpos, qvel = env.qpos.clone(), env.qvel.clone()
+    qpos[2, 2], qvel[2, 2] = 0.3, -6.0
+    env.set_state(qpos, qvel)
+    rollouts, collect = [], ppo.collect
+
+    def recorded(*arguments: Any) -> ppo.Rollout:
+        rollouts.append(collect(*arguments))
+        return rollouts[-1]
+
+    monkeypatch.setattr(ppo, "collect", recorded)
+    metrics = learner.roll_out()
+    (rollout,) = rollouts
+    assert rollout.terminated.any() and metrics["episodes/count"] == rollout.done.sum()
+    with torch.no_grad():
+        value = returns.inverse(learner.actor_critic(normalizer(rollout.obs))[1])
+        next_value = returns.inverse(learner.actor_critic(normalizer(rollout.next_obs))[1])
+    next_value = torch.where(rollout.terminated, 0.0, next_value)
+    advantage = ppo.gae(rollout.reward, value, next_value, rollout.done, args.gamma, args.gae_lambda)
+    returns.update(value + advantage)
+    batch = learner.batch
+    torch.testing.assert_close(batch.obs, normalizer(rollout.obs).flatten(0, 1))
+    torch.testing.assert_close(batch.target, returns((value + advantage).flatten()), rtol=1e-4, atol=1e-5)
+    flat = advantage.flatten()
+    torch.testing.assert_close(batch.advantage, (flat - flat.mean()) / flat.std(correction=0), rtol=1e-4, atol=1e-5)
+    assert learner.actor_critic.normalizer.count == 50 + 24 and learner.return_normalizer.count == 50 + 24
+
+
+def gaussians(count: int = 40) -> tuple[ppo.Batch, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A batch acted by one policy, and mean, log_std of another, and the first one's log_std."""
+    torch.manual_seed(0)
+    mean, other = torch.randn(2, count, 3, dtype=torch.float64)
+    log_std, old_log_std = 0.3 * torch.randn(2, 3, dtype=torch.float64)
+    action = mean + old_log_std.exp() * torch.randn_like(mean)
+    batch = ppo.Batch(torch.zeros(count, 1), mean, action, torch.randn(count, dtype=torch.float64), torch.zeros(count))
+    return batch, other, log_std, old_log_std
+
+
+def test_ratio_and_divergence_are_those_of_the_distributions() -> None:
+    batch, mean, log_std, old_log_std = gaussians()
+    new, old = Normal(mean, log_std.exp()), Normal(batch.mean, old_log_std.exp())
+    expected = (new.log_prob(batch.action) - old.log_prob(batch.action)).sum(-1)
+    torch.testing.assert_close(ppo.log_ratio(batch, mean, log_std, old_log_std), expected)
+    result = ppo.kl_divergence(batch.mean, old_log_std, mean, log_std)
+    torch.testing.assert_close(result, kl_divergence(old, new).sum(-1).mean())
+    torch.testing.assert_close(ppo.entropy(log_std), new.entropy()[0].sum())
+
+
+def test_entropy_bonus_raises_the_noise(tmp_path: Path) -> None:
+    """A wrong sign would lower it; the bonus is so large that nothing else counts."""
+    arguments = "--env cartpole --iterations 2 --eval-episodes 4 --threads 1 --quiet --entropy-coef 100"
+    checkpoint = run(ppo, tmp_path, *arguments.split())
+    assert checkpoint["modules"]["actor_critic"]["log_std"].item() > 0.005
+
+
+def test_clipped_objective_and_its_gradient_case_by_case() -> None:
+    """Figure 1 of the PPO paper: the gain is bounded on one side, which depends on the advantage's sign."""
+    cases = [  # ratio, advantage, loss, its derivative in log ratio
+        (1.0, 2.0, -2.0, -2.0),
+        (1.1, 2.0, -2.2, -2.2),
+        (1.5, 2.0, -2.4, 0.0),
+        (0.5, 2.0, -1.0, -1.0),
+        (1.5, -2.0, 3.0, 3.0),
+        (0.5, -2.0, 1.6, 0.0),
+        (0.9, -2.0, 1.8, 1.8),
+    ]
+    for ratio, advantage, loss, slope in cases:
+        log_ratio = torch.tensor([ratio], dtype=torch.float64).log().requires_grad_()
+        result = ppo.clipped_loss(log_ratio, torch.tensor([advantage], dtype=torch.float64), 0.2)
+        assert result.item() == pytest.approx(loss)
+        assert torch.autograd.grad(result, log_ratio)[0].item() == pytest.approx(slope), (ratio, advantage)
+
+
+@pytest.mark.parametrize(
+    ("lr", "kl", "expected"),
+    [(1e-3, 0.3, 1e-3 / 1.5), (1e-3, 0.19, 1e-3), (1e-3, 0.06, 1e-3), (1e-3, 0.04, 1.5e-3), (1e-3, float("nan"), 1e-3)]
+    + [(1.2e-6, 0.3, 1e-6), (9e-3, 0.01, 1e-2)],
+)
+def test_learning_rate_follows_the_divergence(lr: float, kl: float, expected: float) -> None:
+    tensor = torch.tensor(lr)
+    ppo.adapt(tensor, torch.tensor(kl), 0.1, (1e-6, 1e-2))
+    assert tensor.item() == pytest.approx(expected)
+
+
+def test_cartpole_improves_within_seconds(tmp_path: Path) -> None:
+    """From about -2,200 per episode; a wrong sign of advantage, ratio or clipping stays there or falls."""
+    arguments = "--env cartpole --iterations 9 --eval-episodes 1 --threads 1 --quiet"
+    run(ppo, tmp_path, *arguments.split())
+    returns = [float(row["return"]) for row in read_progress(tmp_path)]
+    assert returns[0] < -2000 and returns[-1] > -1700

@@ -1,0 +1,44 @@
+"""The Python snippets of README and of the page on gymnasium run as they are printed."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+import diffsim
+from diffsim.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parents[1]
+SNIPPETS = [
+    pytest.param(code, id=f"{page.stem}-{k}")
+    for page in (ROOT / "README.md", ROOT / "docs" / "gymnasium.md")
+    for k, code in enumerate(re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL))
+]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """With a robot.xml of the reader's, and no new task afterwards."""
+    shutil.copy(ROOT / "diffsim" / "assets" / "hopper.xml", tmp_path / "robot.xml")
+    shutil.copy(ROOT / "diffsim" / "assets" / "stage.xml", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    known = dict(TASKS)
+    yield
+    TASKS.clear()
+    TASKS.update(known)
+
+
+@pytest.mark.parametrize("code", SNIPPETS)
+def test_snippet_runs(code: str) -> None:
+    """On its own, but for the imports with which README's first one begins."""
+    try:
+        exec(compile(code, "snippet", "exec"), {"torch": torch, "diffsim": diffsim})
+    except RuntimeError as error:
+        if "OpenGL" not in str(error):
+            raise
+        pytest.skip(str(error))

@@ -1,0 +1,107 @@
+"""Evaluations: the first episode of each environment, and what is written of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import diffsim
+from diffsim import render
+from diffsim.training import Evaluation, evaluate, evaluation
+
+
+@pytest.fixture(scope="module")
+def policy() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(37, 8), nn.ELU(), nn.Linear(8, 8), nn.Tanh())
+
+
+@pytest.fixture(scope="module")
+def ants() -> diffsim.DiffEnv:
+    return diffsim.make("ant", num_envs=4, horizon=1, threads=1)
+
+
+@pytest.fixture(scope="module")
+def result(ants: diffsim.DiffEnv, policy: nn.Module) -> Evaluation:
+    return evaluate(ants, policy)
+
+
+def test_first_episodes_only_are_counted(result: Evaluation, ants: diffsim.DiffEnv, policy: nn.Module) -> None:
+    """Against a loop over each environment's own rewards, for ants that fall at different times."""
+    obs, _ = ants.reset(seed=evaluation.SEED)
+    total, length, ended = [0.0] * 4, [0] * 4, [False] * 4
+    path = [[] for _ in range(4)]
+    with torch.no_grad():
+        while not all(ended):
+            before = ants.qpos.clone()
+            obs, reward, terminated, truncated, _ = ants.step(policy(obs))
+            for i in range(4):
+                if not ended[i]:
+                    path[i].append(before[i])
+                    total[i], length[i] = total[i] + reward[i].item(), length[i] + 1
+                    ended[i] = bool(terminated[i] or truncated[i])
+    np.testing.assert_allclose(result.returns, total, rtol=1e-4)
+    assert result.lengths.tolist() == length and len(set(length)) > 1
+    assert result.length == pytest.approx(sum(length) / 4)
+    for i in range(4):
+        assert torch.equal(result.qpos[: length[i], i], torch.stack(path[i]))
+    distance = sum((states[-1][0] - states[0][0]).item() for states in path)
+    assert result.speed == pytest.approx(distance / ((sum(length) - 4) / 60), rel=1e-4)
+
+
+def test_the_same_policy_has_the_same_evaluation(result: Evaluation, ants: diffsim.DiffEnv, policy: nn.Module) -> None:
+    again = evaluate(ants, policy)
+    assert torch.equal(again.returns, result.returns) and torch.equal(again.lengths, result.lengths)
+    assert not result.returns.requires_grad and not result.qpos.requires_grad
+
+
+def test_a_robot_without_ground_has_no_speed() -> None:
+    result = evaluate(diffsim.make("cartpole", num_envs=2, horizon=1), lambda obs: obs[:, :1])
+    assert result.speed is None and result.lengths.tolist() == [240, 240]
+    assert result.scalars().keys() == {"eval/return", "eval/length"} and "speed" not in str(result)
+
+
+def some(result: Evaluation, **changes: Any) -> Evaluation:
+    returns, lengths = torch.tensor([4.0, 1.0, 3.0, 100.0, 2.0]), torch.tensor([5, 2, 7, 10, 1])
+    qpos = torch.arange(10.0).reshape(10, 1, 1).expand(10, 5, 15)
+    motion = dict(qpos=qpos, action=qpos[..., :8] / 10, scene=result.scene, control_dt=1 / 60)
+    return Evaluation(**dict(returns=returns, lengths=lengths, speed=1.25) | motion | changes)
+
+
+def test_numbers_of_an_evaluation(result: Evaluation, tmp_path: Path) -> None:
+    five = some(result)
+    assert five.scalars() == {"eval/return": 3.0, "eval/length": 5.0, "eval/speed": 1.25}
+    assert str(five) == ("return median 3.0, mean 22.0, std 39.0, min 1.0, length 5.0, forward speed 1.25 m/s")
+    path = tmp_path / "new" / "evaluation.json"
+    five.write_json(path, {"env": "ant", "substeps": 16, "penalty": ("mu=1",), "run_dir": tmp_path})
+    assert json.loads(path.read_text()) == {
+        "return": 3.0,
+        "length": 5.0,
+        "speed": 1.25,
+        "returns": [4.0, 1.0, 3.0, 100.0, 2.0],
+        "lengths": [5, 2, 7, 10, 1],
+        "settings": {"env": "ant", "substeps": 16, "penalty": ["mu=1"], "run_dir": str(tmp_path)},
+    }
+
+
+def test_the_video_is_of_the_median_episode(
+    result: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filmed = []
+
+    def film(path: Path, scene: diffsim.Scene, qpos: np.ndarray, dt: float, ctrl: np.ndarray) -> Path:
+        filmed.append((scene, qpos, dt, ctrl))
+        return path
+
+    monkeypatch.setattr(render, "film", film)
+    assert some(result).save_video(tmp_path / "video.mp4") == tmp_path / "video.mp4"
+    ((scene, qpos, dt, ctrl),) = filmed
+    assert scene is result.scene and dt == 1 / 60
+    np.testing.assert_array_equal(qpos[:, 0], range(7))  # seven steps of the episode of return 3
+    np.testing.assert_allclose(ctrl[:, 0], np.arange(7) / 10, rtol=1e-6)

@@ -1,0 +1,269 @@
+"""Command lines: what a number may be, where defaults come from, what --help shows."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import get_type_hints
+
+import pytest
+import torch
+from learners import SCRIPTS, refusal
+
+import bptt
+import diffsim
+import ppo_baseline
+import shac
+from diffsim.tasks import Task
+from diffsim.training import checkpoint, flags, parse
+from diffsim.training.run import make_env
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["script.py"])
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+def save(args: flags.Flags, **further: object) -> Path:
+    """A checkpoint with as much as the flags of its successor depend on, and with further arguments."""
+    values = {name: None if isinstance(v, Path) else v for name, v in dataclasses.asdict(args).items()}
+    path = Path("saved") / "checkpoint.pt"
+    path.parent.mkdir(exist_ok=True)
+    state = dict(script=args.script(), args=values | further, iteration=5, ranks=[None], modules={})
+    torch.save({"format": checkpoint.FORMAT} | state, path)
+    return path
+
+
+# Ranges ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "complaint"),
+    [
+        (shac, "--num-envs 0", "--num-envs must be at least 1, not 0"),
+        (shac, "--num-envs -64", "--num-envs must be at least 1, not -64"),
+        (shac, "--iterations 0", "--iterations must be at least 1, not 0"),
+        (shac, "--horizon 0", "--horizon must be at least 1, not 0"),
+        (shac, "--substeps 0", "--substeps must be at least 1, not 0"),
+        (shac, "--eval-episodes 0", "--eval-episodes must be at least 1, not 0"),
+        (shac, "--critic-iterations 0", "--critic-iterations must be at least 1, not 0"),
+        (shac, "--critic-minibatches 0", "--critic-minibatches must be at least 1, not 0"),
+        (ppo_baseline, "--epochs 0", "--epochs must be at least 1, not 0"),
+        (ppo_baseline, "--minibatch-size 0", "--minibatch-size must be at least 1, not 0"),
+        (shac, "--actor-hidden 0", "--actor-hidden must be at least 1, not 0"),
+        (shac, "--critic-hidden 64 -1 64", "--critic-hidden must be at least 1, not -1"),
+        (shac, "--eval-every -5", "--eval-every must be at least 0, not -5"),
+        (shac, "--save-every -1", "--save-every must be at least 0, not -1"),
+        (shac, "--stop-after -1", "--stop-after must be at least 0, not -1"),
+        (shac, "--threads -1", "--threads must be at least 0, not -1"),
+        (shac, "--actor-lr nan", "--actor-lr must be finite, not nan"),
+        (shac, "--actor-lr inf", "--actor-lr must be finite, not inf"),
+        (shac, "--actor-lr -1", "--actor-lr must be positive, not -1.0"),
+        (shac, "--critic-lr 0", "--critic-lr must be positive, not 0.0"),
+        (bptt, "--lr -1e-3", "--lr must be positive, not -0.001"),
+        (shac, "--max-grad-norm 0", "--max-grad-norm must be positive, not 0.0"),
+        (ppo_baseline, "--lr-bounds 0 1e-2", "--lr-bounds must be positive, not 0.0"),
+        (ppo_baseline, "--lr-bounds 1e-2 1e-6", "--lr-bounds 0.01 1e-06 are the wrong way round"),
+        (ppo_baseline, "--value-coef -1", "--value-coef must be at least 0, not -1.0"),
+        (ppo_baseline, "--entropy-coef nan", "--entropy-coef must be finite, not nan"),
+        (shac, "--gamma 2", "--gamma must be in [0, 1], not 2.0"),
+        (shac, "--gamma nan", "--gamma must be finite, not nan"),
+        (shac, "--td-lambda -0.1", "--td-lambda must be in [0, 1], not -0.1"),
+        (shac, "--target-alpha 1.1", "--target-alpha must be in [0, 1], not 1.1"),
+        (shac, "--theta 1.5", "--theta must be in [0, 1], not 1.5"),
+        (shac, "--betas 2 3", "--betas must be in [0, 1), not 2.0"),
+        (bptt, "--betas 0.9 1", "--betas must be in [0, 1), not 1.0"),
+        (shac, "--initial-log-std nan", "--initial-log-std must be finite, not nan"),
+        (shac, "--initial-log-std -inf", "--initial-log-std must be finite, not -inf"),
+    ],
+)
+def test_a_number_out_of_range_is_named_before_anything_is_written(
+    script: ModuleType, arguments: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refusal(lambda: script.main(arguments.split()), capsys) == f"script.py: {complaint}"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "--num-envs 1 --horizon 1 --iterations 1 --substeps 1 --eval-episodes 1 --critic-minibatches 1",
+        "--eval-every 0 --save-every 0 --stop-after 0 --threads 0",
+        "--gamma 0 --td-lambda 0 --target-alpha 0 --betas 0 0",
+        "--gamma 1 --td-lambda 1 --target-alpha 1 --initial-log-std 2",
+        "--actor-hidden --critic-hidden 1 2 3 4",
+    ],
+)
+def test_ends_of_ranges_are_within(arguments: str) -> None:
+    parse(shac.Args, ["--env", "cartpole", *arguments.split()])
+
+
+@pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
+def test_every_number_has_a_range(script: ModuleType) -> None:
+    """But the seed."""
+    for name, hint in get_type_hints(script.Args, include_extras=True).items():
+        value = getattr(script.Args, name)
+        numbers = value if isinstance(value, tuple) else [value]
+        if name not in ("seed", "FIXED") and type(numbers[0] if numbers else None) in (int, float):
+            assert len(flags._ranges(hint, value)) == len(numbers), name
+
+
+def test_penalty_is_pairs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert flags.parse_penalty(("k_n=1e5", "mu=0")) == {"k_n": 1e5, "mu": 0.0}
+    for wrong in ("k_n", "k_n=", "k_n=stiff"):
+        line = refusal(lambda wrong=wrong: flags.parse_penalty(["mu=1", wrong]), capsys)
+        assert line == f"script.py: --penalty takes pairs like k_n=1e5, not 'mu=1 {wrong}'"
+
+
+# Defaults -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
+def test_defaults_are_the_tables(script: ModuleType) -> None:
+    for env in diffsim.TASKS:
+        args = parse(script.Args, ["--env", env, "--device", "cpu"])
+        expected = dict(zip(script.COLUMNS, script.PER_TASK[env], strict=True)) if env in script.PER_TASK else {}
+        if script is ppo_baseline:
+            expected |= {name: min(expected.get(name, most), most) for name, most in script.CPU.items()}
+        preset = diffsim.TASKS[env].integration("default")
+        expected |= dict(integrator=preset.integrator, substeps=preset.substeps, theta=preset.theta)
+        assert {name: getattr(args, name) for name in expected} == expected
+        assert re.fullmatch(rf"runs/{env}__{script.__name__}__1__\d+", str(args.run_dir))
+
+
+def test_the_command_line_is_before_the_task_is_before_the_class() -> None:
+    args = parse(shac.Args, "--env-id cartpole --actor-lr 3e-3 --substeps 7".split())
+    assert (args.env, args.actor_lr, args.critic_lr, args.gamma) == ("cartpole", 3e-3, 1e-3, 0.99)
+    assert (args.integrator, args.substeps) == ("semi_implicit", 7)
+    fast = diffsim.TASKS["humanoid"].integration("fast")
+    args = parse(shac.Args, "--env humanoid --accuracy fast --theta 0.25".split())
+    assert (args.integrator, args.substeps, args.theta) == (fast.integrator, fast.substeps, 0.25)
+    args = parse(shac.Args, ["--env", "cartpole", "--general-hyperparameters", "--num-envs", "3"])
+    assert (args.iterations, args.num_envs, args.actor_hidden, args.target_alpha) == (500, 3, (256, 128), 0.995)
+
+
+@pytest.mark.parametrize("env", ["cartpole", "ant"])
+def test_a_switch_can_be_turned_on_and_off_whatever_its_default(env: str) -> None:
+    """Observations are normalized for the ant and not for the cartpole."""
+    for word, value in (("--normalize-obs", True), ("--no-normalize-obs", False)):
+        assert parse(bptt.Args, ["--env", env, word]).normalize_obs == value
+    quiet = parse(shac.Args, ["--env", env, "--quiet", "--no-critic", "--no-cuda-graph"])
+    assert (quiet.quiet, quiet.critic, quiet.cuda_graph) == (True, False, False)
+    for word, value in (("--quiet", True), ("--no-quiet", False)):
+        assert parse(shac.Args, ["--resume", str(save(quiet)), word]).quiet == value
+
+
+def test_the_command_line_is_before_the_checkpoint_is_before_the_task() -> None:
+    arguments = "--env cartpole --device cpu --num-envs 5 --gamma 0.9 --stop-after 5 --run-dir there --accuracy fast"
+    path = save(parse(shac.Args, arguments.split()))
+    args = parse(shac.Args, ["--resume", str(path), "--td-lambda", "0.5", "--stop-after", "7"])
+    assert (args.num_envs, args.gamma, args.td_lambda, args.actor_lr, args.stop_after) == (5, 0.9, 0.5, 1e-2, 7)
+    assert (args.run_dir, args.resume, args.evaluate, args.device) == (path.parent, path, None, "cpu")
+    assert parse(shac.Args, ["--evaluate", str(path)]).run_dir == path.parent
+    assert parse(shac.Args, ["--evaluate", str(path), "--run-dir", "here"]).run_dir == Path("here")
+    assert parse(shac.Args, ["--resume", str(path), "--device", "auto", "--stop-after", "6"]).device == "cpu"
+
+
+def test_accuracy_and_penalty_are_stored_and_can_be_replaced() -> None:
+    fast, accurate = (diffsim.TASKS["cartpole"].integration(name) for name in ("fast", "accurate"))
+    path = save(parse(shac.Args, "--env cartpole --accuracy fast --penalty k_limit=50 mu=0.5".split()))
+
+    def simulator(*arguments: str) -> tuple[diffsim.Simulator, tuple[str, int, float]]:
+        args = parse(shac.Args, ["--evaluate", str(path), *arguments])
+        return make_env(args, 1).sim, (args.integrator, args.substeps, args.theta)
+
+    sim, numbers = simulator()
+    assert numbers == (fast.integrator, fast.substeps, fast.theta)
+    assert (set(sim.scene.k_limit), sim.scene.mu) == ({50.0}, 0.5)
+    for words in (["--accuracy", "accurate"], ["--accuracy=accurate"]):
+        assert simulator(*words)[1] == (accurate.integrator, accurate.substeps, accurate.theta)
+    assert simulator("--accuracy", "accurate", "--substeps", "2")[1] == (accurate.integrator, 2, accurate.theta)
+    sim, numbers = simulator("--substeps", "16", "--integrator", "semi_implicit", "--penalty", "k_limit=100")
+    assert numbers == ("semi_implicit", 16, 0.0)
+    assert (set(sim.scene.k_limit), sim.scene.mu) == ({100.0}, diffsim.make("cartpole", 1).scene.mu)
+
+
+def test_a_preset_that_a_task_lacks_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Bare(Task):
+        name, substeps = "bare", 8
+
+    monkeypatch.setitem(flags.TASKS, "bare", Bare)
+    assert parse(shac.Args, ["--env", "bare"]).substeps == 8
+    line = refusal(lambda: parse(shac.Args, ["--env", "bare", "--accuracy", "fast"]), capsys)
+    assert "'bare' has no preset 'fast'" in line
+
+
+def test_what_a_checkpoint_decides(capsys: pytest.CaptureFixture[str]) -> None:
+    path = save(parse(shac.Args, "--env cartpole --num-envs 3 --device cpu".split()))
+    for argument, saved in (
+        ("--env ant", "--env cartpole, not ant"),
+        ("--num-envs 4", "--num-envs 3, not 4"),
+        ("--actor-hidden 64", "--actor-hidden (64, 64), not (64,)"),
+        ("--critic-hidden 64", "--critic-hidden (64, 64), not (64,)"),
+        ("--deterministic-policy", "--deterministic-policy False, not True"),
+        ("--no-critic", "--critic True, not False"),
+    ):
+        for mode in ("--resume", "--evaluate"):
+            command = [mode, str(path), *argument.split()]
+            line = refusal(lambda command=command: parse(shac.Args, command), capsys)
+            assert line == f"script.py: {path} has {saved}"
+
+
+def test_a_checkpoint_with_flags_that_the_script_lacks_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    path = save(parse(shac.Args, ["--env", "cartpole"]), old_flag=3)
+    line = refusal(lambda: parse(shac.Args, ["--resume", str(path)]), capsys)
+    assert line == f"script.py: {path} was written by a shac.py with other flags: --old-flag"
+
+
+# Help -----------------------------------------------------------------------------------------------------------------
+
+
+def help_of(script: ModuleType, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Without boxes and line breaks."""
+    with pytest.raises(SystemExit) as exit:
+        script.main([*arguments, "--help"])
+    assert exit.value.code == 0
+    return re.sub(r"[│╭╮╰╯─\s]+", " ", capsys.readouterr().out)
+
+
+def default(text: str, name: str) -> str:
+    """What help says that a flag is by default."""
+    match = re.search(rf"{name} [A-Z{{[].*?\(default: ([^)]*)\)", text)
+    assert match, name
+    return match.group(1)
+
+
+def test_help_shows_the_defaults_of_the_task_and_the_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of(shac, capsys, "--env", "humanoid")
+    assert (default(text, "--substeps"), default(text, "--target-alpha")) == ("48", "0.995")
+    assert (default(text, "--actor-hidden"), default(text, "--critic-hidden")) == ("256 128", "128 128")
+    text = help_of(shac, capsys, "--env", "humanoid", "--accuracy", "fast")
+    assert (default(text, "--integrator"), default(text, "--substeps")) == ("implicit", "24")
+    text = help_of(bptt, capsys, "--env", "cartpole")
+    assert (default(text, "--horizon"), default(text, "--hidden")) == ("64", "64 64")
+    text = help_of(ppo_baseline, capsys, "--device", "cpu")
+    assert (default(text, "--num-envs"), default(text, "--minibatch-size")) == ("256", "2048")
+    path = save(parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"]))
+    assert default(help_of(shac, capsys, "--resume", str(path)), "--gamma") == "0.9"
+
+
+@pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
+def test_help_groups_flags_and_explains_each(script: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    text = help_of(script, capsys)
+    groups = (script.__name__.replace("_", "-"), "parallel", "simulator", "run")
+    places = [text.index(f" {title} options ") for title in groups]
+    assert places == sorted(places)
+    for own, name in ((0, "--gamma"), (1, "--num-envs"), (2, "--substeps"), (3, "--resume")):
+        if not (script is not shac and name == "--num-envs"):  # which declare it anew, with another default
+            end = places[own + 1] if own < 3 else len(text)
+            assert places[own] < text.index(f"{name} ", places[0]) < end, name
+    for kind in script.Args.__mro__[:-1]:
+        for explanation in flags._help_texts(kind).values():
+            assert explanation.split(" (")[0][:40] in text

@@ -1,0 +1,89 @@
+"""Running statistics against those of all data at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from diffsim.training import ObsNormalizer, moments
+
+MEAN, STD = (0, 5, -100, 1e-3), (1, 10, 0.1, 1e-3)
+
+
+@pytest.fixture
+def windows(rng: np.random.Generator) -> list[np.ndarray]:
+    return [rng.normal(MEAN, STD, size=(8, 6, 4)) for _ in range(20)]
+
+
+def test_statistics_are_those_of_all_data(windows: list[np.ndarray]) -> None:
+    normalizer, probe = ObsNormalizer(4), torch.randn(5, 4)
+    torch.testing.assert_close(normalizer(probe), probe)  # nothing seen yet
+    for window in windows:
+        normalizer.update(torch.tensor(window, dtype=torch.float32))
+    data = np.concatenate(windows).reshape(-1, 4)
+    assert normalizer.count == len(data)
+    np.testing.assert_allclose(normalizer.mean, data.mean(0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(normalizer.var, data.var(0), rtol=1e-3)
+    expected = (probe.double() - torch.tensor(data.mean(0))) / torch.tensor(data.var(0) + 1e-5).sqrt()
+    torch.testing.assert_close(normalizer(probe).double(), expected, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(normalizer.inverse(normalizer(probe)), probe, rtol=1e-4, atol=1e-4)
+
+
+def test_statistics_of_scalars(windows: list[np.ndarray]) -> None:
+    normalizer = ObsNormalizer()
+    for window in windows:
+        normalizer.update(torch.tensor(window[..., 1], dtype=torch.float32))
+    data = np.concatenate(windows)[..., 1]
+    assert normalizer.count == data.size
+    for buffer in (normalizer.mean, normalizer.var, normalizer.std):
+        assert buffer.shape == () and buffer.dtype == torch.float32
+    assert normalizer.mean.item() == pytest.approx(data.mean(), rel=1e-3)
+    assert normalizer.var.item() == pytest.approx(data.var(), rel=1e-3)
+    probe = torch.randn(3, 2)
+    expected = (probe.numpy() - data.mean()) / np.sqrt(data.var() + 1e-5)
+    np.testing.assert_allclose(normalizer(probe), expected, rtol=1e-3)
+    torch.testing.assert_close(normalizer.inverse(normalizer(probe)), probe)
+
+
+@pytest.mark.parametrize("shape", [(), (4,)])
+def test_counting_does_not_end_at_the_last_integer_of_float32(rng: np.random.Generator, shape: tuple[int, ...]) -> None:
+    """After 2^24 samples of mean 2 and variance 3, a quarter as many more of mean 6, variance 1, in single windows."""
+    normalizer = ObsNormalizer(*shape)
+    normalizer.count.fill_(2**24)
+    normalizer.mean.fill_(2.0)
+    normalizer.var.fill_(3.0)
+    normalizer.update(torch.zeros(1, *shape))
+    assert normalizer.count.item() == 2**24 + 1
+    values = torch.tensor([5.0, 7.0]).repeat(2**19).reshape(-1, *[1] * len(shape)).expand(-1, *shape)
+    for _ in range(4):
+        normalizer.update(values)
+    new = 4 * len(values) + 1
+    assert new == 2**22 + 1 and normalizer.count.item() == 2**24 + new
+    mean = (2.0 * 4 + 6.0) / 5
+    var = (4 * (3.0 + 2.0**2) + 1.0 + 6.0**2) / 5 - mean**2
+    np.testing.assert_allclose(normalizer.mean, np.full(shape, mean), rtol=1e-5)
+    np.testing.assert_allclose(normalizer.var, np.full(shape, var), rtol=1e-5)
+    normalizer.update(torch.zeros(1, *shape))
+    assert normalizer.count.item() == 2**24 + new + 1
+
+
+def test_statistics_are_saved_and_change_in_updates_alone() -> None:
+    normalizer, other = ObsNormalizer(3), ObsNormalizer(3)
+    normalizer.update(torch.randn(10, 3) + 1.0)
+    before = {name: value.clone() for name, value in normalizer.state_dict().items()}
+    assert before.keys() == {"count", "mean", "var", "std"} and not list(normalizer.parameters())
+    x = torch.randn(4, 3, requires_grad=True)
+    (gradient,) = torch.autograd.grad(normalizer(x).sum(), x)
+    torch.testing.assert_close(gradient, (1 / normalizer.std).expand(4, 3))
+    for name, value in normalizer.state_dict().items():
+        assert torch.equal(value, before[name])
+    other.load_state_dict(before)
+    assert torch.equal(other(x), normalizer(x))
+
+
+def test_moments(rng: np.random.Generator) -> None:
+    x = rng.normal(3.0, 2.0, size=(50, 4))
+    var, mean = moments(torch.tensor(x))
+    np.testing.assert_allclose(mean, x.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(var, x.var(0), rtol=1e-12)

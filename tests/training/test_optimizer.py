@@ -1,0 +1,100 @@
+"""ClippedAdam against torch's own Adam and clipping."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import torch
+from learners import assert_same
+from torch import nn
+
+from diffsim.training import ClippedAdam
+
+
+def network() -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 5), nn.ELU(), nn.LayerNorm(5), nn.Linear(5, 1))
+
+
+def test_it_is_adam_after_clipping_and_skips_bad_gradients() -> None:
+    torch.manual_seed(0)
+    ours, theirs = network(), network()
+    theirs.load_state_dict(ours.state_dict())
+    optimizer = ClippedAdam(ours, 0.5, (0.7, 0.95))
+    optimizer.lr.fill_(1e-2)
+    reference = torch.optim.Adam(theirs.parameters(), lr=1e-2, betas=(0.7, 0.95))
+    for scale in (1.0, 1e-3, math.nan, 10.0, math.inf, 1e9, 1.0):
+        inputs = torch.randn(20, 3)
+        before = optimizer.vector.clone()
+        norm = optimizer.step(scale * ours(inputs).square().mean())
+        if norm < 1e6:
+            reference.zero_grad()
+            (scale * theirs(inputs).square().mean()).backward()
+            torch.testing.assert_close(norm, nn.utils.clip_grad_norm_(theirs.parameters(), 0.5))
+            reference.step()
+        else:
+            torch.testing.assert_close(optimizer.vector, before, rtol=0, atol=0)
+        for p, q in zip(ours.parameters(), theirs.parameters(), strict=True):
+            torch.testing.assert_close(p, q)
+    assert optimizer.skipped == 3
+
+
+def test_with_an_infinite_bound_large_gradients_are_followed_and_infinite_ones_skipped() -> None:
+    torch.manual_seed(0)
+    module = network()
+    optimizer = ClippedAdam(module, 1.0, (0.7, 0.95), lr=1e-2, skip_norm=math.inf)
+    reference = nn.Parameter(optimizer.vector.clone())
+    adam = torch.optim.Adam([reference], 1e-2, betas=(0.7, 0.95))
+    inputs = torch.randn(20, 3)
+    for scale in (1.0, 1e12, math.nan, math.inf, 1e3):
+        loss = scale * module(inputs).square().mean()
+        gradients = torch.autograd.grad(loss, optimizer.parameters, retain_graph=True)
+        gradient = torch.cat([g.flatten() for g in gradients])
+        norm = optimizer.step(loss)
+        if scale < math.inf:
+            torch.testing.assert_close(norm, gradient.norm())
+            reference.grad = gradient / norm.clamp(min=1.0)
+            adam.step()
+        torch.testing.assert_close(optimizer.vector, reference.detach())
+    assert optimizer.skipped == 2
+
+
+def test_what_requires_no_gradient_stays() -> None:
+    module = network()
+    module[0].bias.requires_grad_(False)
+    bias = module[0].bias.detach().clone()
+    optimizer = ClippedAdam(module, 1.0, lr=0.1)
+    before = optimizer.vector.clone()
+    optimizer.step(module(torch.randn(4, 3)).square().sum())
+    assert torch.equal(module[0].bias, bias) and (optimizer.vector != before).all()
+    assert optimizer.vector.numel() == sum(p.numel() for p in module.parameters()) - bias.numel()
+
+
+def test_it_goes_on_from_its_state() -> None:
+    """With the norm and the decay rates that it was built with, and a learning rate that can still be filled."""
+    torch.manual_seed(0)
+    module = network()
+    optimizer = ClippedAdam(module, 1.0, (0.7, 0.95), lr=1e-2)
+    inputs = torch.randn(3, 20, 3)
+    optimizer.step(module(inputs[0]).square().mean())
+    optimizer.step(math.nan * module(inputs[0]).square().mean())
+    weights, state = copy.deepcopy(module.state_dict()), copy.deepcopy(optimizer.state_dict())
+
+    def go_on(betas: tuple[float, float], lr: float | None = None) -> torch.Tensor:
+        module = network()
+        module.load_state_dict(weights)
+        optimizer = ClippedAdam(module, 1.0, betas)
+        optimizer.load_state_dict(state)
+        assert_same(optimizer.state_dict(), state)
+        assert optimizer.skipped == 1 and optimizer.lr == 1e-2
+        if lr is not None:
+            optimizer.lr.fill_(lr)
+        for batch in inputs[1:]:
+            optimizer.step(module(batch).square().mean())
+        return optimizer.vector
+
+    for batch in inputs[1:]:
+        optimizer.step(module(batch).square().mean())
+    assert torch.equal(go_on((0.7, 0.95)), optimizer.vector)
+    assert not torch.equal(go_on((0.9, 0.999)), optimizer.vector)
+    assert torch.equal(go_on((0.7, 0.95), 0.0), torch.cat([weight.flatten() for weight in weights.values()]))

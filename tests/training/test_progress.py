@@ -1,0 +1,138 @@
+"""progress.csv, tensorboard and the statistics of episodes."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from diffsim.training.progress import COLUMNS, EpisodeStatistics, ProgressFile, ProgressLog, column
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def row(iteration: int, **values: float) -> dict[str, float]:
+    return {"iteration": iteration, "control_steps": 10 * iteration, "seconds": 0.5} | values
+
+
+def test_columns_are_named_after_scalars() -> None:
+    names = {
+        "charts/episodic_return": "return",
+        "charts/episodic_length": "length",
+        "charts/SPS": "charts_SPS",
+        "eval/return": "eval_return",
+        "losses/actor": "losses_actor",
+        "time/sim_forward": "time_sim_forward",
+    }
+    assert {name: column(name) for name in names} == names
+
+
+def test_columns_join_when_they_first_have_a_value(tmp_path: Path) -> None:
+    path = tmp_path / "progress.csv"
+    file = ProgressFile(path, 0)
+    assert path.read_text().split() == [",".join(COLUMNS)]
+    file.write(row(1, loss=0.25))
+    file.write(row(2, loss=0.5))
+    assert [r["loss"] for r in read(path)] == ["0.25", "0.5"]  # without a close: what is written can be read
+    file.write(row(3, eval=7.0, loss=0.75))
+    file.write(row(4, loss=1.0))
+    file.write(row(5, eval=8.0))
+    file.close()
+    assert list(read(path)[0]) == [*COLUMNS, "loss", "eval"]
+    assert [r["loss"] for r in read(path)] == ["0.25", "0.5", "0.75", "1.0", ""]
+    assert [r["eval"] for r in read(path)] == ["", "", "7.0", "", "8.0"]
+    assert [r["control_steps"] for r in read(path)] == ["10", "20", "30", "40", "50"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_resumed_run_goes_on_after_its_checkpoint(tmp_path: Path) -> None:
+    """Without what a crash left behind: later rows, and half of a line."""
+    path = tmp_path / "progress.csv"
+    file = ProgressFile(path, 0)
+    for k in range(1, 11):
+        file.write(row(k, loss=float(k)) | ({"eval": 1.0} if k == 9 else {}))
+    file.close()
+    with path.open("a") as text:
+        text.write("1")  # of 11,110,...
+    file = ProgressFile(path, 6)
+    file.write(row(7, loss=-7.0))
+    file.write(row(8, loss=-8.0, speed=2.0))
+    file.close()
+    rows = read(path)
+    assert [r["iteration"] for r in rows] == [str(k) for k in range(1, 9)]
+    assert [r["loss"] for r in rows] == [f"{k}.0" for k in range(1, 7)] + ["-7.0", "-8.0"]
+    assert [r["speed"] for r in rows] == [""] * 7 + ["2.0"] and not any(r["eval"] for r in rows)
+    ProgressFile(path, 0).close()  # another run, from the start
+    assert read(path) == []
+    path.unlink()
+    ProgressFile(path, 6).close()  # resumed where only the checkpoint was kept
+    assert read(path) == []
+
+
+def test_a_crash_while_columns_join_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "progress.csv"
+    file = ProgressFile(path, 0)
+    file.write(row(1, loss=0.25))
+    before = path.read_text()
+
+    def crash(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="no space"):
+        patch.setattr("os.replace", crash)
+        file.write(row(2, eval=1.0))
+    assert path.read_text() == before
+
+
+def test_episode_statistics_are_of_the_newest_windows_with_a_hundred_episodes() -> None:
+    statistics = EpisodeStatistics()
+    assert all(math.isnan(mean) for mean in statistics.means())
+    statistics.add(0, 0.0, 0.0)
+    assert not statistics.windows
+    statistics.add(60, 600.0, 6000.0)
+    assert statistics.means() == (10.0, 100.0)
+    statistics.add(30, 600.0, 3000.0)
+    assert statistics.means() == (1200 / 90, 100.0)
+    statistics.add(70, 700.0, 700.0)  # with the second as many as a hundred: the first is forgotten
+    assert statistics.means() == (1300 / 100, 3700 / 100)
+    statistics.add(0, 0.0, 0.0)
+    assert statistics.means() == (1300 / 100, 3700 / 100)
+    statistics.add(500, 500.0, 500.0)
+    assert statistics.means() == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], quiet: bool) -> None:
+    log = ProgressLog(tmp_path, 0, 0, {"gamma": 0.99, "hidden": (64, 64)}, total=4, quiet=quiet)
+    for k in range(1, 4):
+        log.write(k, 10 * k, 0.12345 * k, {"losses/actor": 1 / 3, "charts/episodic_return": 12.34})
+    log.message("a line")
+    log.close()
+    rows = read(tmp_path / "progress.csv")
+    assert [r["control_steps"] for r in rows] == ["10", "20", "30"]
+    filled = dict(iteration="2", control_steps="20", seconds="0.247", losses_actor="0.3333333") | {"return": "12.34"}
+    assert rows[1] == dict.fromkeys(COLUMNS, "") | filled
+    out = capsys.readouterr().out
+    if quiet:
+        assert out == ""
+    else:
+        assert "a line\n" in out and "3/4" in out and "it/s" in out and "return 12.3" in out
+
+    resumed = ProgressLog(tmp_path, 2, 20, {}, total=4, quiet=True)
+    resumed.write(3, 30, 1.0, {"losses/actor": 0.5})
+    resumed.close()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert [(e.step, e.value) for e in events.Scalars("losses/actor")] == [
+        (10, pytest.approx(1 / 3)),
+        (20, pytest.approx(1 / 3)),
+        (30, 0.5),
+    ]
+    (text,) = events.Tensors("hyperparameters/text_summary")[:1]
+    assert text.tensor_proto.string_val[0].decode() == "|name|value|\n|-|-|\n|gamma|0.99|\n|hidden|(64, 64)|"

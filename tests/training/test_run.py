@@ -1,0 +1,292 @@
+"""A run: when it evaluates, saves and stops, what it counts, prints and logs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from learners import SMALL, read_progress, refusal, run
+from torch import Tensor, nn
+
+import bptt
+import diffsim
+import shac
+from diffsim.env import DiffEnv
+from diffsim.training import Evaluation, Run, checkpoint, evaluate, parse
+from diffsim.training import run as run_module
+from diffsim.training.progress import COLUMNS
+
+# Iterations of a few milliseconds.
+TINY = "--env cartpole --num-envs 2 --horizon 8 --eval-episodes 1 --device cpu".split()
+
+
+@pytest.fixture(autouse=True)
+def named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["bptt.py"])
+
+
+# When it evaluates, saves and stops -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "evaluated", "saved"),
+    [
+        ("--iterations 7 --eval-every 3 --save-every 2", [3, 6, 7], [2, 4, 6, 7]),
+        ("--iterations 4 --eval-every 2 --save-every 4", [2, 4], [4]),
+        ("--iterations 5 --eval-every 0 --save-every 0", [5], [5]),
+        ("--iterations 5 --eval-every 2 --save-every 0 --stop-after 3", [2], [3]),
+        ("--iterations 5 --eval-every 0 --save-every 2 --stop-after 9", [5], [2, 4, 5]),
+    ],
+)
+def test_schedule(
+    arguments: str,
+    evaluated: list[int],
+    saved: list[int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    iterations, save = list[int](), checkpoint.save
+
+    def record(path: Path, script: str, learner: checkpoint.Learner, state: Mapping[str, Any]) -> None:
+        iterations.append(state["iteration"])
+        save(path, script, learner, state)
+
+    monkeypatch.setattr(checkpoint, "save", record)
+    run(bptt, tmp_path, *TINY, *arguments.split(), "--quiet")
+    assert iterations == saved
+    rows = read_progress(tmp_path)
+    assert [int(row["iteration"]) for row in rows if row.get("eval_return")] == evaluated
+    out, finished = capsys.readouterr().out, "--stop-after 3" not in arguments
+    assert ("stopped early: python bptt.py --resume" in out) != finished
+    assert (tmp_path / "evaluation.json").exists() == finished
+    assert f"evaluation of iteration {evaluated[-1]}, 1 episodes: return median" in out
+
+
+def test_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The first one lets the iteration end, saved; the same a second time has its usual effect."""
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    raised = []
+
+    def interrupted(count: int) -> Any:
+        def loss(*arguments: Any) -> Tensor:
+            for _ in range(count if not raised else 0):
+                raised.append(signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
+            return original(*arguments)
+
+        return loss
+
+    original = bptt.bptt_loss
+    arguments = *TINY, "--iterations", 5, "--quiet"
+    monkeypatch.setattr(bptt, "bptt_loss", interrupted(1))
+    with pytest.raises(SystemExit) as exit:
+        run(bptt, tmp_path / "once", *arguments)
+    assert exit.value.code == 128 + signal.SIGINT
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert checkpoint.load(tmp_path / "once" / "checkpoint.pt")["iteration"] == 1
+    assert len(read_progress(tmp_path / "once")) == 1
+    assert "stopped early" in capsys.readouterr().out
+
+    raised.clear()
+    monkeypatch.setattr(bptt, "bptt_loss", interrupted(2))
+    with pytest.raises(KeyboardInterrupt):
+        run(bptt, tmp_path / "twice", *arguments)
+    assert not (tmp_path / "twice" / "checkpoint.pt").exists()
+
+
+# What it counts -------------------------------------------------------------------------------------------------------
+
+
+def test_bad_gradients_and_states_are_counted_across_a_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the second iteration the loss is too large and an environment leaves the finite numbers."""
+    loss, collect, calls = shac.actor_loss, shac.collect, []
+
+    def sometimes_large(*arguments: Any) -> Tensor:
+        return loss(*arguments) * (1e12 if len(calls) == 2 else 1.0)
+
+    def sometimes_thrown(env: DiffEnv, *arguments: Any) -> shac.Rollout:
+        calls.append(1)
+        if len(calls) == 2:
+            env.qvel = env.qvel.clone()
+            env.qvel[1] = torch.inf
+        return collect(env, *arguments)
+
+    monkeypatch.setattr(shac, "actor_loss", sometimes_large)
+    monkeypatch.setattr(shac, "collect", sometimes_thrown)
+    saved = run(shac, tmp_path, *SMALL["shac"], "--stop-after", 3)
+    optimizer = saved["modules"]["actor_optimizer"]
+    assert optimizer["skipped"] == 1 and optimizer["adam"][0]["step"] == 2
+    assert saved["totals"] == {"sim/nonfinite": 1, "sim/nonfinite_gradients": 0}
+    summary = "skipped 1 updates, contained 1 non-finite states and 0 gradients"
+    assert summary in capsys.readouterr().out
+    shac.main(["--resume", str(tmp_path / "checkpoint.pt"), "--stop-after", "5"])
+    assert summary in capsys.readouterr().out
+    for name in ("grad_skipped", "sim_nonfinite"):
+        assert [float(row[name]) for row in read_progress(tmp_path)] == [0, 1, 1, 1, 1]
+
+
+def test_bad_adjoints_are_counted_across_a_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simulator counts them; each iteration is to add what came in it."""
+    collect, calls = bptt.collect, []
+
+    def counted(env: DiffEnv, *arguments: Any) -> bptt.Rollout:
+        calls.append(1)
+        env.sim.nonfinite_gradients += len(calls)  # in each of two environments
+        return collect(env, *arguments)
+
+    monkeypatch.setattr(bptt, "collect", counted)
+    run(bptt, tmp_path, *TINY, "--iterations", 4, "--stop-after", 2, "--quiet")
+    bptt.main(["--resume", str(tmp_path / "checkpoint.pt")])
+    assert [float(row["sim_nonfinite_gradients"]) for row in read_progress(tmp_path)] == [2, 6, 12, 20]
+
+
+def test_other_hyperparameters_hold_from_a_resume_on(tmp_path: Path) -> None:
+    ends = []
+    run(bptt, tmp_path / "start", *TINY, "--iterations", 4, "--stop-after", 2, "--quiet")
+    for arguments in ([], ["--betas", "0.9", "0.999"], ["--max-grad-norm", "1e-6"], ["--gamma", "0.5"]):
+        path = shutil.copytree(tmp_path / "start", tmp_path / str(len(ends))) / "checkpoint.pt"
+        bptt.main(["--resume", str(path), *arguments])
+        ends.append(checkpoint.load(path)["modules"]["actor"]["mean.0.weight"])
+    assert all(not torch.equal(end, ends[0]) for end in ends[1:])
+
+
+# What it shows --------------------------------------------------------------------------------------------------------
+
+
+def test_progress_and_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = *TINY, "--iterations", 3, "--eval-every", 2
+    run(bptt, tmp_path / "loud", *arguments)
+    out = capsys.readouterr().out
+    assert "3/3" in out and "it/s" in out and "iteration 2: return median" in out
+    summary = out[out.index("cartpole: 3 iterations, 48 control steps, ") :]
+    assert "evaluation of iteration 3, 1 episodes: return median" in summary
+    assert f"written to {tmp_path / 'loud'}" in summary
+    run(bptt, tmp_path / "quiet", *arguments, "--quiet")
+    out = capsys.readouterr().out
+    assert out.startswith("cartpole: 3 iterations, ") and "it/s" not in out
+
+
+def test_track(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    calls = []
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **arguments: calls.append(arguments)))
+    run(bptt, tmp_path / "there", *TINY, "--iterations", 1, "--quiet", "--track")
+    (call,) = calls
+    assert (call["project"], call["name"], call["dir"]) == ("diffsim", "there", tmp_path / "there")
+    assert call["config"]["num_envs"] == 2 and call["sync_tensorboard"]
+
+    monkeypatch.setitem(sys.modules, "wandb", None)  # import fails
+    missing = tmp_path / "missing"
+    line = refusal(lambda: run(bptt, missing, *TINY, "--track"), capsys)
+    assert line == "bptt.py: --track needs Weights & Biases: pip install wandb"
+    assert not missing.exists()
+
+
+def test_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of the last evaluation; what is missing to draw it is named, after everything else is written."""
+    films = []
+
+    def film(self: Evaluation, path: Path) -> Path:
+        films.append(path)
+        return path.with_suffix(".gif")
+
+    monkeypatch.setattr(Evaluation, "save_video", film)
+    run(bptt, tmp_path, *TINY, "--iterations", 2, "--eval-every", 1, "--quiet", "--capture-video")
+    assert capsys.readouterr().out.endswith(f"video: {tmp_path / 'video.gif'}\n")
+    bptt.main(["--evaluate", str(tmp_path / "checkpoint.pt")])
+    assert films == [tmp_path / "video.mp4"] * 2
+
+    def no_library(self: Evaluation, path: Path) -> Path:
+        raise RuntimeError("MuJoCo finds no OpenGL to draw with")
+
+    monkeypatch.setattr(Evaluation, "save_video", no_library)
+    (tmp_path / "evaluation.json").unlink()
+    with pytest.raises(SystemExit) as exit:
+        bptt.main(["--evaluate", str(tmp_path / "checkpoint.pt")])
+    assert exit.value.code == 2
+    assert capsys.readouterr().err == "bptt.py: MuJoCo finds no OpenGL to draw with\n"
+    assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["iteration"] == 2
+
+
+# By itself ------------------------------------------------------------------------------------------------------------
+
+
+class Counter:
+    """A learner that needs no environment: it counts."""
+
+    def __init__(self) -> None:
+        self.policy = nn.Sequential(nn.Linear(5, 1))
+        self.modules: dict[str, checkpoint.Stateful] = {"policy": self.policy}
+
+    @property
+    def bias(self) -> Tensor:
+        return self.policy.get_parameter("0.bias")
+
+    def update(self) -> dict[str, Tensor]:
+        with torch.no_grad():
+            self.bias.add_(1)
+        return {"losses/bias": self.bias[0]}
+
+
+def count(args: bptt.Args) -> Counter:
+    """Control steps are counted by the learner, numbers of the host are logged beside those of the device."""
+    run = Run(args)
+    eval_env, counter = run.make_eval_env(), run.restore(Counter())
+    update = run.capture(counter.update)
+    for iteration in run:
+        run.log(update() | {"charts/square": iteration**2}, control_steps=100 * iteration)
+        if run.evaluation_due:
+            evaluation = evaluate(eval_env, counter.policy)
+            evaluation.others["further"] = 3.5
+            run.log_evaluation(evaluation)
+    return counter
+
+
+def test_a_learner_without_training_environments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [*TINY, "--iterations", "4", "--eval-every", "3", "--run-dir", str(tmp_path)]
+    count(parse(bptt.Args, [*arguments, "--stop-after", "2", "--quiet"]))
+    drawn = torch.rand(1)
+    counter = count(parse(bptt.Args, ["--resume", str(tmp_path / "checkpoint.pt")]))
+    assert torch.equal(drawn, torch.rand(1))  # random numbers go on too
+    rows = read_progress(tmp_path)
+    assert [row["control_steps"] for row in rows] == ["100", "200", "300", "400"]
+    assert [float(row["charts_square"]) for row in rows] == [1, 4, 9, 16]
+    losses = [float(row["losses_bias"]) for row in rows]
+    assert losses == pytest.approx([losses[0] + k for k in range(4)]) and losses[3] == pytest.approx(
+        counter.bias.item()
+    )
+    assert [row["eval_further"] for row in rows] == ["", "", "3.5", "3.5"]
+    assert all(float(row["time_update"]) > 0 for row in rows)
+    own = {"charts_square", "charts_SPS", "losses_bias", "time_update", "time_total", "eval_further"}
+    assert rows[0].keys() == own | {*COLUMNS}
+    seconds = [float(row["seconds"]) for row in rows]
+    assert seconds == sorted(seconds)
+    total = sum(float(row["time_total"]) for row in rows)
+    assert seconds[-1] == pytest.approx(total, abs=1e-3)
+    assert "skipped" not in capsys.readouterr().out
+
+
+def test_episode_metrics() -> None:
+    env = diffsim.make("cartpole", num_envs=2, horizon=1)
+    env.sim.nonfinite_gradients += 3
+    done = torch.tensor([[False, True], [True, False], [False, True]])
+    episode = {"r": torch.tensor([[1.0, 2.0], [4.0, 8.0], [16.0, 32.0]]), "l": torch.tensor([[1, 2], [3, 4], [5, 6]])}
+    metrics = run_module.episode_metrics(env, done, episode, nonfinite=done & (episode["l"] > 2))
+    assert {name: value.item() for name, value in metrics.items()} == {
+        "episodes/count": 3,
+        "episodes/return": 38.0,
+        "episodes/length": 11,
+        "sim/nonfinite": 2,
+        "sim/nonfinite_gradients": 6,
+    }
+    assert not env.sim.nonfinite_gradients.any()

@@ -1,0 +1,61 @@
+"""Where the GPU's time of one SHAC iteration goes: the kernels of its two CUDA graphs, by torch.profiler.
+
+python tools/kernels.py hopper                     the iteration's two tables
+python tools/kernels.py ant --num-envs 1024        what follows the task goes to shac.py
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import mkdtemp
+
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+import diffsim
+from diffsim.training import fail, graph
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import shac  # noqa: E402
+
+ITERATION, LAST, ROWS = 12, 14, 30  # the one that is profiled, how many there are, kernels per table
+Half = Callable[[], dict[str, torch.Tensor]]
+capture = graph.capture
+
+
+def profiled(function: Half, device: torch.device, env: diffsim.DiffEnv | None) -> Half:
+    """graph.capture, whose twelfth call prints a table of its kernels."""
+    replay, calls = capture(function, device, env), 0
+
+    def call() -> dict[str, torch.Tensor]:
+        nonlocal calls
+        calls += 1
+        if calls != ITERATION:
+            return replay()
+        with profile(activities=[ProfilerActivity.CUDA]) as record:
+            result = replay()
+            torch.cuda.synchronize()
+        kernels = defaultdict[str, list[float]](list)
+        for event in record.events() or ():
+            if event.device_type == torch.autograd.DeviceType.CUDA:
+                kernels[event.name].append(event.device_time)
+        busy, count = sum(map(sum, kernels.values())), sum(map(len, kernels.values()))
+        print(f"{function.__name__}: {count} kernels, {busy / 1e3:.2f} ms")
+        for name, times in sorted(kernels.items(), key=lambda item: -sum(item[1]))[:ROWS]:
+            print(f"{len(times):6d} x {sum(times) / len(times):8.2f} us = {sum(times) / 1e3:8.3f} ms  {name[:100]}")
+        return result
+
+    return call
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in diffsim.TASKS:
+        fail(f"give a task: {', '.join(diffsim.TASKS)}")
+    if not torch.cuda.is_available():
+        fail("PyTorch sees no CUDA GPU here, and on a CPU there are no graphs")
+    graph.capture = profiled  # type: ignore[assignment]
+    stop = ["--stop-after", str(LAST), "--eval-every", "0", "--quiet", "--run-dir", mkdtemp()]
+    shac.main(["--env", sys.argv[1], "--device", "cuda", *stop, *sys.argv[2:]])
