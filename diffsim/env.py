@@ -111,7 +111,7 @@ class DiffEnv(VectorEnv):
         return self.generator.initial_seed()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Start all episodes anew, or only those of options={"reset_mask": mask (N,) bool}.
+        """Start all episodes anew, and a window; or only the episodes of options={"reset_mask": mask (N,) bool}.
 
         Returns:
             obs (N, obs_dim) of all environments, and an empty info.
@@ -124,11 +124,11 @@ class DiffEnv(VectorEnv):
             if not isinstance(seed, Integral):
                 raise ValueError(f"seed is {seed!r}, must be one integer; a NumPy vector environment takes one each")
             self.generator.manual_seed(int(seed))
-        if len(rows) == self.num_envs:
-            self._restart()
-        else:
+        if options and "reset_mask" in options:
             self.begin(rows, self._uniform(len(rows)))
             self._draw_starts()
+        else:
+            self._restart()
         return self._obs, {}
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:

@@ -107,7 +107,7 @@ class NumpyVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         Raises:
             ValueError: seeds or a mask of another length, or a mask that is not bool.
         """
-        rows = self.env.masked(options).numpy()
+        rows = self.env.masked(options).numpy(force=True)
         self._seed(rows, seed)
         self._ended[rows] = False
         return self._begin(rows), {}

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 import diffsim  # noqa: F401  (registers the ids)
 
 
-class CleanRLVectorEnv(VectorWrapper[Any, Any, Any, Any, Any]):
+class CleanRLVectorEnv(VectorWrapper):
     """Observations normalized, as gymnasium's own wrapper refuses SAME_STEP; infos["final_info"] as a list of dicts."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:

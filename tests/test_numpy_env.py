@@ -270,6 +270,15 @@ def test_pictures() -> None:
     assert (lying != frame).any(-1).sum() > 1000
 
 
+@pytest.mark.filterwarnings("ignore:.*Box observation space")
+def test_gymnasiums_checker_draws() -> None:
+    env = gymnasium.make(HOPPER, render_mode="rgb_array")
+    env.reset()
+    draw(env)
+    if "human" not in env.metadata["render_modes"]:  # otherwise it would open a window
+        check_env(env.unwrapped)
+
+
 def test_modes_of_rendering() -> None:
     with pytest.raises(ValueError, match="render_mode 'depth'; choose from rgb_array, human"):
         diffsim.make("hopper", render_mode="depth")  # type: ignore[arg-type]
