@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from diffsim.training import distributed
 from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, export_policy, load_policy
+from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import (
@@ -31,6 +32,8 @@ __all__ = [
     "ClippedAdam",
     "Count",
     "Decay",
+    "Ensemble",
+    "EnsembleAdam",
     "Evaluation",
     "Finite",
     "Flags",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -43,17 +44,25 @@ class ClippedAdam:
         skip_norm: float = 1e6,
     ) -> None:
         self.parameters = [p for p in module.parameters() if p.requires_grad]
-        self.vector = nn.utils.parameters_to_vector(self.parameters).detach()
-        nn.utils.vector_to_parameters(self.vector, self.parameters)
+        self.vector = self._flatten(self.parameters).detach()
+        self._adopt(self.vector)
         self.lr = torch.full((), lr, device=self.vector.device)
         self.adam = ScaledAdam([self.vector], self.lr, betas, fused=True, capturable=self.vector.is_cuda)
         self.max_norm, self.skip_norm = max_norm, skip_norm
         self.skipped = torch.zeros_like(self.lr)
 
+    def _flatten(self, tensors: Sequence[Tensor]) -> Tensor:
+        """All numbers in one tensor."""
+        return torch.cat([tensor.flatten() for tensor in tensors])
+
+    def _adopt(self, vector: Tensor) -> None:
+        """Make the parameters views of it."""
+        nn.utils.vector_to_parameters(vector, self.parameters)
+
     def step(self, loss: Tensor) -> Tensor:
         """One descent step; returns the gradient's norm () before clipping."""
         gradients = torch.autograd.grad(loss, self.parameters)
-        self.vector.grad = distributed.average(torch.cat([gradient.flatten() for gradient in gradients]))
+        self.vector.grad = distributed.average(self._flatten(gradients))
         norm = torch.linalg.vector_norm(self.vector.grad)
         bad = (~(norm < self.skip_norm)).to(norm.dtype)
         self.adam.grad_scale = (norm / self.max_norm).clamp(min=1.0)

@@ -1,0 +1,133 @@
+"""Networks of one shape side by side, evaluated and optimised as one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from diffsim.training import distributed
+from diffsim.training.optimizer import ClippedAdam
+
+
+class Linears(nn.Module):
+    """E linear layers: (E, B, inputs) -> (E, B, outputs)."""
+
+    def __init__(self, layers: Sequence[nn.Linear]) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.stack([layer.weight.detach().T for layer in layers]))
+        self.bias = nn.Parameter(torch.stack([layer.bias.detach().unsqueeze(0) for layer in layers]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.baddbmm(self.bias, x, self.weight)
+
+    def __getitem__(self, e: int) -> nn.Linear:
+        layer = nn.Linear(*self.weight.shape[1:]).to(self.weight)
+        layer.load_state_dict({"weight": self.weight[e].T, "bias": self.bias[e, 0]})
+        return layer
+
+
+class LayerNorms(nn.Module):
+    """E layer normalisations: (E, B, width) -> (E, B, width)."""
+
+    def __init__(self, layers: Sequence[nn.LayerNorm]) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.stack([layer.weight.detach().unsqueeze(0) for layer in layers]))
+        self.bias = nn.Parameter(torch.stack([layer.bias.detach().unsqueeze(0) for layer in layers]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.addcmul(self.bias, F.layer_norm(x, x.shape[-1:]), self.weight)
+
+    def __getitem__(self, e: int) -> nn.LayerNorm:
+        layer = nn.LayerNorm(self.weight.shape[-1]).to(self.weight)
+        layer.load_state_dict({"weight": self.weight[e, 0], "bias": self.bias[e, 0]})
+        return layer
+
+
+class Ensemble(nn.Module):
+    """E networks of one shape as one: (E, B, inputs) -> (E, B, outputs), each on its own inputs.
+
+    Indexed by e, it gives a copy of the network e.
+
+    Args:
+        networks: chains of Linear, LayerNorm and layers without parameters, equal but for their weights.
+    """
+
+    def __init__(self, networks: Sequence[nn.Sequential]) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(*(_stack(layers) for layers in zip(*networks, strict=True)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.layers(x)
+        return y
+
+    def __getitem__(self, e: int) -> nn.Sequential:
+        return nn.Sequential(*(layer[e] if isinstance(layer, Linears | LayerNorms) else layer for layer in self.layers))
+
+
+def _stack(layers: Sequence[nn.Module]) -> nn.Module:
+    kind = type(layers[0])
+    if kind is nn.Linear:
+        return Linears([layer for layer in layers if isinstance(layer, nn.Linear)])
+    if kind is nn.LayerNorm:
+        return LayerNorms([layer for layer in layers if isinstance(layer, nn.LayerNorm)])
+    if list(layers[0].parameters()):
+        raise TypeError(f"no ensemble of {kind.__name__}: only of Linear, LayerNorm and layers without parameters")
+    return layers[0]
+
+
+class EnsembleAdam(ClippedAdam):
+    """ClippedAdam for each member of a population, which may own several networks; members can be tied.
+
+    Each network's gradient is clipped by itself, and a bad one counts as zero. Tied members hold equal weights and step
+    along the mean of their gradients: together they are one learner with the samples of all.
+
+    Args:
+        module: all of whose parameters have E = (networks of a member) * members as their first size, in this order.
+        members: how many.
+        max_norm, betas, skip_norm: see ClippedAdam.
+        tied: () whether the members are tied, 0 or 1; a captured graph reads its present value.
+    """
+
+    def __init__(
+        self,
+        module: nn.Module,
+        members: int,
+        max_norm: float,
+        betas: tuple[float, float],
+        tied: Tensor,
+        skip_norm: float = 1e6,
+    ) -> None:
+        self.members, self.tied = members, tied
+        super().__init__(module, max_norm, betas, skip_norm=skip_norm)
+
+    def _flatten(self, tensors: Sequence[Tensor]) -> Tensor:
+        """(networks, members, P)"""
+        return torch.cat([tensor.reshape(-1, self.members, tensor[0].numel()) for tensor in tensors], dim=-1)
+
+    def _adopt(self, vector: Tensor) -> None:
+        start = 0
+        for p in self.parameters:
+            end = start + p[0].numel()
+            p.data = vector.flatten(0, 1)[:, start:end].unflatten(1, p.shape[1:])
+            start = end
+
+    def step(self, loss: Tensor) -> Tensor:
+        """One descent step of each; returns the gradients' largest norm () before clipping."""
+        gradient = distributed.average(self._flatten(torch.autograd.grad(loss, self.parameters)))
+        if self.members > 1:
+            gradient = torch.where(self.tied > 0, gradient.mean(1, keepdim=True), gradient)
+        norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+        good = norm < self.skip_norm
+        self.vector.grad = torch.where(good, gradient / (norm / self.max_norm).clamp(min=1.0), 0.0)
+        self.adam.step()
+        self.skipped += (~good).sum()
+        return norm.max()
+
+    def tie(self, member: int) -> None:
+        """Give all members the weights and moments of one."""
+        for tensor in (self.vector, *self.adam.state[self.vector].values()):
+            if tensor.shape == self.vector.shape:
+                tensor.copy_(tensor[:, member : member + 1].clone().expand_as(tensor))

@@ -1,0 +1,388 @@
+"""SAPO, Soft Analytic Policy Optimization (Xing et al. 2025, https://arxiv.org/abs/2412.12089).
+
+SHAC with a maximum-entropy objective: the actor descends the gradient of a short window of simulated steps, with the
+policy's entropy as a part of the reward; two critics are fitted to the soft TD(lambda) returns of the same window.
+
+    python sapo.py --env humanoid --seed 1                                  train; writes a folder of runs/
+    python sapo.py --resume runs/humanoid__sapo__1__<time>/checkpoint.pt    continue an interrupted run exactly
+    python sapo.py --evaluate runs/humanoid__sapo__1__<time>/checkpoint.pt  evaluate its deterministic policy
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from diffsim import DiffEnv
+from diffsim.training import (
+    Count,
+    Decay,
+    Ensemble,
+    EnsembleAdam,
+    Finite,
+    Fraction,
+    ObsNormalizer,
+    ParallelFlags,
+    Positive,
+    Run,
+    Stateful,
+    Widths,
+    distributed,
+    episode_metrics,
+    evaluate,
+    evaluate_checkpoint,
+    fail,
+    parse,
+)
+
+# By measurement, docs/sapo.md; networks and learning rates of SHAC's where no other was better.
+# fmt: off
+COLUMNS = ("actor_hidden", "critic_hidden", "activation", "actor_lr", "critic_lr", "target_alpha", "initial_log_std",
+           "initial_target_entropy", "target_entropy", "population", "num_envs", "iterations")
+PER_TASK = {
+    "cartpole":     ((64, 64),      (64, 64),   "elu",  1e-2, 1e-3, 0.2,  -1.0,  0.0, -1.5,  1,   64,  500),
+    "hopper":       ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-4, 0.9,  -1.0,  0.0, -1.5,  8, 1024, 1500),
+    "half_cheetah": ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0,  1,  256, 2000),
+    "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0, 16, 2048, 2500),
+    "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200),
+    "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400),
+}
+CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
+ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
+LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
+SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
+# fmt: on
+
+
+@dataclass
+class Args(ParallelFlags):
+    """The algorithm. With --no-entropy --no-state-std --critics 1 --activation elu it is SHAC."""
+
+    FIXED = (
+        *ParallelFlags.FIXED,
+        *("actor_hidden", "critic_hidden", "state_std", "critics", "activation", "population"),
+    )
+
+    entropy: bool = True
+    """the policy's entropy is part of the reward"""
+    state_std: bool = True
+    """the standard deviation of the policy's noise depends on the state"""
+    critics: Count = 2
+    """value functions: the least of them makes the targets, their mean the actor's loss"""
+    activation: Literal["elu", "silu"] = "silu"
+    """nonlinearity of actor and critics (per task)"""
+    population: Count = 1
+    """members that learn side by side, each in its share of the environments, until one goes on (per task)"""
+    selection: Fraction = 0.5
+    """share of the iterations after which the best member goes on in all environments"""
+    initial_target_entropy: Finite = -0.5
+    """entropy per action, in nats, at which the temperature aims in the first iteration (per task)"""
+    target_entropy: Finite = -0.5
+    """and in the last; linear between them (per task)"""
+    initial_temperature: Positive = 1.0
+    """initial weight of the entropy in the reward"""
+    temperature_lr: Positive = 5e-3
+    """learning rate of the temperature's logarithm"""
+    horizon: Count = 32
+    """control steps h of a window (1/60 s each)"""
+    actor_hidden: Widths = (256, 128)
+    """units of the actor's hidden layers (per task)"""
+    critic_hidden: Widths = (128, 128)
+    """units of the critics' hidden layers (per task)"""
+    actor_lr: Positive = 2e-3
+    """initial learning rate of the actor (per task)"""
+    critic_lr: Positive = 5e-4
+    """initial learning rate of the critics (per task)"""
+    final_lr: Positive = 1e-5
+    """learning rate that both reach, linearly, after the last iteration"""
+    betas: tuple[Decay, Decay] = (0.7, 0.95)
+    """Adam's decay rates of the gradient's first and second moment"""
+    max_grad_norm: Positive = 1.0
+    """gradients of actors and critics are clipped to this norm"""
+    gamma: Fraction = 0.99
+    """discount factor"""
+    td_lambda: Fraction = 0.95
+    """lambda of the value estimation"""
+    target_alpha: Fraction = 0.2
+    """target critics <- alpha target critics + (1 - alpha) critics, each iteration (per task)"""
+    critic_iterations: Count = 16
+    """passes over a window's samples to fit the critics"""
+    critic_minibatches: Count = 4
+    """minibatches of a pass, contiguous in time"""
+    initial_log_std: Finite = -1.0
+    """initial log standard deviation of the policy's noise, before tanh (per task)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        if self.device == "cpu":
+            values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
+        return values
+
+    def check(self) -> None:
+        super().check()
+        if (self.num_envs // distributed.size()) % self.population:
+            fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+def mlp(inputs: int, hidden: Widths, activation: str) -> nn.Sequential:
+    """Linear, nonlinearity, LayerNorm per hidden layer."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), ACTIVATIONS[activation](), nn.LayerNorm(width)]
+        inputs = width
+    return nn.Sequential(*layers)
+
+
+def critic(args: Args, obs_dim: int) -> nn.Sequential:
+    network = mlp(obs_dim, args.critic_hidden, args.activation).append(nn.Linear(args.critic_hidden[-1], 1))
+    for layer in network:
+        if isinstance(layer, nn.Linear):
+            nn.init.orthogonal_(layer.weight, math.sqrt(2))
+            nn.init.zeros_(layer.bias)
+    return network
+
+
+class Actor(nn.Module):
+    """pi(a|s) of K members: tanh of a Gaussian. Observations are normalized by the statistics of all."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        K, width = args.population, args.actor_hidden[-1]
+        self.normalizer = ObsNormalizer(obs_dim)
+        self.body = Ensemble([mlp(obs_dim, args.actor_hidden, args.activation) for _ in range(K)])
+        self.mean = Ensemble([nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)])
+        spread = nn.Linear(width, action_dim)
+        with torch.no_grad():
+            spread.weight.mul_(0.1)
+            spread.bias.fill_(args.initial_log_std)
+        self.spread = Ensemble([nn.Sequential(spread)] * K) if args.state_std else None
+        self.log_std = nn.Parameter(torch.full((K, 1, action_dim), args.initial_log_std))
+        self.log_std.requires_grad_(not args.state_std)
+
+    def forward(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Of normalized observations (K, B, obs_dim): the actions, and minus their log density per action (K, B)."""
+        features = self.body(obs)
+        log_std = self.log_std if self.spread is None else self.spread(features).clamp(*LOG_STD)
+        u = self.mean(features) + log_std.exp() * noise
+        log_slope = 2 * (math.log(2) - u - F.softplus(-2 * u))  # of tanh
+        surprise = 0.5 * noise.square() + 0.5 * math.log(2 * math.pi) + log_std + log_slope
+        return torch.tanh(u), surprise.mean(-1)
+
+    def deterministic(self, member: int) -> nn.Sequential:
+        """The policy of a member without noise."""
+        return nn.Sequential(self.normalizer, *self.body[member], *self.mean[member], nn.Tanh())
+
+
+class Population(nn.Module):
+    """What a member has beside networks: its temperature and its running mean reward; and whether all are one."""
+
+    score: Tensor
+    tied: Tensor
+
+    def __init__(self, args: Args) -> None:
+        super().__init__()
+        self.log_temperature = nn.Parameter(torch.full((args.population, 1, 1), math.log(args.initial_temperature)))
+        self.register_buffer("score", torch.zeros(args.population))
+        self.register_buffer("tied", torch.zeros(()))
+
+
+# The algorithm --------------------------------------------------------------------------------------------------------
+
+
+class Rollout(NamedTuple):
+    """What happened in one window, time first: (H, N, ...)."""
+
+    obs: Tensor  # s_t, on which the policy acted
+    next_obs: Tensor  # s_{t+1}, before any reset
+    reward: Tensor
+    entropy: Tensor  # minus the action's log density, per action
+    terminated: Tensor
+    done: Tensor  # terminated or truncated
+    nonfinite: Tensor
+    episode_return: Tensor  # of the episode so far, as is the length
+    episode_length: Tensor
+
+
+class SAPO:
+    """All that the next iteration depends on, and its two halves.
+
+    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph. The N
+    environments are those of K members one after the other; the critics are the first ones of all members, then the
+    second ones.
+    """
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        obs_dim, samples = env.task.obs_dim, args.horizon * env.num_envs // args.population
+        self.actor = Actor(args, obs_dim, env.scene.nu).to(env.device)
+        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * args.population)]).to(env.device)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.population = Population(args).to(env.device)
+        options = args.population, args.max_grad_norm, args.betas, self.population.tied
+        self.actor_optimizer = EnsembleAdam(self.actor, *options)
+        self.critic_optimizer = EnsembleAdam(self.critics, *options)
+        self.temperature_optimizer = EnsembleAdam(self.population, *options)
+        self.temperature_optimizer.lr.fill_(args.temperature_lr)
+        self.target_entropy = torch.zeros((), device=env.device)
+        self.obs = torch.zeros(args.population, samples, obs_dim, device=env.device)  # the critics' samples
+        self.value = torch.zeros(args.population, samples, device=env.device)
+        self.modules: dict[str, Stateful] = {
+            "actor": self.actor,
+            "critics": self.critics,
+            "targets": self.targets,
+            "population": self.population,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+        }
+
+    @property
+    def policy(self) -> nn.Sequential:
+        """Of the member with the largest reward."""
+        return self.actor.deterministic(int(self.population.score.argmax()))
+
+    def prepare(self, iteration: int) -> None:
+        """The iteration's learning rates and target entropy; the members become one when it is time."""
+        args, done = self.args, (iteration - 1) / self.args.iterations
+        self.actor_optimizer.lr.fill_(args.actor_lr + (args.final_lr - args.actor_lr) * done)
+        self.critic_optimizer.lr.fill_(args.critic_lr + (args.final_lr - args.critic_lr) * done)
+        self.target_entropy.fill_(
+            args.initial_target_entropy + (args.target_entropy - args.initial_target_entropy) * done
+        )
+        if args.population > 1 and iteration == 1 + round(args.selection * args.iterations):
+            self.select(int(self.population.score.argmax()))
+
+    def select(self, member: int) -> None:
+        """From now on all members are this one, and learn from the samples of all."""
+        self.actor_optimizer.tie(member)
+        self.critic_optimizer.tie(member)
+        self.temperature_optimizer.tie(member)
+        for p in self.targets.parameters():
+            members = p.unflatten(0, (self.args.critics, -1))
+            members.copy_(members[:, member, None].clone().expand_as(members))
+        self.population.tied.fill_(1.0)
+
+    def update_actor(self) -> dict[str, Tensor]:
+        """Descend the soft loss of a window of all environments; keep the critics' samples of it."""
+        args, normalizer = self.args, self.actor.normalizer
+        rollout = collect(self.env, self.actor, args.horizon)
+        next_values = self.next_values(rollout)
+        reward = rollout.reward
+        if args.entropy:
+            temperature = self.population.log_temperature.detach().exp()
+            reward = reward + (temperature * self.by_member((1 + rollout.entropy) / 2)).movedim(0, 1).flatten(1)
+        loss = actor_loss(reward, next_values.mean(0), rollout.done, args.gamma)
+        norm = self.actor_optimizer.step(args.population * loss)
+        rollout = Rollout(*(tensor.detach() for tensor in rollout))
+        value = td_lambda(reward.detach(), next_values.detach().amin(0), rollout.done, args.gamma, args.td_lambda)
+        self.value.copy_(self.by_member(value).flatten(1))
+        self.obs.copy_(self.by_member(normalizer(rollout.obs)).flatten(1, 2))
+        normalizer.update(rollout.obs)
+        entropy = self.by_member(rollout.entropy).mean((1, 2))
+        gap = (entropy - self.target_entropy).detach()
+        self.temperature_optimizer.step((self.population.log_temperature.exp().flatten() * gap).sum())
+        self.population.score.lerp_(distributed.average(self.by_member(rollout.reward).mean((1, 2))), SCORE_RATE)
+        episode = {"r": rollout.episode_return, "l": rollout.episode_length}
+        metrics = episode_metrics(self.env, rollout.done, episode, rollout.nonfinite)
+        temperature = self.population.log_temperature.detach().exp().mean()
+        metrics |= {"charts/entropy": entropy.mean(), "charts/temperature": temperature}
+        return {"losses/actor": loss.detach(), "grad/norm": norm} | metrics
+
+    def by_member(self, tensor: Tensor) -> Tensor:
+        """(H, N, ...) -> (K, H, N / K, ...)."""
+        return tensor.unflatten(1, (self.args.population, -1)).movedim(1, 0)
+
+    def update_critic(self) -> dict[str, Tensor]:
+        """Fit the critics to the window's soft TD(lambda) returns, and let the target critics follow."""
+        args = self.args
+        obs, value = self.obs.repeat(args.critics, 1, 1), self.value.repeat(args.critics, 1)
+        batches = obs.chunk(args.critic_minibatches, 1), value.chunk(args.critic_minibatches, 1)
+        for _ in range(args.critic_iterations):
+            losses = []
+            for obs, value in zip(*batches, strict=True):
+                errors = (self.critics(obs).squeeze(-1) - value).square().mean(1)
+                self.critic_optimizer.step(errors.sum())
+                losses.append(errors.detach().mean())
+        for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
+            slow.lerp_(fast.detach(), 1 - args.target_alpha)
+        skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped
+        return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+
+    def next_values(self, rollout: Rollout) -> Tensor:
+        """Each critic's V(s_{t+1}) (C, H, N): of an episode's last state where its time ran out, zero if terminated."""
+        args = self.args
+        obs = self.by_member(self.actor.normalizer(rollout.next_obs)).flatten(1, 2).repeat(args.critics, 1, 1)
+        values = self.targets(obs).view(args.critics, args.population, args.horizon, -1).movedim(1, 2).flatten(2)
+        return torch.where(rollout.terminated, torch.zeros_like(values), values)
+
+
+def collect(env: DiffEnv, actor: Actor, horizon: int) -> Rollout:
+    """H steps of all environments from where they stand."""
+    steps = []
+    obs = env.detach()
+    members = len(actor.log_std)
+    for noise in torch.randn(horizon, members, env.num_envs // members, env.scene.nu, device=env.device).unbind():
+        action, entropy = actor(actor.normalizer(obs).unflatten(0, (members, -1)), noise)
+        next_obs, reward, terminated, truncated, info = env.step(action.flatten(0, 1))
+        ends = terminated, terminated | truncated, info["nonfinite"]
+        episode = info["episode"]["r"], info["episode"]["l"]
+        steps.append((obs, info["final_obs"], reward, entropy.flatten(), *ends, *episode))
+        obs = next_obs
+    return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
+
+
+def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
+    """SHAC's Eq. 5 of (H, N) steps: windows are cut at their dones, and the discount starts anew after them."""
+    t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
+    starts, ends = done.roll(1, 0), done.clone()
+    starts[0] = ends[-1] = True
+    age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values  # steps since the start or the last done
+    discount = gamma ** age.to(reward.dtype)
+    return -(discount * reward + discount * gamma * ends * next_value).mean()
+
+
+def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the window's end does."""
+    returns = torch.empty_like(reward)
+    following = next_value[-1]
+    for t in reversed(range(len(reward))):
+        following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))
+        following = returns[t] = reward[t] + gamma * following
+    return returns
+
+
+# The run --------------------------------------------------------------------------------------------------------------
+
+
+def train(args: Args) -> None:
+    run = Run(args)
+    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    sapo = run.restore(SAPO(args, env))
+    update_actor, update_critic = run.capture(sapo.update_actor, env), run.capture(sapo.update_critic)
+    for iteration in run:
+        sapo.prepare(iteration)
+        run.log(update_actor() | update_critic())
+        if run.evaluation_due:
+            run.log_evaluation(evaluate(eval_env, sapo.policy))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(Args, argv)
+    if args.evaluate:
+        evaluate_checkpoint(args)
+    else:
+        train(args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""An ensemble against its networks one by one, and its optimizer against one optimizer for each."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from diffsim.training import ClippedAdam, Ensemble, EnsembleAdam
+
+BETAS = (0.7, 0.95)
+
+
+def network() -> nn.Sequential:
+    chain = nn.Sequential(nn.Linear(3, 5), nn.SiLU(), nn.LayerNorm(5), nn.Linear(5, 2))
+    with torch.no_grad():
+        chain[2].weight.normal_()
+        chain[2].bias.normal_()
+    return chain
+
+
+def loss(outputs: Tensor) -> Tensor:
+    """Of (..., B, 2), summed over the networks."""
+    return outputs.square().mean((-1, -2)).sum()
+
+
+def test_it_is_its_networks_and_gives_them_back() -> None:
+    torch.manual_seed(0)
+    networks = [network() for _ in range(4)]
+    ensemble, x = Ensemble(networks), torch.randn(4, 7, 3)
+    for e, single in enumerate(networks):
+        torch.testing.assert_close(ensemble(x)[e], single(x[e]))
+        assert all(torch.equal(p, q) for p, q in zip(ensemble[e].parameters(), single.parameters(), strict=True))
+    with pytest.raises(TypeError, match="no ensemble of Conv1d: only of Linear, LayerNorm"):
+        Ensemble([nn.Sequential(nn.Conv1d(1, 1, 1))])
+
+
+def test_untied_members_learn_as_if_alone() -> None:
+    """Two networks of each of three members, one of which gets a bad gradient on the way."""
+    torch.manual_seed(0)
+    networks = [network() for _ in range(6)]
+    ensemble = Ensemble(networks)
+    together = EnsembleAdam(ensemble, 3, 0.5, BETAS, tied=torch.zeros(()))
+    alone = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in networks]
+    together.lr.fill_(1e-2)
+    for scale in (1.0, 1e-4, 30.0, 1.0):
+        x = torch.randn(6, 9, 3)
+        parts = zip(alone, networks, x, strict=True)
+        norms = [optimizer.step(scale * loss(single(samples))) for optimizer, single, samples in parts]
+        torch.testing.assert_close(together.step(scale * loss(ensemble(x))), torch.stack(norms).max())
+        for e, single in enumerate(networks):
+            for p, q in zip(ensemble[e].parameters(), single.parameters(), strict=True):
+                torch.testing.assert_close(p, q)
+    before = together.vector.clone()
+    x[1, 0, 0] = math.nan
+    together.step(loss(ensemble(x)))
+    assert together.skipped == 1 and together.vector.isfinite().all()
+    assert (together.vector != before).any(-1).all()
+
+
+def test_tied_members_are_one_learner_with_the_samples_of_all() -> None:
+    torch.manual_seed(0)
+    networks = [network() for _ in range(6)]  # the first ones of three members, then the second ones
+    ensemble, tied = Ensemble(networks), torch.zeros(())
+    together = EnsembleAdam(ensemble, 3, 0.5, BETAS, tied)
+    together.lr.fill_(1e-2)
+    together.step(loss(ensemble(torch.randn(6, 9, 3))))
+    together.tie(1)
+    tied.fill_(1.0)
+    singles = [Ensemble([ensemble[e]]) for e in (1, 4)]
+    optimizers = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in singles]
+    for group, optimizer in enumerate(optimizers):
+        state = together.adam.state[together.vector]
+        moments = {name: state[name][group, 1].clone() for name in ("exp_avg", "exp_avg_sq")}
+        optimizer.adam.state[optimizer.vector].update(moments | {"step": state["step"].clone()})
+    for _ in range(3):
+        x = torch.randn(6, 9, 3)
+        together.step(loss(ensemble(x)))
+        for group, (single, optimizer) in enumerate(zip(singles, optimizers, strict=True)):
+            samples = x.unflatten(0, (2, 3))[group].flatten(0, 1)
+            optimizer.step(single(samples.unsqueeze(0)).square().mean())
+            for member in range(3):
+                for p, q in zip(ensemble[3 * group + member].parameters(), single[0].parameters(), strict=True):
+                    torch.testing.assert_close(p, q)
