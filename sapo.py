@@ -70,6 +70,8 @@ class Args(ParallelFlags):
         *("actor_hidden", "critic_hidden", "state_std", "critics", "activation", "population"),
     )
 
+    accuracy: Literal["fast", "default", "accurate"] = "fast"
+    """preset of integrator, substeps and theta (docs/accuracy.md)"""
     entropy: bool = True
     """the policy's entropy is part of the reward"""
     state_std: bool = True
