@@ -31,7 +31,7 @@ import tyro
 from numpy.typing import NDArray
 
 from diffsim import DiffEnv, render, web
-from diffsim.training import SavedPolicy, evaluate, fail, load_policy, make_policy_env
+from diffsim.training import SavedPolicy, describe, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED
 
 ROBOT = 1  # MuJoCo's first body after the world
@@ -114,6 +114,8 @@ def show(saved: SavedPolicy, args: Args) -> None:
         env = make_policy_env(saved, args.episodes, **changes)
         evaluation = evaluate(env, saved.network, args.seed)
         print(f"{name}, {args.episodes} episodes: {evaluation}")
+        if gait := describe(evaluation):
+            print(f"gait: {gait}")
         qpos, action = evaluation.median_episode(args.seconds)
         motion = env.scene, qpos, env.control_dt, action
         if args.video:

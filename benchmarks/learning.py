@@ -26,6 +26,7 @@ from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, pa
 from tables import ROOT, Row, markdown, read_csv
 
 from diffsim.training import Count, fail
+from diffsim.training.evaluation import ENOUGH
 
 POINTS = 100  # kept of each run
 PPO = "ppo_baseline"
@@ -169,7 +170,7 @@ def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[TaskNam
 def summaries(args: Args, learners: Sequence[str], tasks: Sequence[str]) -> list[Row]:
     """Lines of learning.csv, of all machines."""
     rows = [
-        {"machine": machine} | row | {"gate": "passed" if float(row["kept"] or 0) >= 0.97 else "failed"}
+        {"machine": machine} | row | {"gate": "passed" if float(row["kept"] or 0) >= ENOUGH else "failed"}
         for machine, path in args.machines("learning").items()
         for row in read_csv(path)
         if row["learner"] in learners and row["task"] in tasks

@@ -26,8 +26,8 @@ from tables import ROOT, read_csv
 import diffsim
 from diffsim.launcher import available_cores
 from diffsim.training import checkpoint
+from diffsim.training.evaluation import FINER, kept
 
-FINER = 4  # times the substeps, of the run's own and of the task's default
 COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return")  # kept of progress.csv
 Curve = dict[str, np.ndarray]
 R = TypeVar("R", bound="ScriptFlags")
@@ -94,10 +94,10 @@ class Runner:
     def evaluate(self, case: Case) -> bool:
         """Evaluate the checkpoint in all ways in which that is not done; whether it is now."""
         state = checkpoint.load(path := case.folder / "checkpoint.pt")
-        settings: dict[Path, list[object]] = {case.folder: []}
+        settings: dict[Path, list[object]] = {case.folder: ["--no-finer"]}
         for substeps in (state["args"]["substeps"], diffsim.TASKS[case.env].substeps):
             explicit = ["--integrator", "semi_implicit", "--theta", 0, "--substeps", FINER * substeps]
-            settings[finer(case.folder, substeps)] = explicit
+            settings[finer(case.folder, substeps)] = ["--no-finer", *explicit]
         return all(
             evaluation(folder, state["iteration"]) or self._call(case, "--evaluate", path, "--run-dir", folder, *flags)
             for folder, flags in settings.items()
@@ -184,7 +184,7 @@ def summary(directory: Path, env: str, targets: Sequence[float]) -> dict[str, ob
         "return": f"{own:.0f}",
         "each seed": " ".join(f"{found['return']:.0f}" for found in owns),
         f"explicit, substeps x{FINER}": f"{finest:.0f}",
-        "kept": f"{finest / own if own > 0 else own / finest:.3f}",
+        "kept": f"{kept(own, finest):.3f}",
         "in the reference": f"{reference:.0f}",
         "speed (m/s)": " ".join(f"{found['speed']:.2f}" for found in owns if found["speed"] is not None),
         "falls per episode": " ".join(f"{share:.2f}" for share in falls),

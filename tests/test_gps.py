@@ -356,7 +356,8 @@ def test_evaluation(trained: Path, rows: list[dict[str, str]], tmp_path: Path, s
     gps.main(["--evaluate", str(trained / "checkpoint.pt"), "--run-dir", str(tmp_path)])
     assert before == {path: path.read_bytes() for path in trained.iterdir()}
     again, training = (json.loads((path / "evaluation.json").read_text()) for path in (tmp_path, trained))
-    assert again == training and again["settings"]["substeps"] == 4 and again["lengths"] == [30] * 3
+    assert again.pop("finer")["substeps"] == 16 and again == training
+    assert again["settings"]["substeps"] == 4 and again["lengths"] == [30] * 3
     for name in ("return", "objective", "objective_std", "without_noise", "plan", "guides"):
         assert again[name] == pytest.approx(float(rows[-1][f"eval_{name}"]), rel=1e-6)
     assert gps.evaluate(search).qpos.shape == (30, 3, 2)

@@ -209,17 +209,27 @@ def test_evaluate(script: ModuleType, trained: Path, tmp_path: Path, capsys: pyt
     before = shutil.copy(trained / "checkpoint.pt", path).read_bytes()
     script.main(["--evaluate", str(path), "--device", "cpu"])
     final = float(read_progress(trained)[-1]["eval_return"])
-    assert capsys.readouterr().out.startswith(f"cartpole, 3 episodes: return median {final:.1f}, mean ")
+    out = capsys.readouterr().out
+    assert out.startswith(f"cartpole, 3 episodes: return median {final:.1f}, mean ") and "gait" not in out
     evaluation = json.loads((tmp_path / "evaluation.json").read_text())  # beside the checkpoint
-    assert evaluation == json.loads((trained / "evaluation.json").read_text())
+    finer = evaluation["finer"]
+    assert evaluation == json.loads((trained / "evaluation.json").read_text()) | {"finer": finer}
+    # Returns of this task are costs, so the share that is kept is the inverse ratio.
+    assert finer["substeps"] == 16 and finer["kept"] == pytest.approx(evaluation["return"] / finer["return"])
+    assert f"explicit with 16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} kept" in out
     settings = dict(script=script.__name__, iteration=10, env="cartpole", substeps=4, eval_episodes=3)
     assert evaluation["settings"].items() >= settings.items()
     assert evaluation["lengths"] == [240] * 3 and evaluation["speed"] is None
 
-    finer = "--substeps 16 --eval-episodes 4 --run-dir".split()
-    script.main(["--evaluate", str(path), *finer, str(tmp_path / "finer" / "deeper")])
-    assert capsys.readouterr().out.startswith("cartpole, 4 episodes: return median ")
-    settings = json.loads((tmp_path / "finer" / "deeper" / "evaluation.json").read_text())["settings"]
+    explicit = "--integrator semi_implicit --substeps 16 --no-finer --run-dir".split()
+    script.main(["--evaluate", str(path), *explicit, str(tmp_path / "explicit")])
+    again = json.loads((tmp_path / "explicit" / "evaluation.json").read_text())
+    assert again["return"] == finer["return"] and "finer" not in again
+
+    others = "--substeps 16 --eval-episodes 4 --no-finer --run-dir".split()
+    script.main(["--evaluate", str(path), *others, str(tmp_path / "new" / "deeper")])
+    assert capsys.readouterr().out.count("cartpole, 4 episodes: return median ") == 1
+    settings = json.loads((tmp_path / "new" / "deeper" / "evaluation.json").read_text())["settings"]
     assert (settings["substeps"], settings["eval_episodes"], settings["iteration"]) == (16, 4, 10)
     assert evaluation == json.loads((tmp_path / "evaluation.json").read_text())
     assert path.read_bytes() == before

@@ -22,6 +22,7 @@ class Ant(Locomotion):
     start_height = 0.75
     start_joints = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)
     target = 10_000.0
+    sides = (("_1", "_4"), ("_2", "_3"))
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Eq. 19: R_v + 0.1 R_up + R_heading + R_height, R_height = h - 0.27."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..integration import Integration
+from .mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
 
@@ -54,6 +55,15 @@ class Task:
         if not hasattr(cls, accuracy):
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
         return getattr(cls, accuracy)
+
+    @property
+    def mirror(self) -> Mirror:
+        """How the task looks with left and right exchanged.
+
+        Raises:
+            ValueError: the robot has no left and right.
+        """
+        raise ValueError(f"task {self.name!r} has no mirror image: its robot has no left and right")
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """Start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).

@@ -23,6 +23,7 @@ class Humanoid(Locomotion):
     start_height = 1.35
     start_joints = (0.0,) * 21
     target = 200.0
+    sides = (("right_", "left_"),)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Eq. 20: R_v + 0.1 R_up + R_heading + R_height - 0.002 |a|^2, R_height of Eqs. 21-22."""

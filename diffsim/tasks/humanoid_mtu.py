@@ -29,6 +29,7 @@ class HumanoidMTU(Locomotion):
     joint_spread = 0.0
     observe_action = False
     target = 10_000.0
+    sides = (("R_", "L_"), ("R", "L"))
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Eq. 23: R_v + 0.1 R_up + R_heading + R_height - 0.001 |a|^2, a the activations; R_height of Eqs. 24-25."""

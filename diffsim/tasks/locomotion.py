@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
+from importlib.resources import files
 from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..mjcf import load_scene
 from .base import Task
+from .mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections, signs
 
 FORWARD_VELOCITY = 5  # column of the observation: v_x
 
@@ -30,6 +34,7 @@ class Locomotion(Task):
     joint_spread: ClassVar[float] = 0.4  # rad
     observe_action: ClassVar[bool] = True
     target: ClassVar[float]  # m; the robot is to face the point (target, 0)
+    sides: ClassVar[Sides]  # (right, left) beginnings or ends of the names of joints and actuators, see mirror
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         joints = len(self.start_joints)
@@ -46,6 +51,17 @@ class Locomotion(Task):
         self._progress = torch.zeros(self.obs_dim, device=device, dtype=dtype)
         up = 11 + joints + rates
         self._progress[FORWARD_VELOCITY], self._progress[up], self._progress[up + 1] = 1.0, 0.1, 1.0
+
+    @cached_property
+    def mirror(self) -> Mirror:
+        """See Task. It is made when first asked for, which a CUDA graph cannot capture, so ask before."""
+        model = load_scene(str(files("diffsim") / "assets" / self.asset)).mj_model
+        device, dtype = self._start.device, self._start.dtype
+        qpos, qvel, action = reflections(model, self.sides, device, dtype)
+        root = signs((1.0, *PSEUDOVECTOR, 1.0, *VECTOR, *PSEUDOVECTOR), device, dtype)  # height to angular velocity
+        joints, rates = (Reflection(part.index[n:] - n, part.sign[n:]) for part, n in ((qpos, 7), (qvel, 6)))
+        seen = (root, joints, rates, signs((1.0, 1.0), device, dtype))  # as in observe
+        return Mirror(qpos, qvel, action, Reflection.cat((*seen, action) if self.observe_action else seen))
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """Start states from rand, see Task. The root is turned by up to 7.5 degrees about a random axis."""

@@ -24,6 +24,7 @@ from diffsim.training.flags import (
     parse,
     parse_penalty,
 )
+from diffsim.training.gait import Gait, describe
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.run import Run, episode_metrics, evaluate_checkpoint, make_policy_env
@@ -38,6 +39,7 @@ __all__ = [
     "Finite",
     "Flags",
     "Fraction",
+    "Gait",
     "Learner",
     "Natural",
     "NonNegative",
@@ -48,6 +50,7 @@ __all__ = [
     "SavedPolicy",
     "Stateful",
     "Widths",
+    "describe",
     "distributed",
     "episode_metrics",
     "evaluate",

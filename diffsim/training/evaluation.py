@@ -18,6 +18,8 @@ from diffsim.env import DiffEnv
 from diffsim.scene import Scene
 
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
+FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
+ENOUGH = 0.97  # of the return, kept there
 
 
 @dataclass
@@ -59,13 +61,14 @@ class Evaluation:
         others = "".join(f", {name.replace('_', ' ')} {value:.2f}" for name, value in self.others.items())
         return f"return median {r.median():.1f}, {spread}, length {self.length:.1f}{speed}{others}"
 
-    def write_json(self, path: Path, settings: Mapping[str, Any]) -> None:
-        """Write the scalars, every episode's return and length, and what they were measured with."""
+    def write_json(self, path: Path, settings: Mapping[str, Any], **found: Any) -> None:
+        """Write the scalars, each episode's return and length, what they were measured with, what else was found."""
         values = {
             "return": self.returns.median().item(),
             "length": self.length,
             "speed": self.speed,
             **self.others,
+            **found,
             "returns": self.returns.tolist(),
             "lengths": self.lengths.tolist(),
             "settings": dict(settings),
@@ -87,6 +90,13 @@ class Evaluation:
         """
         qpos, action = self.median_episode()
         return render.film(path, self.scene, qpos, self.control_dt, action)
+
+
+def kept(own: float, finer: float) -> float:
+    """Share of its own return that a policy keeps with finer substeps; of costs, returns below 0, the inverse ratio."""
+    if own > 0:
+        return finer / own
+    return own / finer if finer < 0 else 1.0
 
 
 def travels(scene: Scene) -> bool:

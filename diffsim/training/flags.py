@@ -91,6 +91,8 @@ class RunFlags:
     """checkpoint to continue from; its arguments hold where the command line gives no other"""
     evaluate: Path | None = None
     """checkpoint to evaluate without training, e.g. with other --substeps; writes evaluation.json to --run-dir"""
+    finer: bool = True
+    """with --evaluate, also measure the return at four times the substeps, explicitly integrated"""
     capture_video: bool = False
     """write video.mp4: the first 10 s of the last evaluation's median episode"""
     track: bool = False

@@ -24,8 +24,9 @@ from diffsim.simulator import check_device
 from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import Evaluation, evaluate
+from diffsim.training.evaluation import ENOUGH, FINER, Evaluation, evaluate, kept
 from diffsim.training.flags import Args, Flags, ParallelFlags, parse_penalty
+from diffsim.training.gait import describe
 from diffsim.training.progress import EpisodeStatistics, ProgressLog
 
 L = TypeVar("L", bound=Learner)
@@ -127,6 +128,9 @@ def evaluate_checkpoint(
 ) -> None:
     """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video.
 
+    Unless --no-finer is given, the policy must also keep its return at FINER times the substeps, explicitly integrated:
+    one that does not has learned to live on the integrator's errors.
+
     Args:
         args: the script's arguments.
         learner, method: how a restored learner is evaluated, if not by `evaluate` of its policy.
@@ -134,23 +138,38 @@ def evaluate_checkpoint(
     assert args.evaluate and args.run_dir
     check_writable(args.run_dir)
     torch.set_num_threads(1)
-    env, state = make_env(args, args.eval_episodes), checkpoint.load(args.evaluate, args.script())
-    if learner and method:
-        restored = learner(args, env)
-        checkpoint.restore(restored, state)
-        evaluation = method(restored)
-    else:
-        evaluation = evaluate(env, checkpoint.load_policy(args.evaluate).network.to(env.device))
+    path, state = args.evaluate, checkpoint.load(args.evaluate, args.script())
+
+    def measure(flags: Args) -> Evaluation:
+        env = make_env(flags, flags.eval_episodes)
+        if learner and method:
+            restored = learner(flags, env)
+            checkpoint.restore(restored, state)
+            return method(restored)
+        return evaluate(env, checkpoint.load_policy(path).network.to(env.device))
+
+    evaluation, found = measure(args), dict[str, Any]()
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    write_evaluation(args, evaluation, state["iteration"])
+    if args.finer:
+        substeps = FINER * args.substeps
+        explicit = dataclasses.replace(args, integrator="semi_implicit", theta=0.0, substeps=substeps)
+        value = measure(explicit).returns.median().item()
+        share = kept(evaluation.returns.median().item(), value)
+        found["finer"] = {"substeps": substeps, "return": value, "kept": share}
+        warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
+        print(f"explicit with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
+    write_evaluation(args, evaluation, state["iteration"], **found)
 
 
-def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int) -> None:
-    """evaluation.json and, if asked for, the video, in the run's directory."""
+def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
+    """Print the gait, and leave evaluation.json and, if asked for, the video in the run's directory."""
     assert args.run_dir
     names = ("env", "integrator", "substeps", "theta", "penalty", "device", "eval_episodes")
-    settings = {name: getattr(args, name) for name in names}
-    evaluation.write_json(args.run_dir / "evaluation.json", settings | dict(script=args.script(), iteration=iteration))
+    settings = {name: getattr(args, name) for name in names} | dict(script=args.script(), iteration=iteration)
+    if gait := describe(evaluation):
+        print(f"gait: {gait}")
+        found["gait"] = dataclasses.asdict(gait) | {"verdict": gait.verdict}
+    evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
     if args.capture_video:
         try:
             print(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
