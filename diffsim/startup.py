@@ -14,7 +14,8 @@ from weakref import WeakSet
 
 import warp as wp
 
-NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+# What Warp prints when it starts and nobody needs: pip installs a Warp that supports the Python at hand.
+NOISE = (b"Could not find or load the NVIDIA CUDA driver", b"Support for Python 3.10 is deprecated")
 _announced: set[str] = set()
 _watched: WeakSet[Any] = WeakSet()
 
@@ -66,7 +67,7 @@ def check_kernel_cache() -> Path:
     """
     wanted = wp.config.kernel_cache_dir
     try:
-        with _without(NO_DRIVER):
+        with _without(*NOISE):
             wp.init()
         if not os.access(str(wp.config.kernel_cache_dir), os.W_OK):
             raise PermissionError
@@ -105,8 +106,8 @@ def _is_compiled(module: Any, device: wp.Device, block_dim: int | None) -> bool:
 
 
 @contextmanager
-def _without(message: bytes) -> Iterator[None]:
-    """Hold back what is written to stderr, by C as well, and let all lines through but those with the message."""
+def _without(*messages: bytes) -> Iterator[None]:
+    """Hold back what is written to stderr, by C as well, and let all lines through but those with a message."""
     try:
         stderr = os.dup(2)
     except OSError:  # closed
@@ -122,7 +123,7 @@ def _without(message: bytes) -> Iterator[None]:
         os.close(stderr)
         with open(reader, "rb") as pipe:
             for line in pipe:
-                if message not in line:
+                if not any(message in line for message in messages):
                     os.write(2, line)
 
 

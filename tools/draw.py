@@ -1,10 +1,11 @@
-"""Pictures of the robots, written to docs/figures: the six tasks side by side, or a strip of frames of a learned gait.
+"""Pictures of policies at work, written to docs/figures: a gif of each task, or a strip of frames of a learned gait.
 
-    python tools/draw.py tasks
+    python tools/draw.py loops
     python tools/draw.py gait runs/<run>/checkpoint.pt --start 2 --every 0.1 --frames 8
 
-Muscles are coloured by activation, as in the SHAC paper's Figure 5. The gait is that of the first of a few random
-episodes that lasts long enough.
+Muscles are coloured by activation, as in the SHAC paper's Figure 5. A gif shows the median one of several episodes of
+the policy in diffsim/policies; that of a runner ends where it resembles its first frame most, so that it plays in a
+loop. The gait is that of the first of a few random episodes that lasts long enough.
 """
 
 from __future__ import annotations
@@ -18,24 +19,43 @@ import imageio.v3 as imageio
 import numpy as np
 import torch
 import tyro
-from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 import diffsim
-from diffsim.render import render_frames
-from diffsim.training import Count, NonNegative, Positive, evaluate, fail, load_policy, parse_penalty
+from diffsim.__main__ import DEMO_EPISODES, POLICIES
+from diffsim.render import Frame, render_frames
+from diffsim.training import Count, NonNegative, Positive, evaluate, fail, load_policy, make_policy_env, parse_penalty
+from diffsim.training.evaluation import travels
 from diffsim.training.flags import check_ranges
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
-TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
+# How many times closer than the robot's camera, and at which share of that one's height the picture's middle is.
+CLOSER = {
+    "cartpole": (1.6, 0.38),
+    "hopper": (1.6, 0.62),
+    "half_cheetah": (1.4, 0.5),
+    "ant": (1.4, 0.53),
+    "humanoid": (1.6, 0.56),
+    "humanoid_mtu": (1.2, 0.52),
+}
+COLOURS = 128
 
 
 @dataclass
-class Tasks:
-    """The start of an episode of each task."""
+class Loops:
+    """A gif of each trained policy that comes with the package."""
 
-    size: Count = 320
-    """width and height of a robot's picture in pixels"""
+    tasks: tuple[str, ...] = tuple(CLOSER)
+    """of these tasks"""
+    size: tuple[int, int] = (320, 240)
+    """width and height in pixels"""
+    every: Count = 3
+    """control steps between frames"""
+    start: NonNegative = 2.0
+    """seconds into the episode before which no loop begins; a cart-pole is shown from its start"""
+    seconds: tuple[float, float] = (2.0, 3.0)
+    """of a loop, at least and at most; a cart-pole, which does not travel, is shown for 3.5 s"""
 
 
 @dataclass
@@ -54,19 +74,44 @@ class Gait:
     """width and height of a frame in pixels"""
 
 
-def write_strip(name: str, frames: Sequence[NDArray[np.uint8]], size: int) -> None:
-    """Frames of twice the size side by side, 2 x 2 pixels into one: smooth edges."""
-    strip = np.concatenate(frames, axis=1).astype(np.float32)
-    strip = strip.reshape(size, 2, len(frames) * size, 2, 3).mean(axis=(1, 3))
-    path = FIGURES / f"{name}.png"
-    imageio.imwrite(path, strip.round().astype(np.uint8))
-    print(path)
+def halve(frame: Frame) -> Frame:
+    """2 x 2 pixels into one: smooth edges."""
+    height, width = frame.shape[0] // 2, frame.shape[1] // 2
+    return frame.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).round().astype(np.uint8)
 
 
-def draw_tasks(args: Tasks) -> None:
-    envs = [diffsim.make(name, num_envs=1, stochastic_init=False) for name in TASKS]
-    frames = [render_frames(env.scene, env.qpos.numpy(), 2 * args.size, 2 * args.size)[0] for env in envs]
-    write_strip("tasks", frames, args.size)
+def draw_loop(task: str, args: Loops) -> None:
+    saved = load_policy(Path(str(POLICIES / f"{task}.pt")))
+    episodes = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
+    qpos, action = (rows[:: args.every] for rows in episodes.median_episode())
+    (zoom, middle), (width, height) = CLOSER[task], args.size
+    wide, high = round(2 * zoom * width), round(2 * zoom * height)
+    left, top = wide // 2 - width, round(middle * high) - height
+    shown = slice(top, top + 2 * height), slice(left, left + 2 * width)
+    frames = [halve(frame[shown]) for frame in render_frames(episodes.scene, qpos, wide, high, ctrl=action)]
+    fps = 1 / (args.every * episodes.control_dt)
+    first, last = find_loop(frames, fps, args) if travels(episodes.scene) else (0, round(3.5 * fps))
+    write_gif(FIGURES / f"{task}.gif", frames[first:last], fps)
+
+
+def find_loop(frames: Sequence[Frame], fps: float, args: Loops) -> tuple[int, int]:
+    """The range of frames whose end resembles its begin most: gait and floor, of which 8 x 8 pixels are compared."""
+    small = np.array([frame[::8, ::8] for frame in frames], dtype=np.float32)
+    shortest, longest = (round(seconds * fps) for seconds in args.seconds)
+    ranges = [
+        (first, first + length)
+        for length in range(shortest, longest + 1)
+        for first in range(round(args.start * fps), len(frames) - length)
+    ]
+    return min(ranges, key=lambda ends: np.abs(small[ends[1]] - small[ends[0]]).mean())
+
+
+def write_gif(path: Path, frames: Sequence[Frame], fps: float) -> None:
+    """In the same colours throughout, without dithering: small, and nothing flickers."""
+    palette = Image.fromarray(np.concatenate(frames[::8])).quantize(COLOURS, Image.Quantize.FASTOCTREE)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+    print(f"{path}, {len(frames) / fps:.2f} s, {path.stat().st_size / 1000:.0f} kB")
 
 
 @torch.no_grad()
@@ -88,10 +133,17 @@ def draw_gait(args: Gait) -> None:
     first = int(lasting.int().argmax())
     qpos, ctrl = episodes.qpos[wanted, first].numpy(), torch.stack(actions)[wanted, first].numpy()
     frames = render_frames(env.scene, qpos, 2 * args.size, 2 * args.size, ctrl=ctrl)
-    write_strip(f"{env.task.name}_gait", list(frames), args.size)
+    path = FIGURES / f"{env.task.name}_gait.png"
+    imageio.imwrite(path, halve(np.concatenate(frames, axis=1)))
+    print(path)
 
 
 if __name__ == "__main__":
-    args = tyro.cli(Tasks | Gait, description=__doc__)
+    args = tyro.cli(Loops | Gait, description=__doc__)
     check_ranges(args)
-    draw_tasks(args) if isinstance(args, Tasks) else draw_gait(args)
+    torch.set_num_threads(1)
+    if isinstance(args, Gait):
+        draw_gait(args)
+    else:
+        for task in args.tasks:
+            draw_loop(task, args)
