@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
+from diffsim.tasks import TASKS, Task
 from diffsim.training import (
     Count,
     Decay,
@@ -84,6 +85,10 @@ class Args(ParallelFlags):
     """members that learn side by side, each in its share of the environments, until one goes on (per task)"""
     selection: Fraction = 0.5
     """share of the iterations after which the best member goes on in all environments"""
+    symmetric: bool = False
+    """left and right are treated alike: what the policy does in a state it does in the mirrored state, mirrored"""
+    symmetry_weight: Positive = 10.0
+    """weight in the actor's loss of the squared difference between the two, with --symmetric"""
     initial_target_entropy: Finite = -0.5
     """entropy per action, in nats, at which the temperature aims in the first iteration (per task)"""
     target_entropy: Finite = -0.5
@@ -129,6 +134,8 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
+        if self.symmetric and TASKS[self.env].mirror is Task.mirror:
+            fail(f"--symmetric: the robot of task {self.env!r} has no left and right")
         if (self.num_envs // distributed.size()) % self.population:
             fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")
 
@@ -180,6 +187,10 @@ class Actor(nn.Module):
         surprise = 0.5 * noise.square() + 0.5 * math.log(2 * math.pi) + log_std + log_slope
         return torch.tanh(u), surprise.mean(-1)
 
+    def act(self, obs: Tensor) -> Tensor:
+        """Of normalized observations (K, B, obs_dim): the actions without noise."""
+        return torch.tanh(self.mean(self.body(obs)))
+
     def deterministic(self, member: int) -> nn.Sequential:
         """The policy of a member without noise."""
         return nn.Sequential(self.normalizer, *self.body[member], *self.mean[member], nn.Tanh())
@@ -225,7 +236,9 @@ class SAPO:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        obs_dim, samples = env.task.obs_dim, args.horizon * env.num_envs // args.population
+        obs_dim, samples = env.task.obs_dim, args.horizon * env.num_envs // args.population * (1 + args.symmetric)
+        if args.symmetric:
+            self.mirror = env.task.mirror
         self.actor = Actor(args, obs_dim, env.scene.nu).to(env.device)
         self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * args.population)]).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
@@ -284,11 +297,17 @@ class SAPO:
             temperature = self.population.log_temperature.detach().exp()
             reward = reward + (temperature * self.by_member((1 + rollout.entropy) / 2)).movedim(0, 1).flatten(1)
         loss = actor_loss(reward, next_values.mean(0), rollout.done, args.gamma)
+        if args.symmetric:
+            loss = loss + args.symmetry_weight * self.asymmetry(rollout.obs.detach())
         norm = self.actor_optimizer.step(args.population * loss)
         rollout = Rollout(*(tensor.detach() for tensor in rollout))
         value = td_lambda(reward.detach(), next_values.detach().amin(0), rollout.done, args.gamma, args.td_lambda)
+        samples = rollout.obs
+        if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
+            samples = torch.stack((samples, self.mirror.obs(samples)), 1).flatten(0, 1)
+            value = value.repeat_interleave(2, 0)
         self.value.copy_(self.by_member(value).flatten(1))
-        self.obs.copy_(self.by_member(normalizer(rollout.obs)).flatten(1, 2))
+        self.obs.copy_(self.by_member(normalizer(samples)).flatten(1, 2))
         normalizer.update(rollout.obs)
         entropy = self.by_member(rollout.entropy).mean((1, 2))
         gap = (entropy - self.target_entropy).detach()
@@ -299,6 +318,12 @@ class SAPO:
         temperature = self.population.log_temperature.detach().exp().mean()
         metrics |= {"charts/entropy": entropy.mean(), "charts/temperature": temperature}
         return {"losses/actor": loss.detach(), "grad/norm": norm} | metrics
+
+    def asymmetry(self, obs: Tensor) -> Tensor:
+        """Mean squared difference between the actions in mirrored states and the mirrored actions, without noise."""
+        there = self.actor.act(self.by_member(self.actor.normalizer(self.mirror.obs(obs))).flatten(1, 2))
+        here = self.actor.act(self.by_member(self.actor.normalizer(obs)).flatten(1, 2))
+        return (there - self.mirror.action(here)).square().mean()
 
     def by_member(self, tensor: Tensor) -> Tensor:
         """(H, N, ...) -> (K, H, N / K, ...)."""
