@@ -10,6 +10,9 @@ what comes after the window. Windows as long as an episode (--horizon 1000) make
 
 from __future__ import annotations
 
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +21,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,

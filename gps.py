@@ -11,6 +11,9 @@ policy search (Algorithm 1). Its dynamic programming takes exact Jacobians from 
 
 from __future__ import annotations
 
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +24,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from diffsim import DiffEnv
 from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration
@@ -29,7 +31,18 @@ from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.restarts import best_of_random_starts, starting_actions
 from diffsim.planning.system import System
-from diffsim.training import Count, Flags, Natural, NonNegative, Positive, Run, distributed, evaluate_checkpoint, parse
+from diffsim.training import (
+    Count,
+    Finite,
+    Flags,
+    Natural,
+    NonNegative,
+    Positive,
+    Run,
+    distributed,
+    evaluate_checkpoint,
+    parse,
+)
 from diffsim.training.checkpoint import Stateful
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
@@ -69,9 +82,9 @@ class Args(Flags):
     """the task's own reward, or the paper's: squared errors of velocity and height (per task)"""
     action_cost: Positive = 1e-3
     """w_u: cost of the squared action before tanh, in both rewards (per task)"""
-    target_velocity: float = 0.0
+    target_velocity: Finite = 0.0
     """v_x* of the paper's reward, m/s, with weight 1 (per task)"""
-    target_height: float = 0.0
+    target_height: Finite = 0.0
     """p_y* of the paper's reward, m (per task)"""
     height_weight: NonNegative = 0.0
     """w_h of the paper's reward (per task)"""

@@ -10,6 +10,9 @@ minibatches, and a learning rate that follows the policy's KL divergence, as the
 
 from __future__ import annotations
 
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +21,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,

@@ -10,6 +10,9 @@ policy's entropy as a part of the reward; two critics are fitted to the soft TD(
 
 from __future__ import annotations
 
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
 import copy
 import math
 from collections.abc import Sequence
@@ -20,7 +23,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from diffsim import DiffEnv
 from diffsim.tasks import TASKS, Task
 from diffsim.training import (
     Count,
@@ -71,8 +73,6 @@ class Args(ParallelFlags):
         *("actor_hidden", "critic_hidden", "state_std", "critics", "activation", "population"),
     )
 
-    accuracy: Literal["fast", "default", "accurate"] = "fast"
-    """preset of integrator, substeps and theta (docs/accuracy.md)"""
     entropy: bool = True
     """the policy's entropy is part of the reward"""
     state_std: bool = True

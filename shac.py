@@ -10,6 +10,9 @@ at the window's end (Eq. 5); the value function is fitted to the TD(lambda) retu
 
 from __future__ import annotations
 
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
 import copy
 import math
 from collections.abc import Sequence
@@ -20,7 +23,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,

@@ -13,6 +13,9 @@ by 1 m/s; minus and equals change the speed; space pauses; enter starts a new ep
 
 from __future__ import annotations
 
+from diffsim import DiffEnv, render, startup, web  # first: from here on Ctrl-C ends in one line
+
+# isort: split
 import copy
 import csv
 import math
@@ -30,8 +33,7 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from diffsim import DiffEnv, render, web
-from diffsim.training import SavedPolicy, describe, evaluate, fail, load_policy, make_policy_env
+from diffsim.training import SavedPolicy, describe, evaluate, fail, load_policy, make_policy_env, parse_command_line
 from diffsim.training.evaluation import SEED
 
 ROBOT = 1  # MuJoCo's first body after the world
@@ -71,7 +73,7 @@ class Args:
             fail("nothing to show: give --video, --web, --viewer or --plot")
         if not self.paths:
             fail("of what? give a checkpoint or the directory of a run")
-        if min(self.seconds, self.episodes, *self.size, self.substeps or 1) <= 0:
+        if min(self.episodes, *self.size, self.substeps or 1) <= 0 or not 0 < self.seconds < math.inf:
             fail("--seconds, --episodes, --substeps and --size must be positive")
         if len(self.paths) > 1 and (self.video or self.web or self.viewer):
             fail("--video, --web and --viewer show one checkpoint; several are for --plot")
@@ -93,8 +95,9 @@ class Args:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
+    startup.end_in_one_line()
     config = (tyro.conf.FlagCreatePairsOff,)
-    args = tyro.cli(Args, args=argv, description=__doc__, config=config)
+    args = parse_command_line(Args, argv, description=__doc__, config=config)
     args.check()
     try:
         if args.plot:

@@ -19,12 +19,14 @@ import torch
 import tyro
 from tables import ROOT, Row
 
+from diffsim import startup
 from diffsim.simulator import check_device
-from diffsim.training import fail
+from diffsim.training import fail, parse_command_line
 from diffsim.training.distributed import choose_device
 from diffsim.training.flags import check_ranges
 
-RESULTS, DOCS = ROOT / "results", ROOT / "docs"
+RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
+OUTPUT = ROOT / "runs" / "benchmarks"
 TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu"]
 TASKS: tuple[TaskName, ...] = get_args(TaskName)  # of the SHAC paper
 Tasks = Annotated[tuple[TaskName, ...], tyro.conf.arg(aliases=["--env-id"])]
@@ -37,13 +39,15 @@ class CommonFlags:
 
     env: Tasks = TASKS  # tasks
     device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
-    output: Path | None = None  # directory of the csv files (default: results/cpu or, by the GPU, e.g. results/h100)
-    figures: Path | None = None  # of the pictures (default: docs/figures, docs/figures/h100, or that of --output)
+    output: Path | None = None  # directory of csv files (default: runs/benchmarks/cpu or, by the GPU, e.g. .../h100)
+    figures: Path | None = None  # of the pictures (default: that of the csv files)
+    update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
     draw_only: Annotated[bool, tyro.conf.arg(aliases=["--collect-only"])] = False  # measure nothing, read csv files
 
     @property
     def directory(self) -> Path:
-        return self.output.resolve() if self.output else RESULTS / machine(self.device)
+        tree = RESULTS if self.update_results else OUTPUT
+        return self.output.resolve() if self.output else tree / machine(self.device)
 
     def csv(self, name: str) -> Path:
         return self.directory / f"{name}.csv"
@@ -58,23 +62,26 @@ class CommonFlags:
         return tables.merge_csv(self.csv(name), rows, key, self.device)
 
     def machines(self, name: str) -> dict[str, Path]:
-        """The csv files of a name by their machines: all of the tree of results, or the one outside of it."""
-        paths = sorted(RESULTS.glob(f"*/{name}.csv")) if self.directory.parent == RESULTS else [self.csv(name)]
+        """The csv files of a name by their machines: all of the tree of results, or the one of --output."""
+        paths = [self.csv(name)] if self.output else sorted(self.directory.parent.glob(f"*/{name}.csv"))
         return {path.parent.name: path for path in paths if path.is_file()}
 
     def picture(self, name: str) -> Path:
         default = DOCS / "figures" / self.directory.name.replace("cpu", "")
-        return (self.figures or (default if self.directory.parent == RESULTS else self.directory)) / f"{name}.png"
+        return (self.figures or (default if self.update_results else self.directory)) / f"{name}.png"
 
     def link(self, name: str) -> str:
         """A picture's address in a page."""
         return os.path.relpath(self.picture(name), DOCS)
 
     def publish(self, name: str, text: str, page: str, everywhere: bool = False) -> None:
-        """Print a table, and fill the part of a page that has its name; of one GPU's results it is {name}_{machine}."""
+        """Print a table; with --update-results fill the part of a page that has its name.
+
+        Of one GPU's results the name is {name}_{machine}.
+        """
         print(text)
         name = name if everywhere or self.directory.name == "cpu" else f"{name}_{self.directory.name}"
-        if self.directory.parent == RESULTS and f"<!-- {name} -->" in (DOCS / page).read_text():
+        if self.update_results and f"<!-- {name} -->" in (DOCS / page).read_text():
             tables.fill(DOCS / page, name, text)
 
 
@@ -88,8 +95,11 @@ def machine(device: str) -> str:
 
 def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = None) -> F:
     """The command line, checked; anything wrong ends the benchmark with one line."""
-    args = tyro.cli(kind, args=argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    startup.end_in_one_line(startup.KernelCacheError)
+    args = parse_command_line(kind, argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
     check_ranges(args)
+    if args.output and args.update_results:
+        fail("--output and --update-results exclude each other")
     args.device = choose_device(args.device)
     try:
         check_device("cpu" if args.draw_only else args.device)

@@ -2,12 +2,13 @@
 
 From states that MuJoCo visits under random controls, both simulators take 0.1 s. The error is the difference in
 velocity, in the norm of the kinetic energy: its mean over the states, relative to the mean speed. In MuJoCo the robots'
-parts pass through each other too, and margins are 0. `python benchmarks/defaults.py` writes results/cpu/defaults.csv.
+parts pass through each other too, and margins are 0. `python benchmarks/defaults.py` writes defaults.csv.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,15 +16,16 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
+import tyro
+from common import OUTPUT, RESULTS
 from numpy.typing import NDArray
-from tables import ROOT, write_csv
+from tables import write_csv
 
 from diffsim import Integration, Scene, Simulator, load_scene
 
 Array = NDArray[np.float64]
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-OUTPUT = ROOT / "results" / "cpu" / "defaults.csv"
 ROBOTS = ("ant", "half_cheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum", "reacher", "walker2d_v5")
 FORMER = {"k_n": 2e4, "k_d": 1e3, "k_t": 1e3, "mu": 0.9, "k_limit": 1e3, "d_limit": 0.0}
 STATES, STEPS, EPISODE = 160, 6, 40  # control steps of 1/60 s a segment; segments an episode, the first two are skipped
@@ -93,7 +95,12 @@ def one_limit(scene: Scene) -> Scene:
     return scene.with_penalty(means)
 
 
-def main() -> None:
+@dataclass
+class Args:
+    update_results: bool = False  # write to results/ of this repository instead of runs/benchmarks/
+
+
+def main(args: Args) -> None:
     rows = []
     for name in ROBOTS:
         scene, motion = load_scene(ASSETS / f"{name}.xml"), segments(name)
@@ -106,8 +113,8 @@ def main() -> None:
         }
         rows.append({"robot": name} | {what: f"{error(one, motion):.3f}" for what, one in scenes.items()})
         print(rows[-1], flush=True)
-    write_csv(OUTPUT, rows)
+    write_csv((RESULTS if args.update_results else OUTPUT) / "cpu" / "defaults.csv", rows)
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Args, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,)))

@@ -6,10 +6,10 @@
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
     python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
 
-Writes results/cpu/gps_runs.csv (every iteration of every run), gps_generalisation.csv (the policy, the DDP controller
+Writes gps_runs.csv (every iteration of every run), gps_generalisation.csv (the policy, the DDP controller
 and that of the nearest state, from perturbed starts and under pushes), gps_paths.csv (where the root went) and
-gps_time.csv (one iteration of iLQR), their tables in docs/gps.md, and the pictures docs/figures/gps_variants.png,
-gps_paths.png and gps_generalisation.png: Figures 2, 1 and 3 of the paper. An interrupted run is resumed.
+gps_time.csv (one iteration of iLQR), their tables in gps.md, and the pictures figures/gps_variants.png, gps_paths.png
+and gps_generalisation.png: Figures 2, 1 and 3 of the paper. An interrupted run is resumed.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ import matplotlib
 import numpy as np
 import torch
 import tyro
-from tables import fill, markdown, read_csv, write_csv
+from common import DOCS, OUTPUT, RESULTS
+from tables import ROOT, fill, markdown, read_csv, write_csv
 from torch import Tensor
 
 import diffsim
 from diffsim.planning import REAL, ilqr
 from diffsim.training import checkpoint, fail, load_policy, parse_penalty
 
-ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
 
@@ -87,10 +87,12 @@ class Args:
     """perturbed starts and pushes of each size"""
     runs: Path = ROOT / "runs" / "gps"
     """directory of the runs: {runs}/{env}__{variant}__{seed}"""
-    results: Path = ROOT / "results" / "cpu"
+    results: Path = OUTPUT / "cpu"
     """directory of the csv files"""
-    docs: Path = ROOT / "docs"
+    docs: Path = OUTPUT
     """directory of gps.md, whose tables are filled, and of figures/"""
+    update_results: bool = False
+    """write to results/cpu and docs/ of this repository"""
     draw_only: bool = False
     """train nothing: collect, draw and tabulate the runs there are"""
     record: Path | None = None
@@ -427,6 +429,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = [*(sys.argv[1:] if argv is None else argv), "--"]
     args = tyro.cli(Args, args=argv[: argv.index("--")], description=__doc__)
     args.arguments = tuple(argv[argv.index("--") + 1 : -1])
+    if args.update_results:
+        args.results, args.docs = RESULTS / "cpu", DOCS
     torch.set_num_threads(1)
     if args.record:
         record(args.record, args.actor, args.steps)

@@ -8,8 +8,8 @@ mean reward of an episode of --horizon steps up to its end (a fallen robot gains
 of 32 steps from states that the policy visits. Every variation of the policy meets the same start states and the same
 noise, all at once in one batch.
 
-Writes landscape_*.csv, landscape_*.png and their part of the page docs/experiments.md. A csv that exists is kept:
-delete it to measure it anew.
+Writes landscape_*.csv, landscape_*.png and, with --update-results, their part of docs/experiments.md. A csv
+that exists is kept: delete it to measure it anew.
 """
 
 from __future__ import annotations

@@ -7,8 +7,9 @@
     python benchmarks/learning.py --runs runs/short -- --iterations 50 what follows "--" goes to the learner
 
 Writes {learner}_{env}.csv (about 100 points of each run), learning.csv (a line for each learner and task), pictures of
-the learner or the experiment, and the tables of their pages. Each final policy is evaluated where it was trained,
-explicitly with four times the substeps, and explicitly with four times the task's default.
+the learner or the experiment, and with --update-results the tables of their pages. Each final policy is
+evaluated where it was trained, explicitly with four times the substeps, and explicitly with four times the task's
+default.
 """
 
 from __future__ import annotations

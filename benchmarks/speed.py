@@ -42,7 +42,7 @@ from diffsim.kernels.lanes import divide
 from diffsim.launcher import available_cores
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
-from diffsim.training.run import make_env
+from diffsim.training.assess import make_env
 
 SETTING = integration("semi_implicit", 16)
 LINKS = 16  # of the chain to which everything but links is added

@@ -3,10 +3,11 @@
     python benchmarks/stability.py                         every task and integrator, a quarter of an hour
     python benchmarks/stability.py --parts long --steps 100_000
 
-Writes stability_*.csv, stability.png and the tables of docs/stability.md, which explains them. All is float32, from
-states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below twice the largest
-kinetic energy of a reference, 64 times as fine. "sweeps" drives one thing to an extreme: without motors the energy must
-never exceed that of the start, springs included, by 10 %; under actions, the kinetic one not twice the reference's.
+Writes stability_*.csv, stability.png and, with --update-results, the tables of docs/stability.md, which explains them.
+All is float32, from states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below
+twice the largest kinetic energy of a reference, 64 times as fine. "sweeps" drives one thing to an extreme: without
+motors the energy must never exceed that of the start, springs included, by 10 %; under actions, the kinetic one not
+twice the reference's.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from diffsim import startup  # first: it starts Warp and MuJoCo, and Ctrl-C may come during the other imports
+
+# isort: split
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -10,7 +13,6 @@ import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode
 
-from diffsim import startup  # first: it starts Warp and MuJoCo
 from diffsim.env import DiffEnv
 from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
@@ -108,3 +110,5 @@ for _name, _task in TASKS.items():
             max_episode_steps=_task.episode_length,
             kwargs={"name": _name},
         )
+
+startup.imported()

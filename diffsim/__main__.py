@@ -30,6 +30,7 @@ DEMO_EPISODES = 8  # of which the one of median return is filmed
 
 def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
+    startup.end_in_one_line()
     parser = argparse.ArgumentParser(
         prog="python -m diffsim", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
 
@@ -18,6 +19,17 @@ from diffsim.scene import Scene
 from diffsim.screen import RENDER_MODES, Frames, RenderMode, Screen
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import Task
+
+
+def check_seed(seed: int) -> int:
+    """The seed as an int, be it NumPy's; raises ValueError unless it is an integer of 64 bits. True is none."""
+    if not isinstance(seed, Integral) or isinstance(seed, bool) or not -(2**63) <= seed < 2**63:
+        raise ValueError(f"seed is {seed!r}, must be one integer of 64 bits; a NumPy vector environment takes one each")
+    return int(seed)
+
+
+class ActionError(ValueError):
+    """An action that is not a number: the policy that took it has diverged."""
 
 
 class DiffEnv(VectorEnv):
@@ -97,7 +109,7 @@ class DiffEnv(VectorEnv):
         if seed is None:
             self.generator.seed()
         else:
-            self.generator.manual_seed(seed)
+            self.generator.manual_seed(check_seed(seed))
 
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
@@ -117,13 +129,12 @@ class DiffEnv(VectorEnv):
             obs (N, obs_dim) of all environments, and an empty info.
 
         Raises:
-            ValueError: several seeds, as one generator draws all start states; a mask of another shape or dtype.
+            ValueError: several seeds, as one generator draws all start states; a mask of another shape or dtype;
+                unknown options.
         """
         rows = self.masked(options)
         if seed is not None:
-            if not isinstance(seed, Integral):
-                raise ValueError(f"seed is {seed!r}, must be one integer; a NumPy vector environment takes one each")
-            self.generator.manual_seed(int(seed))
+            self.generator.manual_seed(check_seed(seed))
         if options and "reset_mask" in options:
             self.begin(rows, self._uniform(len(rows)))
             self._draw_starts()
@@ -144,7 +155,7 @@ class DiffEnv(VectorEnv):
             valid under "_episode"; "nonfinite" (N,): environments that blew up, which end with reward 0.
 
         Raises:
-            ValueError: action of the wrong shape, dtype or device, or, on the CPU, not a number.
+            ValueError: action of the wrong shape, dtype or device; an ActionError on the CPU if it is not a number.
             RuntimeError: more than `horizon` differentiable steps without `detach`.
         """
         _, reward, terminated, truncated, info = self.advance(action)
@@ -164,7 +175,7 @@ class DiffEnv(VectorEnv):
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action.detach()).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
-            raise ValueError(f"action is NaN in environments {rows[:8]}; every action must be a number")
+            raise ActionError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
         recorded = torch.is_grad_enabled() and (
             action.requires_grad or self.qpos.requires_grad or self.qvel.requires_grad
@@ -215,10 +226,16 @@ class DiffEnv(VectorEnv):
         """(k,) int64, the environments that reset's options ask for: all, or those of "reset_mask" (N,).
 
         Raises:
-            ValueError: a mask of another shape, or not bool.
+            ValueError: a mask of another shape, or not bool; unknown options.
         """
-        everyone = torch.ones(self.num_envs, dtype=torch.bool)
-        mask = torch.as_tensor((options or {}).get("reset_mask", everyone))
+        options = {} if options is None else options
+        if not isinstance(options, Mapping) or options.keys() - {"reset_mask"}:
+            raise ValueError(f"options are {options!r}, must be a dictionary of reset_mask alone")
+        everyone = np.ones(self.num_envs, dtype=np.bool_)
+        try:
+            mask = torch.as_tensor(options.get("reset_mask", everyone))
+        except TypeError as error:
+            raise ValueError(f"reset_mask is {options['reset_mask']!r}, must be bool ({self.num_envs},)") from error
         if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask is {mask.dtype} {tuple(mask.shape)}, must be bool ({self.num_envs},)")
         return mask.nonzero().flatten().to(self.device)
@@ -292,8 +309,9 @@ class DiffEnv(VectorEnv):
             ValueError: it is of another task, size or dtype, or no state_dict of an environment.
         """
         own = self.state_dict()
-        if state.keys() != own.keys():
-            raise ValueError(f"the state has {', '.join(state)}; that of an environment has {', '.join(own)}")
+        if not isinstance(state, Mapping) or state.keys() != own.keys():
+            has = ", ".join(state) if isinstance(state, Mapping) else type(state).__name__
+            raise ValueError(f"the state has {has or 'nothing'}; that of an environment has {', '.join(own)}")
         theirs, ours = (f"{len(x['qpos'])} x {x['task']} in {x['qpos'].dtype}" for x in (state, own))
         if theirs != ours:
             raise ValueError(f"the state is of {theirs}; this environment is {ours}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numbers import Integral
+from numbers import Integral, Real
 from typing import NamedTuple
 
 INTEGRATORS = ("semi_implicit", "implicit", "extrapolated")
@@ -39,11 +39,16 @@ class Integration(NamedTuple):
         substeps = check_count("substeps", self.substeps)
         if self.integrator == "extrapolated" and substeps % 2:
             raise ValueError(f"substeps is {self.substeps}, must be even for the extrapolated integrator")
-        if not 0 <= self.theta <= 1:
+        if not is_real(self.theta) or not 0 <= self.theta <= 1:
             raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
         if self.theta and self.integrator != "implicit":
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
         return self._replace(substeps=substeps)
+
+
+def is_real(value: object) -> bool:
+    """Whether it is a number, be it NumPy's. True is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def check_count(name: str, value: int) -> int:

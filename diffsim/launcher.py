@@ -28,6 +28,10 @@ MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
 
 
+class TooLargeError(ValueError):
+    """What is asked for does not fit into the device's memory."""
+
+
 class Launcher:
     """Runs the forward and the backward kernel of a scene over a batch of environments.
 
@@ -117,7 +121,7 @@ def available_cores() -> int:
 
 
 def check_memory(what: str, num_envs: int, bytes_each: int, device: torch.device) -> None:
-    """Raise ValueError if what is to be allocated, so many bytes per environment, is more than the device has."""
+    """Raise TooLargeError if what is to be allocated, so many bytes per environment, is more than the device has."""
     if device.type == "cuda":
         there = torch.cuda.get_device_properties(device).total_memory
     elif hasattr(os, "sysconf"):
@@ -125,7 +129,10 @@ def check_memory(what: str, num_envs: int, bytes_each: int, device: torch.device
     else:  # Windows does not tell
         return
     if num_envs * bytes_each > there:
-        raise ValueError(
+        enough = (
+            f"enough for fewer than {there // bytes_each:,} environments" if there >= bytes_each else "too few for one"
+        )
+        raise TooLargeError(
             f"num_envs is {num_envs:,}: the {what} would take {num_envs * bytes_each / 2**30:,.0f} GiB, but {device} "
-            f"has {there / 2**30:,.0f} GiB, enough for fewer than {there // bytes_each:,} environments"
+            f"has {there / 2**30:,.0f} GiB, {enough}"
         )

@@ -89,22 +89,28 @@ FINITE = {
 }
 
 
+def _finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Elementwise, in the single precision of the kernels."""
+    within: NDArray[np.bool_] = np.abs(values) <= np.finfo(np.float32).max
+    return within
+
+
 def _not_finite(m: mujoco.MjModel) -> Iterator[Obstacle]:
     for kind, (prefix, fields) in FINITE.items():
         for field in fields:
             values = np.asarray(getattr(m, f"{prefix}_{field}"))
-            for index in np.flatnonzero(~np.isfinite(values.reshape(len(values), values[:1].size)).all(1)).tolist():
+            for index in np.flatnonzero(~_finite(values.reshape(len(values), values[:1].size)).all(1)).tolist():
                 yield _of(m, kind, index, f"{field} is not finite")
     for joint in range(m.njnt):
         dof, adr = m.jnt_dofadr[joint], m.jnt_qposadr[joint]
         for what, value in (("ref", m.qpos0[adr]), ("springref", m.qpos_spring[adr])):
-            if not np.isfinite(value):
+            if not _finite(value):
                 yield _of(m, Kind.mjOBJ_JOINT, joint, f"{what} is not finite")
         for field in ("armature", "damping", "frictionloss"):
-            if not np.isfinite(getattr(m, f"dof_{field}")[dof]):
+            if not _finite(getattr(m, f"dof_{field}")[dof]):
                 yield _of(m, Kind.mjOBJ_JOINT, joint, f"{field} is not finite")
     for field in ("gravity", "density", "viscosity"):
-        if not np.isfinite(getattr(m.opt, field)).all():
+        if not _finite(getattr(m.opt, field)).all():
             yield Obstacle("option", field, "not finite")
 
 

@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from diffsim.integration import is_real
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
@@ -215,7 +217,7 @@ class Scene:
         for name, value in constants.items():
             if name not in PENALTY_CONSTANTS:
                 raise ValueError(f"unknown penalty constant {name!r}; choose from {', '.join(PENALTY_CONSTANTS)}")
-            if not 0 <= value < np.inf:
+            if not is_real(value) or not 0 <= value <= np.finfo(np.float32).max:
                 raise ValueError(f"penalty constant {name} is {value!r}, must be finite and not negative")
         changes: dict[str, Any] = {
             name: np.full(self.nlink, value) if name.endswith("_limit") else value for name, value in constants.items()

@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import torch
 
-from diffsim.integration import Integration, check_count
+from diffsim.integration import Integration, check_count, is_real
 from diffsim.kernels.lanes import Division
 from diffsim.launcher import WARP_DTYPE, Launcher, check_memory
 from diffsim.scene import Scene
@@ -53,11 +53,13 @@ class Simulator:
         threads: int | None = None,
         division: Division | None = None,
     ) -> None:
+        if not isinstance(scene, Scene):
+            raise ValueError(f"scene is a {type(scene).__name__}, must be a Scene: load_scene reads one from a file")
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         if threads is not None:
             threads = check_count("threads", threads)
         integration = integration.check()
-        if not 0 < control_dt < math.inf:
+        if not is_real(control_dt) or not 0 < control_dt < math.inf:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")

@@ -1,23 +1,89 @@
-"""MuJoCo and Warp, started without noise. The package imports this before everything else that needs them."""
+"""MuJoCo and Warp, started without noise, and an end in one line. The package imports this before everything else."""
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import importlib
 import os
+import shutil
+import signal
 import sys
+import threading
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any
 from weakref import WeakSet
 
-import warp as wp
+_one_line: tuple[type[BaseException], ...] = ()
+_interrupted = False  # while the package was imported
 
+
+def end_in_one_line(*kinds: type[BaseException]) -> None:
+    """From now on such errors, and Ctrl-C, end the program in one line on stderr instead of a traceback."""
+    global _one_line
+    _one_line = (KeyboardInterrupt, *kinds)
+
+
+def imported() -> None:
+    """The package is imported. Raises KeyboardInterrupt if Ctrl-C came and a module that was imported kept it back."""
+    if signal.getsignal(signal.SIGINT) is _note:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if _interrupted:
+        raise KeyboardInterrupt
+
+
+def _note(number: int, frame: FrameType | None) -> None:
+    global _interrupted
+    _interrupted = True
+    signal.default_int_handler(number, frame)
+
+
+def _report(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    global _interrupted
+    # An import that is interrupted fails somewhere in another package, with whatever error that makes of it.
+    imports = sum(frame.f_code.co_name == "<module>" for frame, _ in traceback.walk_tb(trace)) > 1
+    interrupted = _interrupted or (imports and issubclass(kind, KeyboardInterrupt))
+    no_memory = kind is RuntimeError and "can't allocate memory" in str(error)  # torch's on a CPU
+    if interrupted or issubclass(kind, _one_line) or (_one_line and no_memory):
+        text = "" if interrupted else str(error).partition("\n")[0]
+        print(f"{Path(sys.argv[0]).name}: {text or 'interrupted'}", file=sys.stderr)
+    else:
+        _others(kind, error, trace)
+    _interrupted = False
+
+
+def _report_in_thread(args: threading.ExceptHookArgs) -> None:
+    if type(args.thread).__name__ != "_AsyncWriterThread":  # tensorboard's raises its error in the main thread again
+        _others_in_threads(args)
+
+
+_others, sys.excepthook = sys.excepthook, _report
+_others_in_threads, threading.excepthook = threading.excepthook, _report_in_thread
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler and (
+    threading.current_thread() is threading.main_thread()
+):
+    signal.signal(signal.SIGINT, _note)
+
+import warp as wp  # noqa: E402  Ctrl-C may come during this import and all that follow
+
+ROOM = 16 * 2**20  # bytes that a kernel takes in Warp's cache at most; LLVM aborts the process when there are fewer
 # What Warp prints when it starts and nobody needs: pip installs a Warp that supports the Python at hand.
 NOISE = (b"Could not find or load the NVIDIA CUDA driver", b"Support for Python 3.10 is deprecated")
 _announced: set[str] = set()
 _watched: WeakSet[Any] = WeakSet()
+
+
+class KernelCacheError(ValueError):
+    """Warp's folder of compiled kernels cannot be written."""
+
+    def __init__(self, folder: object, error: OSError) -> None:
+        super().__init__(
+            f"cannot write to Warp's kernel cache {folder}: set WARP_CACHE_PATH to another folder ({error.strerror})"
+        )
 
 
 def import_mujoco() -> None:
@@ -63,19 +129,17 @@ def check_kernel_cache() -> Path:
     """Start Warp; the folder where it keeps compiled kernels.
 
     Raises:
-        ValueError: it cannot be written.
+        KernelCacheError: it cannot be written.
     """
     wanted = wp.config.kernel_cache_dir
     try:
         with _without(*NOISE):
             wp.init()
         if not os.access(str(wp.config.kernel_cache_dir), os.W_OK):
-            raise PermissionError
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
         folder, wp.config.kernel_cache_dir = wp.config.kernel_cache_dir, wanted
-        raise ValueError(
-            f"cannot write to Warp's kernel cache {folder}: set WARP_CACHE_PATH to another folder"
-        ) from error
+        raise KernelCacheError(folder, error) from error
     return Path(str(wp.config.kernel_cache_dir))
 
 
@@ -91,11 +155,16 @@ def _watch(module: Any, name: str) -> None:
     load = module.load
 
     def announcing_load(device: Any, block_dim: int | None = None, *args: Any, **kwargs: Any) -> Any:
-        if name not in _announced and not _is_compiled(module, wp.get_device(device), block_dim):
-            _announced.add(name)
-            if os.environ.get("RANK", "0") == "0":
-                print(f"compiling kernels for {name} (once, about 10 s) ...", file=sys.stderr, flush=True)
-        return load(device, block_dim, *args, **kwargs)
+        try:
+            if not _is_compiled(module, wp.get_device(device), block_dim):
+                if shutil.disk_usage(str(wp.config.kernel_cache_dir)).free < ROOM:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                if name not in _announced and os.environ.get("RANK", "0") == "0":
+                    print(f"compiling kernels for {name} (once, about 10 s) ...", file=sys.stderr, flush=True)
+                _announced.add(name)
+            return load(device, block_dim, *args, **kwargs)
+        except OSError as error:
+            raise KernelCacheError(wp.config.kernel_cache_dir, error) from error
 
     module.load = announcing_load
 

@@ -19,7 +19,7 @@ _SMALL = (
 ).split()
 SMALL = {
     "shac": [*_SMALL, "--critic-iterations", "3"],
-    "sapo": [*_SMALL, "--accuracy", "default", "--critic-iterations", "3", "--population", "3"],
+    "sapo": [*_SMALL, "--critic-iterations", "3", "--population", "3"],
     "bptt": _SMALL,
     "ppo_baseline": [*_SMALL, "--minibatch-size", "40", "--epochs", "2"],
 }

@@ -349,6 +349,44 @@ def test_counts_are_integers():
             diffsim.make("hopper", **{"num_envs": 2, name: True})
 
 
+@pytest.mark.parametrize("seed", [True, 1.5, "a", [1, 2], 10**30])
+def test_seeds_are_integers(seed):
+    env = diffsim.make("cartpole", num_envs=2, seed=np.int64(3))
+    for call in (lambda: env.reset(seed=seed), lambda: diffsim.make("cartpole", num_envs=2, seed=seed)):
+        with pytest.raises(ValueError, match="must be one integer of 64 bits"):
+            call()
+
+
+@pytest.mark.parametrize("options", [5, {"mask": np.array([True, False])}, {"reset_mask": "all"}])
+def test_unknown_reset_options_are_refused(options):
+    env = diffsim.make("cartpole", num_envs=2, seed=0)
+    qpos = env.qpos.clone()
+    with pytest.raises(ValueError, match="reset_mask"):
+        env.reset(options=options)
+    assert_same(env.qpos, qpos)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(penalty={"mu": "a"}), "penalty constant mu is 'a'"),
+        (dict(penalty={"k_n": 1e39}), r"penalty constant k_n is 1e\+39"),  # infinite in the kernels
+        (dict(integrator="implicit", theta="a"), "theta is 'a'"),
+        (dict(integrator="implicit", theta=True), "theta is True"),
+    ],
+)
+def test_numbers_are_numbers(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        diffsim.make("hopper", num_envs=1, **arguments)
+
+
+def test_a_simulator_wants_a_scene():
+    with pytest.raises(ValueError, match="scene is a str, must be a Scene: load_scene reads one"):
+        diffsim.Simulator("ant.xml", num_envs=1)
+    with pytest.raises(ValueError, match="control_dt is 'a'"):
+        diffsim.Simulator(diffsim.load_scene(HOPPER), num_envs=1, control_dt="a")
+
+
 def test_more_environments_than_memory(monkeypatch):
     monkeypatch.setattr(torch, "zeros", None)  # nothing is allocated
     scene = diffsim.load_scene(HOPPER)

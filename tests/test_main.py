@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
+import signal
 import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,6 +22,7 @@ from diffsim import render, startup
 from diffsim.training import load_policy
 
 ROOT = Path(__file__).resolve().parents[1]
+PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
 SMALL = "--env cartpole --device cpu --iterations 1 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet".split()
 
 
@@ -167,3 +171,45 @@ def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(wp.config, "kernel_cache_dir", "/proc/nowhere")
     with pytest.raises(ValueError, match="cannot write to Warp's kernel cache /proc/nowhere: set WARP_CACHE_PATH"):
         diffsim.make("cartpole", 1)
+
+
+@pytest.mark.parametrize("kept_back", [False, True])
+def test_an_interrupted_import_ends_in_one_line(kept_back: bool, tmp_path: Path) -> None:
+    """Also where another package makes an ImportError of it, as extensions in C++ do."""
+    program = tmp_path / "train.py"
+    program.write_text(f"""
+import signal, sys
+class Finder:
+    def find_spec(name, *_):
+        if name == "gymnasium":
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                if {kept_back}:
+                    raise ImportError("initialization failed")
+                raise
+sys.meta_path.insert(0, Finder)
+import diffsim
+""")
+    done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, env=os.environ | PATH)
+    assert done.returncode != 0 and (done.stdout, done.stderr) == ("", "train.py: interrupted\n")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler  # in a program that was not interrupted
+
+
+def test_a_script_ends_in_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    others = list[object]()
+    monkeypatch.setattr(startup, "_one_line", ())
+    monkeypatch.setattr(startup, "_others", lambda *arguments: others.append(arguments[0]))
+    startup.end_in_one_line(ZeroDivisionError)
+    for error in (KeyboardInterrupt(), ZeroDivisionError("no such number"), KeyError("a mistake")):
+        sys.excepthook(type(error), error, None)
+    assert capsys.readouterr().err == "diffsim: interrupted\ndiffsim: no such number\n"
+    assert others == [KeyError]
+
+
+def test_a_full_kernel_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    env = diffsim.make("cartpole", 1, substeps=1)
+    monkeypatch.setattr(startup, "_is_compiled", lambda *_: False)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1e6))
+    with pytest.raises(startup.KernelCacheError, match=r"kernel cache /.*: set WARP_CACHE_PATH to .* \(No space left"):
+        env.step(torch.zeros(1, 1))

@@ -210,7 +210,10 @@ REFUSED = {
     **{
         f"{what} {value}": (pendulum(f'{what}="{value}"'), f"joint 'hinge': {what} is {message}")
         for what in ("damping", "armature", "stiffness")
-        for value, message in (("-1", "-1, must not be negative"), ("nan", "not finite"), ("inf", "not finite"))
+        for value, message in (
+            ("-1", "-1, must not be negative"),
+            *((value, "not finite") for value in ("nan", "inf", "1e39")),
+        )
     },
     "position that is not a number": (
         robot('<body name="b" pos="nan 0 0"><joint/><geom size="1"/></body>'),

@@ -6,9 +6,10 @@ The physics knows nothing of this package.
 from __future__ import annotations
 
 from diffsim.training import distributed
+from diffsim.training.assess import evaluate_checkpoint, make_policy_env
 from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, export_policy, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
-from diffsim.training.errors import fail
+from diffsim.training.errors import fail, parse_command_line
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import (
     Count,
@@ -27,7 +28,7 @@ from diffsim.training.flags import (
 from diffsim.training.gait import Gait, describe
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.run import Run, episode_metrics, evaluate_checkpoint, make_policy_env
+from diffsim.training.run import Run, episode_metrics
 
 __all__ = [
     "ClippedAdam",
@@ -61,5 +62,6 @@ __all__ = [
     "make_policy_env",
     "moments",
     "parse",
+    "parse_command_line",
     "parse_penalty",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import zipfile
 from collections.abc import Mapping
@@ -74,9 +75,31 @@ def save(path: Path, script: str, learner: Learner, state: Mapping[str, Any]) ->
     """
     modules = {name: module.state_dict() for name, module in learner.modules.items()}
     policy = {"layers": _describe(learner.policy), "weights": learner.policy.state_dict()}
-    temporary = path.with_suffix(".tmp")
-    torch.save({"format": FORMAT, "script": script, **state, "modules": modules, "policy": policy}, temporary)
-    os.replace(temporary, path)
+    _write(path, {"format": FORMAT, "script": script, **state, "modules": modules, "policy": policy})
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    buffer = io.BytesIO()  # torch.save to a full disk raises what says nothing of it
+    torch.save(content, buffer)
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        temporary.write_bytes(buffer.getbuffer())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def find_nonfinite(learner: Learner) -> str | None:
+    """The first weight that is not finite, if any. Frozen ones may be infinite: log_std of a policy without noise."""
+    modules = dict(learner.modules) | {"policy": learner.policy}
+    for owner, module in modules.items():
+        for name, weight in (
+            (*module.named_parameters(), *module.named_buffers()) if isinstance(module, nn.Module) else ()
+        ):
+            frozen = isinstance(weight, nn.Parameter) and not weight.requires_grad
+            if bool((weight.isnan() if frozen else ~weight.isfinite()).any()):
+                return f"{owner}.{name}"
+    return None
 
 
 def load(path: Path, script: str | None = None) -> dict[str, Any]:
@@ -89,6 +112,8 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
                 raise ValueError
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         form = state["format"]
+        if form == FORMAT and "script" not in state:
+            raise ValueError
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         fail(f"{path} is not a whole checkpoint" + (f" of {script}.py" if script else ""))
     if form != FORMAT:
@@ -101,21 +126,27 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
 def load_policy(path: Path) -> SavedPolicy:
     """The policy of any script's checkpoint, on the CPU in float32; anything else ends the script with one line."""
     state = load(path)
-    network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
-    network.load_state_dict(state["policy"]["weights"])
+    try:
+        network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
+        network.load_state_dict(state["policy"]["weights"])
+    except (KeyError, RuntimeError):
+        fail(f"{path} is not a whole checkpoint")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"])
 
 
 def export_policy(path: Path, output: Path) -> None:
     """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB."""
     state = load(path)
-    torch.save({name: state[name] for name in ("format", "script", "args", "iteration", "policy")}, output)
+    _write(output, {name: state[name] for name in ("format", "script", "args", "iteration", "policy")})
 
 
 def restore(learner: Learner, state: Mapping[str, Any]) -> None:
-    """Load the weights and statistics of a checkpoint into a learner of the same sizes."""
-    for name, module in learner.modules.items():
-        module.load_state_dict(state["modules"][name])
+    """Load the weights and statistics of a checkpoint into a learner; other sizes end the script with one line."""
+    try:
+        for name, module in learner.modules.items():
+            module.load_state_dict(state["modules"][name])
+    except (KeyError, RuntimeError) as error:
+        fail(f"the checkpoint does not fit the script as it is now: {' '.join(str(error).split())}")
 
 
 def _describe(policy: nn.Sequential) -> list[list[Any]]:

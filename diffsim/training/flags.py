@@ -16,12 +16,18 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+import torch
 import tyro
 
 from diffsim import render
+from diffsim.env import ActionError
+from diffsim.launcher import TooLargeError
+from diffsim.startup import KernelCacheError, end_in_one_line
 from diffsim.tasks import TASKS
 from diffsim.training import checkpoint, distributed
-from diffsim.training.errors import fail
+from diffsim.training.errors import fail, parse_command_line
+
+LARGEST = torch.finfo(torch.float32).max
 
 
 @dataclass(frozen=True)
@@ -32,8 +38,12 @@ class Range:
     holds: Callable[[float], bool]
 
     def complaint(self, value: float) -> str | None:
-        if not math.isfinite(value):
-            return f"must be finite, not {value}"
+        if not abs(value) <= LARGEST:
+            return (
+                f"must be finite in single precision, not {value}"
+                if math.isfinite(value)
+                else f"must be finite, not {value}"
+            )
         return None if self.holds(value) else f"must be {self.words}, not {value}"
 
 
@@ -45,6 +55,7 @@ NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
 Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]
 Decay = Annotated[float, Range("in [0, 1)", lambda value: 0 <= value < 1)]
 Widths = tuple[Count, ...]
+Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
 @dataclass
@@ -71,7 +82,7 @@ class SimulatorFlags:
 class RunFlags:
     """Where and how long it runs, what it writes."""
 
-    seed: int = 1
+    seed: Seed = 1
     """seed of all random numbers"""
     iterations: Count = 2000
     """learning iterations (per task)"""
@@ -155,6 +166,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         kind: the script's dataclass of arguments.
         argv: in place of the process's.
     """
+    end_in_one_line(KernelCacheError, TooLargeError, ActionError, FloatingPointError, torch.OutOfMemoryError)
     argv = list(sys.argv[1:] if argv is None else argv)
     # The first pass finds what the defaults of the second depend on, so that its --help shows the task's own.
     args = _cli(kind, [word for word in argv if word not in ("-h", "--help")], kind())
@@ -236,7 +248,7 @@ def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
     every = dataclasses.make_dataclass(kind.__name__, fields)
     description = sys.modules[kind.__module__].__doc__
     config = (tyro.conf.OmitArgPrefixes,)
-    parsed = tyro.cli(every, args=argv, description=description, default=every(*groups), config=config)
+    parsed: Any = parse_command_line(every, argv, description=description, default=every(*groups), config=config)
     return kind(**{name: value for group in vars(parsed).values() for name, value in vars(group).items()})
 
 

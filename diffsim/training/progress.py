@@ -134,5 +134,7 @@ class ProgressLog:
     def close(self) -> None:
         if self.bar is not None:
             self.bar.close()
-        self.tensorboard.close()
-        self.file.close()
+        try:
+            self.tensorboard.close()
+        finally:
+            self.file.close()

@@ -6,10 +6,10 @@ import dataclasses
 import json
 import signal
 import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -18,15 +18,15 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-import diffsim
-from diffsim.env import DiffEnv
+from diffsim.env import ActionError, DiffEnv
 from diffsim.simulator import check_device
 from diffsim.training import checkpoint, distributed, graph
-from diffsim.training.checkpoint import Learner, SavedPolicy
+from diffsim.training.assess import make_env, write_evaluation
+from diffsim.training.checkpoint import Learner
+from diffsim.training.directory import Lock, check_writable
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import ENOUGH, FINER, Evaluation, evaluate, kept
-from diffsim.training.flags import Args, Flags, ParallelFlags, parse_penalty
-from diffsim.training.gait import describe
+from diffsim.training.evaluation import Evaluation
+from diffsim.training.flags import Flags, ParallelFlags
 from diffsim.training.progress import EpisodeStatistics, ProgressLog
 
 L = TypeVar("L", bound=Learner)
@@ -86,97 +86,6 @@ class Entry:
     evaluation: Evaluation | None = None
 
 
-def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> DiffEnv:
-    """The task as the flags ask for it; what is wrong with them ends the script."""
-    try:
-        return diffsim.make(
-            args.env,
-            num_envs,
-            args.device,
-            seed,
-            horizon,
-            substeps=args.substeps,
-            integrator=args.integrator,
-            theta=args.theta,
-            penalty=parse_penalty(args.penalty),
-            threads=args.threads or None,
-        )
-    except ValueError as error:
-        fail(error)
-
-
-def make_policy_env(saved: SavedPolicy, num_envs: int, **changes: Any) -> DiffEnv:
-    """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
-    names = {field.name for field in dataclasses.fields(Flags)} & saved.args.keys()
-    args = Flags(**{name: saved.args[name] for name in names} | {"device": "cpu", "threads": 0} | changes)
-    return make_env(args, num_envs)
-
-
-def check_writable(directory: Path) -> None:
-    """End the script if nothing can be written to a directory, which need not exist; leaves nothing behind."""
-    try:
-        existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
-        tempfile.TemporaryFile(dir=existing).close()
-    except OSError as error:
-        fail(f"cannot write to run directory {directory}: {error.strerror}")
-
-
-def evaluate_checkpoint(
-    args: Args,
-    learner: Callable[[Args, DiffEnv], L] | None = None,
-    method: Callable[[L], Evaluation] | None = None,
-) -> None:
-    """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video.
-
-    Unless --no-finer is given, the policy must also keep its return at FINER times the substeps, explicitly integrated:
-    one that does not has learned to live on the integrator's errors.
-
-    Args:
-        args: the script's arguments.
-        learner, method: how a restored learner is evaluated, if not by `evaluate` of its policy.
-    """
-    assert args.evaluate and args.run_dir
-    check_writable(args.run_dir)
-    torch.set_num_threads(1)
-    path, state = args.evaluate, checkpoint.load(args.evaluate, args.script())
-
-    def measure(flags: Args) -> Evaluation:
-        env = make_env(flags, flags.eval_episodes)
-        if learner and method:
-            restored = learner(flags, env)
-            checkpoint.restore(restored, state)
-            return method(restored)
-        return evaluate(env, checkpoint.load_policy(path).network.to(env.device))
-
-    evaluation, found = measure(args), dict[str, Any]()
-    print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
-    if args.finer:
-        substeps = FINER * args.substeps
-        explicit = dataclasses.replace(args, integrator="semi_implicit", theta=0.0, substeps=substeps)
-        value = measure(explicit).returns.median().item()
-        share = kept(evaluation.returns.median().item(), value)
-        found["finer"] = {"substeps": substeps, "return": value, "kept": share}
-        warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-        print(f"explicit with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
-    write_evaluation(args, evaluation, state["iteration"], **found)
-
-
-def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
-    """Print the gait, and leave evaluation.json and, if asked for, the video in the run's directory."""
-    assert args.run_dir
-    names = ("env", "integrator", "substeps", "theta", "penalty", "device", "eval_episodes")
-    settings = {name: getattr(args, name) for name in names} | dict(script=args.script(), iteration=iteration)
-    if gait := describe(evaluation):
-        print(f"gait: {gait}")
-        found["gait"] = dataclasses.asdict(gait) | {"verdict": gait.verdict}
-    evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
-    if args.capture_video:
-        try:
-            print(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
-        except (OSError, RuntimeError) as error:
-            fail(error)
-
-
 class Run:
     """Iterate over it: it yields the number of each iteration, and evaluates, saves and stops when due.
 
@@ -197,6 +106,7 @@ class Run:
         self.args, self.directory = args, args.run_dir
         self.writes = distributed.rank() == 0
         self._state = checkpoint.load(args.resume, args.script()) if args.resume else None
+        self._lock = Lock()
         if self.writes:
             self._check_directory()
         try:
@@ -207,6 +117,7 @@ class Run:
         torch.set_num_threads(1)  # operations this small gain little from more; idle threads disturb the simulator's
         torch.manual_seed(args.seed)
         self.iteration, self.seconds, self.control_steps = 0, 0.0, 0
+        self._saved = self._state["iteration"] if self._state else 0
         self.last = min(args.iterations, args.stop_after or args.iterations)
         self._totals, self._episodes = dict.fromkeys(TOTALS, 0), EpisodeStatistics()
         self._env: DiffEnv | None = None
@@ -263,7 +174,11 @@ class Run:
 
         def timed() -> Metrics:
             begin = Mark(self.device)
-            metrics = call()
+            try:
+                metrics = call()
+            except ActionError:
+                self._check_weights()  # they say more
+                raise
             self._timings.append((f"time/{function.__name__}", begin, Mark(self.device)))
             return metrics
 
@@ -274,7 +189,9 @@ class Run:
     @property
     def evaluation_due(self) -> bool:
         """Whether this iteration ends with an evaluation, on the rank that evaluates."""
-        return self.writes and self._evaluates()
+        if due := self.writes and self._evaluates():
+            self._check_weights()
+        return due
 
     def _evaluates(self) -> bool:
         every = self.args.eval_every
@@ -366,7 +283,8 @@ class Run:
         if entry.evaluation is not None:
             self.message(f"iteration {entry.iteration}: {entry.evaluation}")
         if self._log is not None:
-            self._log.write(entry.iteration, entry.control_steps, self.seconds, scalars)
+            with self._writing():
+                self._log.write(entry.iteration, entry.control_steps, self.seconds, scalars)
 
     # Files and signals -----------------------------------------------------------------------------------------------
 
@@ -377,6 +295,7 @@ class Run:
         if existing.exists() and (args.resume is None or not args.resume.samefile(existing)):
             fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
         check_writable(path)
+        self._lock.acquire(path)
         if args.track:
             try:
                 import wandb  # noqa: F401
@@ -391,7 +310,12 @@ class Run:
             self._handlers[number] = signal.signal(number, self._receive)
         if not self.writes:
             return
+        with self._writing():
+            self._open_files()
+
+    def _open_files(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
+        self._lock.acquire(self.directory)
         arguments = dataclasses.asdict(self.args)
         (self.directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
         if self.args.track:
@@ -403,9 +327,26 @@ class Run:
         self._log = ProgressLog(*start, arguments, self.args.iterations, self.args.quiet)
 
     def _receive(self, number: int, _frame: FrameType | None) -> None:
-        """Stop after the present iteration; the same signal a second time has its usual effect."""
+        """Stop after the present iteration; a second time at once, as Ctrl-C does elsewhere."""
         self._signals.append(number)
-        signal.signal(number, self._handlers[number])
+        signal.signal(number, signal.default_int_handler)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Around what writes files: a full disk or the like ends the script."""
+        try:
+            yield
+        except OSError as error:
+            fail(f"cannot write to {self.directory}: {error.strerror}; {self._kept()}")
+
+    def _kept(self) -> str:
+        path = self.directory / "checkpoint.pt"
+        return f"{path} is of iteration {self._saved}" if path.is_file() else "no checkpoint was saved"
+
+    def _check_weights(self) -> None:
+        """End the script where training has diverged."""
+        if self._learner is not None and (name := checkpoint.find_nonfinite(self._learner)):
+            fail(f"iteration {self.iteration}: weight {name} is not finite; {self._kept()}")
 
     def _random_numbers(self) -> torch.Generator:
         return (
@@ -418,17 +359,22 @@ class Run:
         ranks = distributed.gather({"env": env, "rng": self._random_numbers().get_state()})
         if not self.writes:
             return
+        self._check_weights()
         args = {k: None if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.args).items()}
         args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
         state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
-        checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
+        with self._writing():
+            checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
+        self._saved = self.iteration
 
     def _close(self) -> None:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         if self._log is not None:
-            self._log.close()
+            with suppress(OSError) if sys.exc_info()[0] else self._writing():  # one message is enough
+                self._log.close()
+        self._lock.release()
         distributed.finalize()
 
     def _summarise(self) -> None:

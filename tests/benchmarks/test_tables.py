@@ -8,6 +8,7 @@ from pathlib import Path
 import common
 import pytest
 import tables
+from learners import refusal
 
 
 def test_rows_replace_those_of_their_key_and_origins_those_of_their_command(
@@ -44,13 +45,35 @@ def test_only_its_own_part_of_a_page_is_filled(tmp_path: Path) -> None:
 def test_results_of_a_gpu_have_places_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.get_device_name", lambda _: "NVIDIA H100 80GB HBM3")
     gpu, cpu, elsewhere = (
-        common.CommonFlags(device="cuda:0"),
-        common.CommonFlags(),
+        common.CommonFlags(device="cuda:0", update_results=True),
+        common.CommonFlags(update_results=True),
         common.CommonFlags(output=Path("/elsewhere")),
     )
     assert gpu.csv("speed") == common.RESULTS / "h100" / "speed.csv" and gpu.link("speed") == "figures/h100/speed.png"
     assert cpu.csv("speed") == common.RESULTS / "cpu" / "speed.csv" and cpu.link("speed") == "figures/speed.png"
     assert elsewhere.picture("speed") == Path("/elsewhere/speed.png")
+
+
+def test_the_repository_is_changed_on_demand_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("RESULTS", "DOCS", "OUTPUT"):
+        monkeypatch.setattr(common, name, tmp_path / name)
+    (tmp_path / "DOCS").mkdir()
+    page = tmp_path / "DOCS" / "page.md"
+    page.write_text("<!-- a -->\n<!-- /a -->\n")
+    for flags, tree in (([], "OUTPUT"), (["--update-results"], "RESULTS")):
+        args = common.parse(common.CommonFlags, None, flags)
+        args.write("a", [{"task": "ant"}])
+        args.publish("a", "table\n", "page.md")
+        assert list(tmp_path.glob("*/cpu/a.csv")) == [tmp_path / tree / "cpu" / "a.csv"]
+        assert (
+            ("table" in page.read_text()) == (tree == "RESULTS") == (args.picture("a").parents[1] == tmp_path / "DOCS")
+        )
+        (tmp_path / tree / "cpu" / "a.csv").unlink()
+    argv = ["--update-results", "--output", str(tmp_path)]
+    error = refusal(lambda: common.parse(common.CommonFlags, None, argv), capsys)
+    assert error.endswith("--output and --update-results exclude each other")
 
 
 def test_every_result_says_where_it_comes_from() -> None:

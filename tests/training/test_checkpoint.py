@@ -27,13 +27,14 @@ def test_a_crash_while_saving_leaves_the_old_one(tmp_path: Path, monkeypatch: py
     save(path, "shac", Tiny(), {"iteration": 1})
     whole = path.read_bytes()
 
-    def crash(state: object, file: Path) -> None:
-        file.write_bytes(whole[:100])
+    def crash(file: Path, data: bytes) -> None:
+        file.open("wb").write(data[:100])
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="no space"):
-        patch.setattr(torch, "save", crash)
+        patch.setattr(Path, "write_bytes", crash)
         save(path, "shac", Tiny(), {"iteration": 2})
+    assert list(tmp_path.iterdir()) == [path]
     assert path.read_bytes() == whole and load(path, "shac")["iteration"] == 1
     assert load(path)["format"] == FORMAT and load(path)["script"] == "shac"
     save(path, "shac", Tiny(), {"iteration": 3})
@@ -58,7 +59,7 @@ def test_anything_else_is_refused_in_one_line(tmp_path: Path, capsys: pytest.Cap
         torch.save({"format": older, "actor": {}}, path)
         message = f": {path} is a checkpoint of format {older}, and this version reads format {FORMAT}"
         assert refusal(lambda: load(path, "shac"), capsys).endswith(message)
-    for foreign in ({"weights": torch.zeros(3)}, [1, 2]):
+    for foreign in ({"weights": torch.zeros(3)}, [1, 2], {"format": FORMAT}):
         torch.save(foreign, path)
         assert refusal(lambda: load(path), capsys).endswith(f": {path} is not a whole checkpoint")
 
@@ -94,3 +95,21 @@ def test_a_layer_that_cannot_be_saved_is_named(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="layer Dropout; .* has ELU, LayerNorm, Linear"):
         save(tmp_path / "checkpoint.pt", "shac", learner, {})
     assert not list(tmp_path.iterdir())
+
+
+def test_weights_of_other_sizes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    learner = Tiny()
+    learner.modules = {"policy": learner.policy}
+    for other in ({"policy": nn.Sequential(nn.Linear(3, 1)).state_dict()}, {}):
+        error = refusal(lambda other=other: restore(learner, {"modules": other}), capsys)  # type: ignore[misc]
+        assert "the checkpoint does not fit the script as it is now: " in error
+
+
+def test_a_policy_that_is_not_whole_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "checkpoint.pt"
+    save(path, "shac", Tiny(), {"args": {}, "iteration": 1})
+    state = load(path)
+    assert load_policy(path).iteration == 1
+    for policy in ({}, state["policy"] | {"weights": {}}):
+        torch.save(state | {"policy": policy}, path)
+        assert refusal(lambda: load_policy(path), capsys).endswith(f"{path} is not a whole checkpoint")

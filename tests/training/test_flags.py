@@ -19,7 +19,7 @@ import ppo_baseline
 import shac
 from diffsim.tasks import Task
 from diffsim.training import checkpoint, flags, parse
-from diffsim.training.run import make_env
+from diffsim.training.assess import make_env
 
 
 @pytest.fixture(autouse=True)
@@ -80,6 +80,17 @@ def save(args: flags.Flags, **further: object) -> Path:
         (bptt, "--betas 0.9 1", "--betas must be in [0, 1), not 1.0"),
         (shac, "--initial-log-std nan", "--initial-log-std must be finite, not nan"),
         (shac, "--initial-log-std -inf", "--initial-log-std must be finite, not -inf"),
+        (shac, "--actor-lr 1e39", "--actor-lr must be finite in single precision, not 1e+39"),
+        (shac, "--seed 99999999999999999999", "--seed must be below 2^62 in size, not 99999999999999999999"),
+        (shac, "--num-envs 1e8", "Error parsing --num-envs: invalid literal for int() with base 10: '1e8'"),
+        (shac, "--betas 0.9", "Missing value for argument '--betas'. Expected 2 values."),
+        (
+            shac,
+            "--accuracy x",
+            "invalid choice 'x' for argument '--accuracy'. Expected one of ('fast', 'default', 'accurate').",
+        ),
+        (shac, "--no-such-thing", "Unrecognized options: --no-such-thing"),
+        (shac, "--actor-lrr 3", "Unrecognized options: --actor-lrr, 3; perhaps you meant --actor-lr"),
     ],
 )
 def test_a_number_out_of_range_is_named_before_anything_is_written(
@@ -128,7 +139,7 @@ def test_defaults_are_the_tables(script: ModuleType) -> None:
     for env in diffsim.TASKS:
         args = parse(script.Args, ["--env", env, "--device", "cpu"])
         expected = dict(zip(script.COLUMNS, script.PER_TASK[env], strict=True)) if env in script.PER_TASK else {}
-        if script is ppo_baseline:
+        if hasattr(script, "CPU"):
             expected |= {name: min(expected.get(name, most), most) for name, most in script.CPU.items()}
         preset = diffsim.TASKS[env].integration("default")
         expected |= dict(integrator=preset.integrator, substeps=preset.substeps, theta=preset.theta)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +22,7 @@ import bptt
 import diffsim
 import shac
 from diffsim.env import DiffEnv
-from diffsim.training import Evaluation, Run, checkpoint, evaluate, parse
+from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, evaluate, parse
 from diffsim.training import run as run_module
 from diffsim.training.progress import COLUMNS
 
@@ -101,6 +103,86 @@ def test_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     with pytest.raises(KeyboardInterrupt):
         run(bptt, tmp_path / "twice", *arguments)
     assert not (tmp_path / "twice" / "checkpoint.pt").exists()
+
+
+# When it cannot go on -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "arguments"),
+    [(math.nan, "--save-every 1"), (math.inf, "--save-every 1"), (math.nan, "--save-every 2 --eval-every 3")],
+)
+def test_weights_that_are_not_finite_are_named_and_not_saved(
+    value: float, arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    step, calls = ClippedAdam.step, []
+
+    def diverge(optimizer: ClippedAdam, loss: Tensor) -> Tensor:
+        norm = step(optimizer, loss)
+        calls.append(1)
+        if len(calls) == 3:
+            optimizer.vector[-1] = value
+        return norm
+
+    monkeypatch.setattr(ClippedAdam, "step", diverge)
+    argv = [*TINY, "--iterations", "5", "--quiet", *arguments.split(), "--run-dir", str(tmp_path)]
+    error, path = refusal(lambda: bptt.main(argv), capsys), tmp_path / "checkpoint.pt"
+    assert error.startswith("bptt.py: iteration 3: weight actor.mean.") and error.endswith(f"{path} is of iteration 2")
+    assert checkpoint.load(path)["iteration"] == 2 and not list(tmp_path.glob("*.tmp"))
+
+
+def test_weights_that_make_actions_nan_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a CPU the environment refuses them, an iteration after the weights went wrong."""
+    monkeypatch.setattr(ClippedAdam, "step", lambda optimizer, _: optimizer.vector.fill_(math.nan)[0])
+    argv = [*TINY, "--iterations", "5", "--quiet", "--run-dir", str(tmp_path)]
+    error = refusal(lambda: bptt.main(argv), capsys)
+    assert error == "bptt.py: iteration 2: weight actor.log_std is not finite; no checkpoint was saved"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="directories have no locks")
+def test_one_process_trains_into_a_directory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A killed one leaves no lock behind, and it ends before anything is written."""
+    run(bptt, tmp_path, *TINY, "--iterations", 2, "--stop-after", 1, "--quiet")
+    hold = "import fcntl, os, sys; fcntl.flock(os.open(sys.argv[1], os.O_RDONLY), fcntl.LOCK_EX); print(); input()"
+    pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    other = subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], **pipes)
+    try:
+        assert other.stdout and other.stdout.readline()
+        before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+        error = refusal(lambda: bptt.main(["--resume", str(tmp_path / "checkpoint.pt")]), capsys)
+        assert error == f"bptt.py: another process trains into {tmp_path}"
+        assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
+    finally:
+        other.kill()
+        other.communicate()
+    bptt.main(["--resume", str(tmp_path / "checkpoint.pt")])
+    assert checkpoint.load(tmp_path / "checkpoint.pt")["iteration"] == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limit")
+@pytest.mark.parametrize(("limit", "arguments"), [(30_000, "--save-every 1"), (1_000, "--save-every 0")])
+def test_a_full_disk_leaves_the_last_checkpoint(
+    limit: int, arguments: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What does not fit is the checkpoint, or the progress."""
+    import resource
+
+    run(bptt, tmp_path, *TINY, "--iterations", 50, "--stop-after", 2, "--quiet")
+    path = tmp_path / "checkpoint.pt"
+    whole, (soft, hard) = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def resume() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+        try:
+            bptt.main(["--resume", str(path), *arguments.split()])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    error = refusal(resume, capsys)
+    assert error == f"bptt.py: cannot write to {tmp_path}: File too large; {path} is of iteration 2"
+    assert path.read_bytes() == whole and not list(tmp_path.glob("*.tmp"))
 
 
 # What it counts -------------------------------------------------------------------------------------------------------
