@@ -217,7 +217,7 @@ class Scene:
         for name, value in constants.items():
             if name not in PENALTY_CONSTANTS:
                 raise ValueError(f"unknown penalty constant {name!r}; choose from {', '.join(PENALTY_CONSTANTS)}")
-            if not is_real(value) or not 0 <= value <= np.finfo(np.float32).max:
+            if not is_real(value) or not 0 <= value <= float(np.finfo(np.float32).max):
                 raise ValueError(f"penalty constant {name} is {value!r}, must be finite and not negative")
         changes: dict[str, Any] = {
             name: np.full(self.nlink, value) if name.endswith("_limit") else value for name, value in constants.items()

@@ -20,8 +20,11 @@ class Linears(nn.Module):
         self.weight = nn.Parameter(torch.stack([layer.weight.detach().T for layer in layers]))
         self.bias = nn.Parameter(torch.stack([layer.bias.detach().unsqueeze(0) for layer in layers]))
 
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
+    def forward(self, x: Tensor, norms: LayerNorms | None = None) -> Tensor:
+        """Of normalized inputs, norms scale and shift them first: in the weights, which are fewer than the inputs."""
+        if norms is None:
+            return torch.baddbmm(self.bias, x, self.weight)
+        return torch.baddbmm(self.bias + norms.bias @ self.weight, x, norms.weight.mT * self.weight)
 
     def __getitem__(self, e: int) -> nn.Linear:
         layer = nn.Linear(*self.weight.shape[1:]).to(self.weight)
@@ -30,7 +33,7 @@ class Linears(nn.Module):
 
 
 class LayerNorms(nn.Module):
-    """E layer normalisations: (E, B, width) -> (E, B, width)."""
+    """E layer normalizations: (E, B, width) -> (E, B, width), before they are scaled and shifted."""
 
     def __init__(self, layers: Sequence[nn.LayerNorm]) -> None:
         super().__init__()
@@ -38,7 +41,7 @@ class LayerNorms(nn.Module):
         self.bias = nn.Parameter(torch.stack([layer.bias.detach().unsqueeze(0) for layer in layers]))
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.addcmul(self.bias, F.layer_norm(x, x.shape[-1:]), self.weight)
+        return F.layer_norm(x, x.shape[-1:])
 
     def __getitem__(self, e: int) -> nn.LayerNorm:
         layer = nn.LayerNorm(self.weight.shape[-1]).to(self.weight)
@@ -57,11 +60,18 @@ class Ensemble(nn.Module):
 
     def __init__(self, networks: Sequence[nn.Sequential]) -> None:
         super().__init__()
-        self.layers = nn.Sequential(*(_stack(layers) for layers in zip(*networks, strict=True)))
+        self.layers = nn.ModuleList(_stack(layers) for layers in zip(*networks, strict=True))
 
     def forward(self, x: Tensor) -> Tensor:
-        y: Tensor = self.layers(x)
-        return y
+        norms = None  # whose scale and shift the next layer is to apply
+        for layer in self.layers:
+            if isinstance(layer, Linears):
+                x, norms = layer(x, norms), None
+            elif norms is None:
+                x, norms = layer(x), layer if isinstance(layer, LayerNorms) else None
+            else:
+                raise TypeError(f"no ensemble of LayerNorm and then {type(layer).__name__}: only Linear may follow")
+        return x if norms is None else torch.addcmul(norms.bias, x, norms.weight)
 
     def __getitem__(self, e: int) -> nn.Sequential:
         return nn.Sequential(*(layer[e] if isinstance(layer, Linears | LayerNorms) else layer for layer in self.layers))

@@ -35,6 +35,10 @@ def test_it_is_its_networks_and_gives_them_back() -> None:
         assert all(torch.equal(p, q) for p, q in zip(ensemble[e].parameters(), single.parameters(), strict=True))
     with pytest.raises(TypeError, match="no ensemble of Conv1d: only of Linear, LayerNorm"):
         Ensemble([nn.Sequential(nn.Conv1d(1, 1, 1))])
+    with pytest.raises(TypeError, match="no ensemble of LayerNorm and then ELU: only Linear may follow"):
+        Ensemble([nn.Sequential(nn.LayerNorm(3), nn.ELU())])(torch.ones(1, 2, 3))
+    trunk = nn.Sequential(*network()[:3])  # ends with a LayerNorm
+    torch.testing.assert_close(Ensemble([trunk])(x[:1])[0], trunk(x[0]))
 
 
 def test_untied_members_learn_as_if_alone() -> None:
