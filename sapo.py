@@ -87,7 +87,7 @@ class Args(ParallelFlags):
     """share of the iterations after which the best member goes on in all environments"""
     symmetric: bool = False
     """left and right are treated alike: what the policy does in a state it does in the mirrored state, mirrored"""
-    symmetry_weight: Positive = 10.0
+    symmetry_weight: Positive = 1.0
     """weight in the actor's loss of the squared difference between the two, with --symmetric"""
     initial_target_entropy: Finite = -0.5
     """entropy per action, in nats, at which the temperature aims in the first iteration (per task)"""
