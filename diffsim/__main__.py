@@ -26,6 +26,7 @@ from diffsim.launcher import available_cores
 
 POLICIES = files("diffsim") / "policies"
 DEMO_EPISODES = 8  # of which the one of median return is filmed
+DEMO_SECONDS = 5.0  # of it
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -73,7 +74,7 @@ def demo(task: str, output: Path) -> None:
         saved = load_policy(Path(str(policy)))
         evaluation = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
         print(f"{task}, {saved.script}.py, iteration {saved.iteration}, {DEMO_EPISODES} episodes: {evaluation}")
-        print(f"video: {evaluation.save_video(output)}")
+        print(f"video: {evaluation.save_video(output, DEMO_SECONDS)}")
     except (OSError, RuntimeError, ValueError) as error:
         fail(error)
 

@@ -82,13 +82,13 @@ class Evaluation:
         steps = min(int(self.lengths[episode]), max(1, round(seconds / self.control_dt)))
         return self.qpos[:steps, episode].cpu().numpy(), self.action[:steps, episode].cpu().numpy()
 
-    def save_video(self, path: Path) -> Path:
-        """Film the first 10 s of the episode of median return, as .mp4 or .gif; returns the file.
+    def save_video(self, path: Path, seconds: float = render.VIDEO_SECONDS) -> Path:
+        """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
 
         Raises:
             OSError, RuntimeError: what is missing to draw or to write, see render.film.
         """
-        qpos, action = self.median_episode()
+        qpos, action = self.median_episode(seconds)
         return render.film(path, self.scene, qpos, self.control_dt, action)
 
 
