@@ -26,7 +26,7 @@ from diffsim.launcher import available_cores
 
 POLICIES = files("diffsim") / "policies"
 DEMO_EPISODES = 8  # of which the one of median return is filmed
-DEMO_SECONDS = 5.0  # of it
+DEMO_SECONDS = 4.0  # of it
 
 
 def main(argv: Sequence[str] | None = None) -> None:
