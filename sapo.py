@@ -45,7 +45,7 @@ from diffsim.training import (
     parse,
 )
 
-# By measurement, docs/sapo.md; networks and learning rates of SHAC's where no other was better.
+# SHAC's networks; docs/sapo.md has what was measured with these settings.
 # fmt: off
 COLUMNS = ("actor_hidden", "critic_hidden", "activation", "actor_lr", "critic_lr", "target_alpha", "initial_log_std",
            "initial_target_entropy", "target_entropy", "population", "num_envs", "iterations")

@@ -36,12 +36,14 @@ PPO = "ppo_baseline"
 # fmt: off
 RETURNS: dict[TaskName, tuple[int, tuple[int, ...], dict[str, int]]] = {
     "cartpole":     (-520, (-1000, -520),      {}),
-    "hopper":       (3000, (3000, 4500, 5437), {"shac": 4837, PPO: 4742}),
-    "half_cheetah": (6000, (9300,),            {}),
-    "ant":          (5000, (5000, 7661, 9313), {"shac": 7661, PPO: 6605}),
-    "humanoid":     (5000, (5000, 8387, 9845), {"shac": 8387, PPO: 7293}),
+    "hopper":       (3000, (3000, 4500), {"shac": 4837, PPO: 4742}),
+    "half_cheetah": (6000, (),                 {}),
+    "ant":          (5000, (5000, 7300, 7661), {"shac": 7661, PPO: 6605}),
+    "humanoid":     (5000, (5000, 7000, 8387), {"shac": 8387, PPO: 7293}),
     "humanoid_mtu": (4246, (4246, 6114, 6964), {"shac": 6114, PPO: 4246}),
 }
+# The best published of any learner, timed for SAPO: AHAC's (Georgiev et al. 2024).
+RECORDS: dict[TaskName, int] = {"ant": 9313, "humanoid": 9845}
 SAPO = ("sapo", "--accuracy", "fast")
 SAPO_CPU = ("sapo", "--integrator", "implicit", "--substeps", "16", "--iterations", "1000")  # the humanoid in minutes
 PRESETS = {  # what the trade of accuracy for speed does to learning
@@ -128,7 +130,8 @@ def collect(args: Args, learner: str, env: TaskName) -> None:
         for row in (rows[k] for k in sorted(keep)):
             points.append({"seed": seed(folder)} | {c: row.get(c) and f"{float(row[c]):.6g}" or "" for c in COLUMNS})
     args.write(f"{learner}_{env}", points)
-    if found := summary(args.runs / learner, env, RETURNS[env][1]):
+    records = {RECORDS[env]} if learner.startswith("sapo") and env in RECORDS else set()
+    if found := summary(args.runs / learner, env, sorted({*RETURNS[env][1]} | records)):
         row = {"learner": learner, "task": env} | found | {"published": RETURNS[env][2].get(learner, "")}
         args.merge("learning", [row], ("learner", "task"))
 

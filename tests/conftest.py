@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+
+import shac
 
 torch.set_num_threads(1)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it to what they run in the background
@@ -21,3 +24,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of two iterations of shac.py on cartpole."""
+    directory = tmp_path_factory.mktemp("runs") / "cartpole"
+    flags = "--env cartpole --device cpu --iterations 2 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet"
+    shac.main([*flags.split(), "--run-dir", str(directory)])
+    return directory

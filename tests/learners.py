@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -38,16 +39,19 @@ def read_progress(directory: Path) -> list[dict[str, str]]:
 
 
 def assert_same(a: Any, b: Any) -> None:
-    """Bitwise, whatever a checkpoint holds."""
+    """Bitwise and equal in type, whatever the nesting: of checkpoints, observations and infos."""
     assert type(a) is type(b)
     if isinstance(a, dict):
         assert a.keys() == b.keys()
         for key in a:
             assert_same(a[key], b[key])
-    elif isinstance(a, list | tuple):
+    elif isinstance(a, list | tuple) or (isinstance(a, np.ndarray) and a.dtype == object):
         assert len(a) == len(b)
         for x, y in zip(a, b, strict=True):
             assert_same(x, y)
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
     else:
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
 

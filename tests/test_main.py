@@ -23,7 +23,6 @@ from diffsim.training import load_policy
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
-SMALL = "--env cartpole --device cpu --iterations 1 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet".split()
 
 
 @pytest.fixture(autouse=True)
@@ -31,11 +30,9 @@ def named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["diffsim"])
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("runs") / "cartpole"
-    shac.main([*SMALL, "--run-dir", str(directory)])
-    return directory / "checkpoint.pt"
+@pytest.fixture
+def trained(tiny_run: Path) -> Path:
+    return tiny_run / "checkpoint.pt"
 
 
 # The report -----------------------------------------------------------------------------------------------------------
@@ -86,7 +83,7 @@ def test_a_demonstration_of_an_exported_policy(
     policy, video = tmp_path / "policies" / "cartpole.pt", tmp_path / "new" / "demo.mp4"
     monkeypatch.setattr(command, "POLICIES", policy.parent)
     command.main(["export", str(trained), str(policy)])
-    assert "cartpole, shac.py, iteration 1, " in capsys.readouterr().out
+    assert "cartpole, shac.py, iteration 2, " in capsys.readouterr().out
     command.main(["demo", "cartpole", "--output", str(video)])
     assert video.stat().st_size > 1000
     assert f"video: {video}" in capsys.readouterr().out

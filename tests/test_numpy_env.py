@@ -14,6 +14,7 @@ from gymnasium import wrappers
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from learners import assert_same
 
 import diffsim
 from diffsim.tasks import TASKS
@@ -24,23 +25,6 @@ HOPPER, HOPPERS = IDS["hopper"], "diffsim/Hopper-numpy-v0"
 
 def random_actions(steps: int, *shape: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-1, 1, (steps, *shape)).astype(np.float32)
-
-
-def assert_same(a: Any, b: Any) -> None:
-    """Equal in type, dtype and value, whatever the nesting."""
-    assert type(a) is type(b)
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        for key in a:
-            assert_same(a[key], b[key])
-    elif isinstance(a, tuple) or isinstance(a, np.ndarray) and a.dtype == object:
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
-    elif isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
-    else:
-        assert a == b
 
 
 # One environment ------------------------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ import pytest
 import torch
 
 import diffsim
-import shac
 import view
 from diffsim import render, web
 from diffsim.mjcf import load_scene
@@ -26,19 +25,11 @@ from diffsim.training import load_policy
 
 ASSETS = Path(diffsim.__file__).parent / "assets"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-SMALL = "--env cartpole --device cpu --iterations 2 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet".split()
 
 
 @pytest.fixture(autouse=True)
 def named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["view.py"])
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("runs") / "cartpole"
-    shac.main([*SMALL, "--run-dir", str(directory)])
-    return directory
 
 
 def motion_of(task: str, steps: int, rng: np.random.Generator) -> tuple[Any, ...]:
@@ -254,7 +245,7 @@ def test_the_window_simulates_until_it_is_closed(window: view.Window, monkeypatc
 # The command ----------------------------------------------------------------------------------------------------------
 
 
-def test_video_page_and_curves_of_a_run(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_video_page_and_curves_of_a_run(tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     try:
         render.check_opengl()
     except RuntimeError as error:
@@ -262,7 +253,7 @@ def test_video_page_and_curves_of_a_run(trained: Path, tmp_path: Path, capsys: p
     outputs = [tmp_path / name for name in ("a.mp4", "a.html", "a.png")]
     options = ["--seconds", "0.5", "--episodes", "3", "--size", "64", "48", "--substeps", "2"]
     flags = [word for pair in zip(("--video", "--web", "--plot"), map(str, outputs), strict=True) for word in pair]
-    view.main([str(trained / "checkpoint.pt"), *flags, *options])
+    view.main([str(tiny_run / "checkpoint.pt"), *flags, *options])
     assert all(path.stat().st_size > 1000 for path in outputs)
     assert data_of(outputs[1])["frames"] == 30
     printed = capsys.readouterr().out
@@ -270,10 +261,10 @@ def test_video_page_and_curves_of_a_run(trained: Path, tmp_path: Path, capsys: p
     assert all(str(path) in printed for path in outputs)
 
 
-def test_substeps_are_those_of_the_training_unless_given(trained: Path) -> None:
+def test_substeps_are_those_of_the_training_unless_given(tiny_run: Path) -> None:
     from diffsim.training import make_policy_env
 
-    saved = load_policy(trained / "checkpoint.pt")
+    saved = load_policy(tiny_run / "checkpoint.pt")
     assert make_policy_env(saved, 1).sim.integration.substeps == saved.args["substeps"]
     assert make_policy_env(saved, 1, substeps=7).sim.integration.substeps == 7
 
@@ -300,14 +291,14 @@ def test_substeps_are_those_of_the_training_unless_given(trained: Path) -> None:
 def test_mistakes_are_one_line(
     arguments: str,
     message: str,
-    trained: Path,
+    tiny_run: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":77")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    places = {"run": trained, "new": tmp_path}
+    places = {"run": tiny_run, "new": tmp_path}
     with pytest.raises(SystemExit) as exit:
         view.main(arguments.format(**places).split())
     error = capsys.readouterr().err
@@ -317,20 +308,20 @@ def test_mistakes_are_one_line(
 
 
 def test_missing_matplotlib_is_one_line(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(SystemExit):
-        view.main([str(trained), "--plot", str(tmp_path / "a.png")])
+        view.main([str(tiny_run), "--plot", str(tmp_path / "a.png")])
     assert capsys.readouterr().err == "view.py: --plot needs matplotlib: pip install matplotlib\n"
 
 
-def test_curves_of_several_runs(trained: Path, tmp_path: Path) -> None:
+def test_curves_of_several_runs(tiny_run: Path, tmp_path: Path) -> None:
     empty = tmp_path / "gaps"
     empty.mkdir()
     (empty / "progress.csv").write_text("iteration,control_steps,seconds,return,eval_return\n1,10,0.5,,\n2,20,1,3,4\n")
     columns = view.read_progress(empty / "progress.csv")
     np.testing.assert_array_equal(columns["return"], [np.nan, 3])
-    view.main([str(trained), str(empty), "--plot", str(tmp_path / "new" / "a.svg")])
+    view.main([str(tiny_run), str(empty), "--plot", str(tmp_path / "new" / "a.svg")])
     text = (tmp_path / "new" / "a.svg").read_text()
     assert "<svg" in text

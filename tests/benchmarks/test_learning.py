@@ -69,7 +69,7 @@ def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.Mon
     assert (shac["seeds"], shac["iterations"], shac["training (s)"]) == ("1 2", "700", "350")
     assert (shac["return"], shac["explicit, substeps x4"], shac["in the reference"]) == ("7090", "6990", "6990")
     assert (shac["kept"], shac["falls per episode"]) == ("0.986", "0.50 0.50")
-    assert shac["return passes"] == "5000 after 250 s; 7661 not; 9313 not"
+    assert shac["return passes"] == "5000 after 250 s; 7300 not; 7661 not"
 
 
 def test_a_return_that_some_seeds_pass() -> None:
