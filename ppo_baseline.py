@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from diffsim.tasks import TASKS, Task
 from diffsim.training import (
     ClippedAdam,
     Count,
@@ -97,6 +98,10 @@ class Args(ParallelFlags):
     """weight of the policy's entropy, which keeps its noise from vanishing (per task)"""
     bound_coef: NonNegative = 1e-4
     """weight of the squared excess of the policy's mean beyond 1.1, where the action is clipped"""
+    symmetric: bool = False
+    """left and right are treated alike: what the policy does in a state it does in the mirrored state, mirrored"""
+    symmetry_weight: Positive = 1.0
+    """weight of the squared difference between the two, with --symmetric"""
     initial_log_std: Finite = 0.0
     """initial log standard deviation of the policy"""
     eval_every: Natural = 500
@@ -113,6 +118,8 @@ class Args(ParallelFlags):
         least, largest = self.lr_bounds
         if least > largest:
             fail(f"--lr-bounds {least} {largest} are the wrong way round")
+        if self.symmetric and TASKS[self.env].mirror is Task.mirror:
+            fail(f"--symmetric: the robot of task {self.env!r} has no left and right")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -165,6 +172,7 @@ class Batch(NamedTuple):
     """What the update needs of a rollout's samples, or of some of them: (B, ...)."""
 
     obs: Tensor  # normalized
+    mirrored: Tensor  # the mirror image of obs, likewise; none unless --symmetric
     mean: Tensor  # of the policy that acted
     action: Tensor
     advantage: Tensor  # normalized
@@ -184,7 +192,10 @@ class PPO:
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, args.max_grad_norm, lr=args.lr)
-        samples, sizes = args.horizon * env.num_envs, ((obs_dim,), (action_dim,), (action_dim,), (), ())
+        if args.symmetric:
+            self.mirror = env.task.mirror
+        mirrored, samples = obs_dim if args.symmetric else 0, args.horizon * env.num_envs
+        sizes = (obs_dim,), (mirrored,), (action_dim,), (action_dim,), (), ()
         self.batch = Batch(*(torch.zeros(samples, *size, device=env.device) for size in sizes))
         self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
         self.modules: dict[str, Stateful] = {
@@ -207,7 +218,8 @@ class PPO:
         target = self.return_normalizer(value + advantage)
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
-        samples = normalizer(rollout.obs), rollout.mean, rollout.action, advantage, target
+        mirrored = normalizer(self.mirror.obs(rollout.obs)) if args.symmetric else rollout.obs[..., :0]
+        samples = normalizer(rollout.obs), mirrored, rollout.mean, rollout.action, advantage, target
         for buffer, tensor in zip(self.batch, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(rollout.obs)
@@ -229,6 +241,9 @@ class PPO:
                 value_loss = (value - b.target).square().mean()
                 bound_loss = (mean.abs() - 1.1).clamp(min=0).square().sum(-1).mean()
                 loss = policy_loss + args.value_coef * value_loss + args.bound_coef * bound_loss
+                if args.symmetric:
+                    difference = policy(b.mirrored)[0] - self.mirror.action(mean)
+                    loss = loss + args.symmetry_weight * difference.square().mean()
                 norm = self.optimizer.step(loss - args.entropy_coef * entropy(policy.log_std))
                 metrics.append(torch.stack((policy_loss.detach(), value_loss.detach(), kl, norm)))
         names = ("losses/policy", "losses/value", "losses/kl", "grad/norm")
