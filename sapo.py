@@ -15,8 +15,9 @@ from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
 # isort: split
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -42,24 +43,26 @@ from diffsim.training import (
     evaluate,
     evaluate_checkpoint,
     fail,
+    load_policy,
     parse,
 )
 
 # SHAC's networks; docs/sapo.md has what was measured with these settings.
 # fmt: off
 COLUMNS = ("actor_hidden", "critic_hidden", "activation", "actor_lr", "critic_lr", "target_alpha", "initial_log_std",
-           "initial_target_entropy", "target_entropy", "population", "num_envs", "iterations")
+           "initial_target_entropy", "target_entropy", "population", "num_envs", "iterations", "critic_iterations")
 PER_TASK = {
-    "cartpole":     ((64, 64),      (64, 64),   "elu",  1e-2, 1e-3, 0.2,  -1.0,  0.0, -1.5,  1,   64,  500),
-    "hopper":       ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-4, 0.9,  -1.0,  0.0, -1.5,  8, 1024, 1500),
-    "half_cheetah": ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0,  1,  256, 2000),
-    "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0, 16, 2048, 2500),
-    "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200),
-    "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400),
+    "cartpole":     ((64, 64),      (64, 64),   "elu",  1e-2, 1e-3, 0.2,  -1.0,  0.0, -1.5,  1,   64,  500, 16),
+    "hopper":       ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-4, 0.9,  -1.0,  0.0, -1.5,  8, 1024, 1500, 16),
+    "half_cheetah": ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0,  1,  256, 2000, 16),
+    "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0, 16, 2048, 2500, 16),
+    "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
+    "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400, 16),
 }
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
+START_NOISE = 0.15  # standard deviation around the policy to start from, so that it is seen off its path too
 SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
 # fmt: on
 
@@ -89,6 +92,10 @@ class Args(ParallelFlags):
     """left and right are treated alike: what the policy does in a state it does in the mirrored state, mirrored"""
     symmetry_weight: Positive = 1.0
     """weight in the actor's loss of the squared difference between the two, with --symmetric"""
+    start_from: Path | None = None
+    """checkpoint of any script on this task, e.g. PPO's: the first iteration begins with imitating its policy"""
+    start_windows: Count = 160
+    """windows of imitation: in the first half that policy acts, in the second half the imitating one"""
     initial_target_entropy: Finite = -0.5
     """entropy per action, in nats, at which the temperature aims in the first iteration (per task)"""
     target_entropy: Finite = -0.5
@@ -120,7 +127,7 @@ class Args(ParallelFlags):
     target_alpha: Fraction = 0.2
     """target critics <- alpha target critics + (1 - alpha) critics, each iteration (per task)"""
     critic_iterations: Count = 16
-    """passes over a window's samples to fit the critics"""
+    """passes over a window's samples to fit the critics (per task)"""
     critic_minibatches: Count = 4
     """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
@@ -138,6 +145,10 @@ class Args(ParallelFlags):
             fail(f"--symmetric: the robot of task {self.env!r} has no left and right")
         if (self.num_envs // distributed.size()) % self.population:
             fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")
+        if self.start_from and not (self.resume or self.evaluate):
+            env = load_policy(self.start_from).args["env"]
+            if env != self.env:
+                fail(f"--start-from {self.start_from} is a policy for task {env!r}, not {self.env!r}")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -289,8 +300,8 @@ class SAPO:
 
     def update_actor(self) -> dict[str, Tensor]:
         """Descend the soft loss of a window of all environments; keep the critics' samples of it."""
-        args, normalizer = self.args, self.actor.normalizer
-        rollout = collect(self.env, self.actor, args.horizon)
+        args = self.args
+        rollout = collect(self.env, self.act, args.horizon)
         next_values = self.next_values(rollout)
         reward = rollout.reward
         if args.entropy:
@@ -301,14 +312,7 @@ class SAPO:
             loss = loss + args.symmetry_weight * self.asymmetry(rollout.obs.detach())
         norm = self.actor_optimizer.step(args.population * loss)
         rollout = Rollout(*(tensor.detach() for tensor in rollout))
-        value = td_lambda(reward.detach(), next_values.detach().amin(0), rollout.done, args.gamma, args.td_lambda)
-        samples = rollout.obs
-        if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
-            samples = torch.stack((samples, self.mirror.obs(samples)), 1).flatten(0, 1)
-            value = value.repeat_interleave(2, 0)
-        self.value.copy_(self.by_member(value).flatten(1))
-        self.obs.copy_(self.by_member(normalizer(samples)).flatten(1, 2))
-        normalizer.update(rollout.obs)
+        self.keep(rollout, reward.detach(), next_values.detach())
         entropy = self.by_member(rollout.entropy).mean((1, 2))
         gap = (entropy - self.target_entropy).detach()
         self.temperature_optimizer.step((self.population.log_temperature.exp().flatten() * gap).sum())
@@ -318,6 +322,46 @@ class SAPO:
         temperature = self.population.log_temperature.detach().exp().mean()
         metrics |= {"charts/entropy": entropy.mean(), "charts/temperature": temperature}
         return {"losses/actor": loss.detach(), "grad/norm": norm} | metrics
+
+    def act(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Each member acts in its environments: actions (N, nu) and entropy (N,) of obs (N, obs_dim), noise (N, nu)."""
+        members = self.args.population, -1
+        action, entropy = self.actor(self.actor.normalizer(obs).unflatten(0, members), noise.unflatten(0, members))
+        return action.flatten(0, 1), entropy.flatten()
+
+    def keep(self, rollout: Rollout, reward: Tensor, next_values: Tensor) -> None:
+        """A window's observations with their TD(lambda) returns, which the critics are to learn."""
+        args, normalizer, samples = self.args, self.actor.normalizer, rollout.obs
+        value = td_lambda(reward, next_values.amin(0), rollout.done, args.gamma, args.td_lambda)
+        if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
+            samples = torch.stack((samples, self.mirror.obs(samples)), 1).flatten(0, 1)
+            value = value.repeat_interleave(2, 0)
+        self.value.copy_(self.by_member(value).flatten(1))
+        self.obs.copy_(self.by_member(normalizer(samples)).flatten(1, 2))
+        normalizer.update(rollout.obs)
+
+    def imitate(self, policy: nn.Module, lead: bool) -> Tensor:
+        """A window from whose states the actors learn another policy's actions, and the critics the returns.
+
+        Either that policy acts in it, with noise, or the actors do, which shows them where their errors lead (Ross et
+        al. 2011, https://arxiv.org/abs/1011.0686). Returns their mean squared error () before.
+        """
+        with torch.no_grad():
+
+            def act(obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+                return policy(obs) + START_NOISE * noise, torch.zeros_like(noise[:, 0])
+
+            rollout = collect(self.env, act if lead else self.act, self.args.horizon)
+            goal = self.by_member(policy(rollout.obs).clamp(-1.0, 1.0)).flatten(1, 2)
+            obs = self.by_member(self.actor.normalizer(rollout.obs)).flatten(1, 2)
+            self.keep(rollout, rollout.reward, self.next_values(rollout))
+        errors = []
+        for samples, actions in zip(obs.chunk(8, 1), goal.chunk(8, 1), strict=True):
+            mean, entropy = self.actor(samples, torch.zeros_like(actions))
+            errors.append((mean - actions).square().mean())
+            self.actor_optimizer.step(self.args.population * errors[-1] + 0 * entropy.sum())  # the noise stays
+        self.update_critic()
+        return errors[0].detach()
 
     def asymmetry(self, obs: Tensor) -> Tensor:
         """Mean squared difference between the actions in mirrored states and the mirrored actions, without noise."""
@@ -353,17 +397,16 @@ class SAPO:
         return torch.where(rollout.terminated, torch.zeros_like(values), values)
 
 
-def collect(env: DiffEnv, actor: Actor, horizon: int) -> Rollout:
-    """H steps of all environments from where they stand."""
+def collect(env: DiffEnv, act: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], horizon: int) -> Rollout:
+    """H steps of all environments from where they stand; act makes actions and entropies of observations and noise."""
     steps = []
     obs = env.detach()
-    members = len(actor.log_std)
-    for noise in torch.randn(horizon, members, env.num_envs // members, env.scene.nu, device=env.device).unbind():
-        action, entropy = actor(actor.normalizer(obs).unflatten(0, (members, -1)), noise)
-        next_obs, reward, terminated, truncated, info = env.step(action.flatten(0, 1))
+    for noise in torch.randn(horizon, env.num_envs, env.scene.nu, device=env.device).unbind():
+        action, entropy = act(obs, noise)
+        next_obs, reward, terminated, truncated, info = env.step(action)
         ends = terminated, terminated | truncated, info["nonfinite"]
         episode = info["episode"]["r"], info["episode"]["l"]
-        steps.append((obs, info["final_obs"], reward, entropy.flatten(), *ends, *episode))
+        steps.append((obs, info["final_obs"], reward, entropy, *ends, *episode))
         obs = next_obs
     return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
 
@@ -398,6 +441,10 @@ def train(args: Args) -> None:
     update_actor, update_critic = run.capture(sapo.update_actor, env), run.capture(sapo.update_critic)
     for iteration in run:
         sapo.prepare(iteration)
+        if iteration == 1 and args.start_from:
+            policy = load_policy(args.start_from).network.to(env.device)
+            errors = [sapo.imitate(policy, k < args.start_windows / 2) for k in range(args.start_windows)]
+            run.message(f"imitated {args.start_from}: squared error of the actions {errors[-1].item():.3g}")
         run.log(update_actor() | update_critic())
         if run.evaluation_due:
             run.log_evaluation(evaluate(eval_env, sapo.policy))

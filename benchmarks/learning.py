@@ -45,7 +45,10 @@ RETURNS: dict[TaskName, tuple[int, tuple[int, ...], dict[str, int]]] = {
 # The best published of any learner, timed for SAPO: AHAC's (Georgiev et al. 2024).
 RECORDS: dict[TaskName, int] = {"ant": 9313, "humanoid": 9845}
 SAPO = ("sapo", "--accuracy", "fast")
-SAPO_CPU = ("sapo", "--integrator", "implicit", "--substeps", "16", "--iterations", "1000")  # the humanoid in minutes
+SAPO_16 = ("sapo", "--integrator", "implicit", "--substeps", "16")  # the humanoids in minutes
+SAPO_CPU = (*SAPO_16, "--iterations", "1000")
+PPO_MANY = (PPO, "--accuracy", "fast", "--num-envs", "4096", "--minibatch-size", "32768", "--entropy-coef", "0.002",
+            "--iterations", "2500")
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
@@ -68,7 +71,10 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     **{f"ppo_e{c}":       (PPO, "--entropy-coef", c) for c in ("0", "0.002", "0.005", "0.01", "0.02")},
     "bptt":               ("bptt",),
     "sapo":               SAPO,
-    "sapo_cpu":           SAPO_CPU,
+    "ppo_many":           PPO_MANY,
+    "ppo_many_symmetric": (*PPO_MANY, "--symmetric"),
+    "sapo_16":            SAPO_16,
+    "sapo_cpu":           (*SAPO_CPU, "--critic-iterations", "16"),
     "sapo_cpu_8":         (*SAPO_CPU, "--critic-iterations", "8"),
     "sapo_cpu_symmetric": (*SAPO_CPU, "--critic-iterations", "8", "--symmetric"),
     "sapo_symmetric":     (*SAPO, "--symmetric"),

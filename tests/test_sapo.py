@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
 import torch
-from learners import SMALL, assert_derivatives, run
+from learners import SMALL, assert_derivatives, refusal, run
 from torch import Tensor, nn
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
@@ -199,7 +200,7 @@ def test_symmetric_policies_are_paid_and_mirrored_states_are_worth_the_same(
     torch.testing.assert_close(learner.asymmetry(obs), torch.stack(squares).mean())
 
     learner.prepare(1)
-    rollout = sapo.collect(learner.env, learner.actor, 8)
+    rollout = sapo.collect(learner.env, learner.act, 8)
     before = learner.asymmetry(rollout.obs.detach())
     for _ in range(20):
         learner.update_actor()
@@ -210,3 +211,29 @@ def test_symmetric_policies_are_paid_and_mirrored_states_are_worth_the_same(
     with pytest.raises(SystemExit):
         parse(sapo.Args, ["--env", "hopper", "--symmetric"])
     assert "--symmetric: the robot of task 'hopper' has no left and right" in capsys.readouterr().err
+
+
+def test_start_from_another_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Members imitate its actions and learn the returns; their noise stays. A policy of another task is refused."""
+    torch.manual_seed(0)
+    teacher = nn.Sequential(nn.Linear(37, 8), nn.Tanh())
+    learner = build("ant", "--population", "2", "--critic-iterations", "1")
+    learner.prepare(1)
+    assert learner.actor.spread is not None
+    noise, value = learner.actor.spread.layers[0].bias.clone(), learner.value.clone()
+    errors = [learner.imitate(teacher, lead=k < 20) for k in range(40)]
+    assert torch.stack(errors[-5:]).max() < 0.3 * errors[0]
+    obs = learner.env.detach()
+    for k in range(2):
+        torch.testing.assert_close(learner.actor.deterministic(k)(obs), teacher(obs), atol=0.5, rtol=0)
+    assert torch.equal(learner.actor.spread.layers[0].bias, noise) and not torch.equal(learner.value, value)
+
+    saved = Path(str(files("diffsim") / "policies" / "ant.pt"))
+    assert f"--start-from {saved} is a policy for task 'ant', not 'hopper'" in refusal(
+        lambda: parse(sapo.Args, ["--env", "hopper", "--start-from", str(saved)]), capsys
+    )
+    flags = (
+        f"--env ant --start-from {saved} --start-windows 2 --num-envs 4 --iterations 1 --eval-episodes 2 --device cpu"
+    )
+    run(sapo, tmp_path, *flags.split())
+    assert "imitated" in capsys.readouterr().out
