@@ -75,6 +75,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "ppo_many_symmetric": (*PPO_MANY, "--symmetric"),
     "sapo_16":            SAPO_16,
     "sapo_cpu":           (*SAPO_CPU, "--critic-iterations", "16"),
+    "sapo_cpu_4":         (*SAPO_16, "--critic-iterations", "4"),
     "sapo_cpu_8":         (*SAPO_CPU, "--critic-iterations", "8"),
     "sapo_cpu_symmetric": (*SAPO_CPU, "--critic-iterations", "8", "--symmetric"),
     "sapo_symmetric":     (*SAPO, "--symmetric"),
