@@ -53,6 +53,7 @@ def make(
     threads: int | None = None,
     max_episode_steps: int | None = None,
     render_mode: RenderMode | None = None,
+    factors: bool = False,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -62,6 +63,7 @@ def make(
             docs/accuracy.md has what each costs and how much it errs.
         substeps, integrator, theta: each in place of the preset's, if given.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
+        factors: let constants differ between environments: `env.sim.factors`, see Simulator.
 
     Raises:
         ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
@@ -86,6 +88,7 @@ def make(
         threads=threads,
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,
+        factors=factors,
     )
 
 

@@ -44,7 +44,7 @@ class DiffEnv(VectorEnv):
         task: task on the simulator's device and dtype.
         scene: its robot.
         integration: default the task's "default".
-        num_envs, horizon, threads: see Simulator.
+        num_envs, horizon, threads, factors: see Simulator; env.sim.factors has the factors.
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
@@ -78,6 +78,7 @@ class DiffEnv(VectorEnv):
         threads: int | None = None,
         max_episode_steps: int | None = None,
         render_mode: RenderMode | None = None,
+        factors: bool = False,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
@@ -98,6 +99,7 @@ class DiffEnv(VectorEnv):
             device,
             dtype,
             threads,
+            factors=factors,
         )
         self.device, self.dtype = self.sim.device, dtype
         real = np.float32 if dtype == torch.float32 else np.float64
@@ -177,9 +179,8 @@ class DiffEnv(VectorEnv):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
             raise ActionError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
-        recorded = torch.is_grad_enabled() and (
-            action.requires_grad or self.qpos.requires_grad or self.qvel.requires_grad
-        )
+        start = (self.qpos, self.qvel, action, self.sim.factors)
+        recorded = torch.is_grad_enabled() and any(part.requires_grad for part in start)
         if recorded and self._recorded == self.horizon:
             raise RuntimeError(
                 f"horizon of {self.horizon} differentiable steps exceeded: call env.detach() to start a new "
@@ -291,7 +292,7 @@ class DiffEnv(VectorEnv):
         return self._obs
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that continues the episodes exactly, as of the start of a window."""
+        """Everything but the simulator's factors that continues the episodes exactly, as of the start of a window."""
         return {
             "task": self.task.name,
             "qpos": self.qpos.detach().clone(),

@@ -304,7 +304,7 @@ class _Reader:
         """k_limit, d_limit (nv,); a file that names k_limit alone keeps the damping ratio."""
         k, d = limit_constants(self.m)
         k_limit = np.array([self._numeric("k_limit", x) for x in k])
-        ratio = np.sqrt(np.divide(k_limit, k, out=np.ones_like(k), where=k > 0))
+        ratio = np.divide(k_limit, k, out=np.ones_like(k), where=k > 0)
         return k_limit, np.array([self._numeric("d_limit", x) for x in d * ratio])
 
     def _numeric(self, name: str, default: float) -> float:

@@ -20,6 +20,7 @@ STEP = 1 / 960  # s, 16 substeps of 1/60 s: explicit steps up to this one are st
 CARRIERS = 4  # contact points that share the weight of a robot that has more
 FIRMNESS = 2.0  # times what solref asks for
 REBOUND = 2.0  # s/m, k_d / k_n at a dampratio of 1: the ground stops pushing what leaves at half a metre a second
+LIMIT_REBOUND = 4.0  # s/m or s/rad, d_limit / k_limit likewise
 
 
 class Recovery(NamedTuple):
@@ -27,6 +28,10 @@ class Recovery(NamedTuple):
 
     stiffness: float  # 1/s^2
     damping: float  # 1/s
+
+    @property
+    def damping_ratio(self) -> float:
+        return self.damping / (2 * np.sqrt(FIRMNESS * self.stiffness)) if self.stiffness > 0 else 0.0
 
 
 def asked(solref: Sequence[float] | Array) -> Recovery:
@@ -54,11 +59,10 @@ def contact_constants(mass: float, mobility: Array, solref: Sequence[float]) -> 
     k_n carries its share of the mass as solref asks, but never more than the lightest point stays stable on; k_t halves
     that point's slip in one substep.
     """
-    stiffness, damping = recovery(solref)
+    rates = recovery(solref)
     lightest = min(mass, 1 / mobility.max()) if mobility.any() else mass  # kg
-    k_n = min(mass * stiffness / min(CARRIERS, len(mobility)), 0.1 * lightest / STEP**2)
-    ratio = damping / (2 * np.sqrt(FIRMNESS * stiffness)) if stiffness > 0 else 0.0
-    return {"k_n": float(k_n), "k_d": float(REBOUND * ratio * k_n), "k_t": lightest / (2 * STEP)}
+    k_n = min(mass * rates.stiffness / min(CARRIERS, len(mobility)), 0.1 * lightest / STEP**2)
+    return {"k_n": float(k_n), "k_d": float(REBOUND * rates.damping_ratio * k_n), "k_t": lightest / (2 * STEP)}
 
 
 def mass_matrix(m: mujoco.MjModel) -> Array:
@@ -91,5 +95,6 @@ def mobilities(m: mujoco.MjModel, points: Sequence[tuple[int, Array]]) -> Array:
 def limit_constants(m: mujoco.MjModel) -> tuple[Array, Array]:
     """k_limit, d_limit (nv,): what solreflimit asks for, times the inertia that the joint moves."""
     inertia = 1 / np.diag(np.linalg.inv(mass_matrix(m)))
-    rates = np.array([recovery(m.jnt_solref[joint]) for joint in m.dof_jntid])
-    return inertia * rates[:, 0], inertia * rates[:, 1]
+    rates = [recovery(m.jnt_solref[joint]) for joint in m.dof_jntid]
+    k_limit: Array = inertia * np.array([rate.stiffness for rate in rates])
+    return k_limit, LIMIT_REBOUND * k_limit * np.array([rate.damping_ratio for rate in rates])

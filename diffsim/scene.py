@@ -23,8 +23,10 @@ PENALTY_CONSTANTS = {
     "k_t": "N s/m",
     "mu": "",
     "k_limit": "N/m or N m/rad",
-    "d_limit": "N s/m or N m s/rad",
+    "d_limit": "N s/m^2 or N m s/rad^2",
 }
+# What may differ between environments, see Simulator: each column of its factors multiplies one of these.
+FACTORS = (*PENALTY_CONSTANTS, "mass", "motor")
 
 MUSCLE_MODELS = ("linear", "hill")
 

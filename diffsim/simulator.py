@@ -10,7 +10,7 @@ import torch
 from diffsim.integration import Integration, check_count, is_real
 from diffsim.kernels.lanes import Division
 from diffsim.launcher import WARP_DTYPE, Launcher, check_memory
-from diffsim.scene import Scene
+from diffsim.scene import FACTORS, Scene
 from diffsim.stepper import ExtrapolatedStepper, State, Stepper
 
 
@@ -30,11 +30,16 @@ class Simulator:
         dtype: torch.float32 or torch.float64.
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
         division: of an environment among GPU threads, from kernels.lanes.divide; default as measured to be fastest.
+        factors: let constants of the scene differ between environments, see the attribute.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
 
     Attributes:
+        factors: (N, 8) multipliers of the scene's constants, at first ones, columns in the order of scene.FACTORS:
+            constants of contact and of all limits, mass and inertia of all links (not armature), force of all motors
+            and muscles (not the passive one of a Hill-type muscle). Change it in place or assign another tensor; a
+            step uses those of its call and is differentiable in them. (N, 0) without the argument.
         nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s. Their
             state is returned as it was before that step, its gradient is zero; other environments are not touched.
         nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
@@ -52,6 +57,7 @@ class Simulator:
         dtype: torch.dtype = torch.float32,
         threads: int | None = None,
         division: Division | None = None,
+        factors: bool = False,
     ) -> None:
         if not isinstance(scene, Scene):
             raise ValueError(f"scene is a {type(scene).__name__}, must be a Scene: load_scene reads one from a file")
@@ -64,22 +70,34 @@ class Simulator:
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
         self.device = check_device(device)
-        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu)
+        width = len(FACTORS) if factors else 0
+        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width)
         check_memory("states and actions", num_envs, numbers * dtype.itemsize, self.device)
         self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
         self.integration, self.control_dt, self.horizon = integration, control_dt, horizon
-        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, division)
+        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, division, factors)
         stepper = ExtrapolatedStepper if integration.integrator == "extrapolated" else Stepper
         self._stepper = stepper(launcher, integration, control_dt, horizon)
         self.seconds, self.nonfinite_gradients = launcher.seconds, launcher.nonfinite_gradients
+        self._factors = torch.ones(num_envs, width, dtype=dtype, device=self.device)
 
     @property
     def nonfinite(self) -> torch.Tensor:
         return self._stepper.nonfinite
 
+    @property
+    def factors(self) -> torch.Tensor:
+        return self._factors
+
+    @factors.setter
+    def factors(self, value: torch.Tensor) -> None:
+        self.check_tensor("factors", value, self._factors.shape[1])
+        check_factors(value)
+        self._factors = value
+
     def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        """Advance all environments by one control step, differentiable in all three arguments.
+        """Advance all environments by one control step, differentiable in all three arguments and in `factors`.
 
         Args:
             qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, normalised here.
@@ -91,11 +109,14 @@ class Simulator:
             qpos, qvel after the step, of the same shapes.
 
         Raises:
-            ValueError: an argument of the wrong shape, dtype or device.
+            ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors that were changed in place
+                to what is negative or not finite.
         """
         for name, value, width in (("qpos", qpos, self.nq), ("qvel", qvel, self.nv), ("ctrl", ctrl, self.nu)):
             self.check_tensor(name, value, width)
-        return self._stepper.step(qpos, qvel, ctrl)
+        if self._factors.shape[1] and self.device.type == "cpu":  # a GPU's would have to be waited for
+            check_factors(self._factors)
+        return self._stepper.step(qpos, qvel, ctrl, self._factors)
 
     def rewind(self) -> None:
         """Let the next differentiable step use the first checkpoint: the start of a new window."""
@@ -118,6 +139,17 @@ class Simulator:
             raise ValueError(f"{name} has dtype {value.dtype}, must be {self.dtype}")
         if value.device != self.device:
             raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
+
+
+def check_factors(factors: torch.Tensor) -> None:
+    """Raise ValueError unless all (N, len(FACTORS) or 0) are finite and not negative."""
+    bad = ~((factors >= 0) & (factors < math.inf))
+    if bool(bad.any()):
+        env, column = bad.nonzero()[0].tolist()
+        raise ValueError(
+            f"the factor of {FACTORS[column]} is {factors[env, column].item()} in environment {env}; factors must be "
+            "finite and not negative"
+        )
 
 
 def check_device(device: str | torch.device) -> torch.device:

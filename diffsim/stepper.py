@@ -10,6 +10,7 @@ import warp as wp
 
 from diffsim.integration import Integration
 from diffsim.launcher import Launcher, check_memory
+from diffsim.scene import FACTORS
 
 State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 
@@ -22,12 +23,12 @@ class Checkpoint(NamedTuple):
 
 
 class ControlStep(torch.autograd.Function):
-    """qpos, qvel, ctrl -> qpos and qvel side by side. The stepper's checkpoint holds what backward needs."""
+    """qpos, qvel, ctrl, factors -> qpos and qvel side by side. The stepper's checkpoint holds what backward needs."""
 
     @staticmethod
-    def forward(ctx: Any, stepper: Stepper, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, stepper: Stepper, *start: torch.Tensor) -> torch.Tensor:
         ctx.stepper, ctx.checkpoint = stepper, stepper.next_checkpoint()
-        return stepper.forward(ctx.checkpoint.slot, qpos, qvel, ctrl)
+        return stepper.forward(ctx.checkpoint.slot, *start)
 
     @staticmethod
     def backward(ctx: Any, g_end: torch.Tensor) -> tuple[Any, ...]:
@@ -56,8 +57,9 @@ class Stepper:
 
         self._launcher, self._horizon, self._substeps = launcher, horizon, integration.substeps
         self._scalars = [h, spec.dtype(integration.theta), integration.substeps]
-        # One buffer for qpos, qvel and ctrl side by side: torch copies each in one operation, the kernels see parts.
-        self._widths = (spec.nq, spec.nv, spec.nu)
+        # One buffer for all that a step starts from, side by side: torch copies it in one operation, the kernels see
+        # parts, and each slot keeps the factors of its step.
+        self._widths = (spec.nq, spec.nv, spec.nu, len(FACTORS) if spec.varied else 0)
         self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
         self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
         self._nonfinite = tensor(slots, n, of=torch.bool)
@@ -70,11 +72,11 @@ class Stepper:
     def nonfinite(self) -> torch.Tensor:
         return self._nonfinite[self._last]
 
-    def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        if torch.is_grad_enabled() and (qpos.requires_grad or qvel.requires_grad or ctrl.requires_grad):
-            end = ControlStep.apply(self, qpos, qvel, ctrl)
+    def step(self, *start: torch.Tensor) -> State:
+        if torch.is_grad_enabled() and any(part.requires_grad for part in start):
+            end = ControlStep.apply(self, *start)
         else:
-            end = self.forward(self._horizon, qpos, qvel, ctrl)
+            end = self.forward(self._horizon, *start)
         return end.split(self._widths[:2], dim=1)
 
     def rewind(self) -> None:
@@ -88,14 +90,14 @@ class Stepper:
         return Checkpoint(slot, self._version[slot])
 
     def forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
-        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl)."""
+        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl, factors)."""
         torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
         self._last = slot
         self._launcher.launch("forward", self._command("forward", slot))
         return self._end.clone()
 
     def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The adjoints of qpos, qvel and ctrl from that of the state (N, nq + nv) after the step.
+        """The adjoints of qpos, qvel, ctrl and factors from that of the state (N, nq + nv) after the step.
 
         Raises:
             RuntimeError: the checkpoint serves another step by now.
@@ -139,8 +141,9 @@ class Stepper:
         return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
 
     def _parts(self, buffer: torch.Tensor, count: int) -> list[Any]:
-        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl."""
-        return [wp.from_torch(part) for part in buffer.split(self._widths[:count], dim=1)]
+        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl with the factors behind it."""
+        nq, nv, nu, nfactors = self._widths
+        return [wp.from_torch(part) for part in buffer.split((nq, nv, nu + nfactors)[:count], dim=1)]
 
 
 class ExtrapolatedStepper:
@@ -160,14 +163,14 @@ class ExtrapolatedStepper:
     def nonfinite(self) -> torch.Tensor:
         return self._fine.nonfinite | self._coarse.nonfinite
 
-    def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        fine, coarse = (stepper.step(qpos, qvel, ctrl) for stepper in (self._fine, self._coarse))
+    def step(self, *start: torch.Tensor) -> State:
+        fine, coarse = (stepper.step(*start) for stepper in (self._fine, self._coarse))
         end_qpos, end_qvel = (2.0 * b - a for a, b in zip(coarse, fine, strict=True))
         if len(self._quaternions):
             unit = F.normalize(end_qpos[:, self._quaternions], dim=2)
             end_qpos = end_qpos.index_copy(1, self._quaternions.flatten(), unit.flatten(1))
         bad = self.nonfinite.unsqueeze(1)
-        return torch.where(bad, qpos.detach(), end_qpos), torch.where(bad, qvel.detach(), end_qvel)
+        return torch.where(bad, start[0].detach(), end_qpos), torch.where(bad, start[1].detach(), end_qvel)
 
     def rewind(self) -> None:
         self._fine.rewind()

@@ -121,10 +121,11 @@ def joint_forces(
         q = joint_position(scene, i, qpos) + theta * h * qd
         bound = np.clip(q, scene.lower[i], scene.upper[i])
         beyond = q != bound
-        push = scene.k_limit[i] * (bound - q) - scene.d_limit[i] * qd
-        pushes = beyond and push * (bound - q) > 0  # it never pulls
-        force[dof] += scene.stiffness[i] * (scene.spring_ref[i] - q) - scene.damping[i] * qd + pushes * push
-        resistance[dof] = h * (scene.damping[i] + pushes * scene.d_limit[i])
+        firmness = scene.k_limit[i] - scene.d_limit[i] * qd * np.sign(bound - q)
+        pushes = beyond and firmness > 0  # it never pulls
+        push = pushes * firmness * (bound - q)
+        force[dof] += scene.stiffness[i] * (scene.spring_ref[i] - q) - scene.damping[i] * qd + push
+        resistance[dof] = h * (scene.damping[i] + (pushes * scene.d_limit[i] * abs(bound - q) if beyond else 0.0))
         resistance[dof] += theta * h**2 * (scene.stiffness[i] + pushes * scene.k_limit[i])
     return force, resistance
 
@@ -249,6 +250,14 @@ def turned(quaternion: Array, rotation: Array) -> Array:
     angle = np.linalg.norm(rotation)
     turn = np.array([np.cos(angle / 2), *(np.sinc(angle / (2 * np.pi)) / 2 * rotation)])
     return quaternion_product(quaternion / np.linalg.norm(quaternion), turn)
+
+
+def with_factors(scene: Scene, factors: Array) -> Scene:
+    """The scene of an environment with a row of Simulator.factors."""
+    names = ("k_n", "k_d", "k_t", "mu", "k_limit", "d_limit"), ("mass", "inertia"), ("gear", "motor_bias")
+    given = dict(zip(names[0], factors, strict=False))
+    given |= dict.fromkeys(names[1], factors[6]) | dict.fromkeys(names[2], factors[7])
+    return dataclasses.replace(scene, **{name: factor * getattr(scene, name) for name, factor in given.items()})
 
 
 def step(

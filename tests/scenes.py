@@ -101,11 +101,17 @@ LEG = """
   </tendon>
   <actuator> {actuators} </actuator>
 </mujoco>"""
+
+# The same over a ground, with a limited knee.
+GROUNDED = LEG.replace("<worldbody>", '<worldbody> <geom type="plane" size="1 1 1" pos="0 0 -100"/>').replace(
+    'name="knee"', 'name="knee" limited="true" range="-40 40"'
+)
+CONSTANTS = {"k_n": 4e3, "k_d": 4e3, "k_t": 300, "mu": 0.6, "k_limit": 300, "d_limit": 200}
 MUSCLES = {"gluteus": (400, 0.18), "hamstring": (300, 0.52), "iliacus": (250, 0.55), "zigzag": (100, 1.1)}  # N, m
 
 
 @cache
-def leg_scene(model: str) -> Scene:
+def leg_scene(model: str, grounded: bool = False) -> Scene:
     """With MuJoCo's <muscle> if "hill"; if "linear" with the same forces as plain actuators."""
     actuators = ['<motor joint="knee" gear="7"/>'] * (len(MUSCLES) + 1)
     for n, (name, (force, length)) in enumerate(MUSCLES.items()):
@@ -116,7 +122,16 @@ def leg_scene(model: str) -> Scene:
             muscle = f'<general tendon="{name}" gainprm="{-force}" ctrllimited="true" ctrlrange="0 1"/>'
         actuators[n + (n >= 2)] = muscle
     custom = f'<text name="muscle_model" data="{model}"/>'
-    return parse(LEG.format(custom=custom, actuators="".join(actuators)))
+    custom += "".join(f'<numeric name="{name}" data="{value}"/>' for name, value in CONSTANTS.items() if grounded)
+    return parse((GROUNDED if grounded else LEG).format(custom=custom, actuators="".join(actuators)))
+
+
+def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
+    """A scene whose ground a third of the spheres of these random states touch, beyond limits and within."""
+    qpos, qvel, ctrl = free_states(scene, count, rng)
+    pass_limits(scene, qpos, rng)
+    qvel[::2] *= 0.02  # so that some contacts stick
+    return raise_ground(scene, qpos), (qpos, qvel, ctrl)
 
 
 # A pendulum on a cart that is pulled from the wall.
@@ -137,7 +152,7 @@ CRANE = """
 HINGE = """
 <mujoco>
   <compiler angle="radian"/>
-  <custom> <numeric name="k_limit" data="300"/> <numeric name="d_limit" data="2"/> </custom>
+  <custom> <numeric name="k_limit" data="300"/> <numeric name="d_limit" data="200"/> </custom>
   <worldbody>
     <body>
       <joint name="hinge" axis="0 0 1" range="-0.5 0.5" armature="0.1"/>
@@ -265,7 +280,7 @@ def random_tree(base: str, seed: int) -> str:
   <option gravity="{rng.normal()} {rng.normal()} -9.81"/>
   <custom>
     <numeric name="k_n" data="2e3"/> <numeric name="k_d" data="2e2"/> <numeric name="k_t" data="200"/>
-    <numeric name="mu" data="0.7"/> <numeric name="k_limit" data="500"/> <numeric name="d_limit" data="3"/>
+    <numeric name="mu" data="0.7"/> <numeric name="k_limit" data="500"/> <numeric name="d_limit" data="300"/>
   </custom>
   <worldbody> <geom type="plane" size="1 1 1" pos="0 0 -100"/> {text} </worldbody>
   <actuator> {motors} </actuator>
@@ -348,10 +363,13 @@ def run(
     ctrl: Array,
     steps: int = 1,
     dtype: torch.dtype = torch.float64,
+    factors: Array | None = None,
     **simulator: object,
 ) -> tuple[Array, Array]:
     """qpos and qvel after some control steps of constant ctrl, without gradients."""
-    sim = Simulator(scene, len(qpos), dtype=dtype, **simulator)
+    sim = Simulator(scene, len(qpos), dtype=dtype, factors=factors is not None, **simulator)
+    if factors is not None:
+        sim.factors = torch.as_tensor(factors, dtype=dtype)
     q, v, u = (torch.as_tensor(x, dtype=dtype) for x in (qpos, qvel, ctrl))
     with torch.no_grad():
         for _ in range(steps):

@@ -12,11 +12,13 @@ import warp as wp
 from scenes import task_scene
 
 import diffsim
+from diffsim.integration import Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
 from diffsim.launcher import default_division
+from diffsim.scene import FACTORS
 from diffsim.simulator import Simulator
 
 HORIZON = 32
@@ -51,34 +53,55 @@ def test_kernels_compile_for_a_gpu_without_one(name: str) -> None:
             assert (function in code) == (feature in scene.features), function
 
 
-def episode(name: str, device: str, team: tuple[int, int] | None = None) -> dict[str, torch.Tensor]:
-    """The state after 32 control steps of random actions, and the gradients of a random function of it."""
+def test_kernels_with_factors_compile_for_a_gpu_without_one() -> None:
+    scene = task_scene("ant")
+    spec = kernel_spec(scene, divide(scene, 4), wp.float32, implicit=True, env_last=True, varied=True)
+    for kernel in (forward_kernel(spec), backward_kernel(spec)):
+        compiled(kernel.module, arch=90)
+
+
+def episode(
+    name: str, device: str, team: tuple[int, int] | None = None, integration: Integration | None = None
+) -> dict[str, torch.Tensor]:
+    """The state after 32 control steps of random actions and factors, and the gradients of a random function of it.
+
+    With `integration` every environment has factors of its own, else there are none.
+    """
     n, kwargs = 8, dict(dtype=torch.float64)
     start = diffsim.make(name, num_envs=n, seed=0, **kwargs)
     generator = torch.Generator().manual_seed(0)
     actions = torch.rand(HORIZON, n, start.scene.nu, generator=generator, **kwargs) * 2 - 1
     weights = [torch.randn(n, width, generator=generator, **kwargs) for width in (start.scene.nq, start.scene.nv)]
-    inputs = [x.to(device).detach().requires_grad_() for x in (start.qpos, start.qvel, actions)]
+    parts = [start.qpos, start.qvel, actions]
+    if integration:
+        parts.append(torch.rand(n, len(FACTORS), generator=generator, **kwargs) + 0.5)
+    inputs = [x.to(device).detach().requires_grad_() for x in parts]
     division = divide(start.scene, *team) if team else None
-    kwargs |= dict(device=device, division=division)
-    sim = Simulator(start.scene, n, start.sim.integration, start.control_dt, HORIZON, **kwargs)
-    qpos, qvel, steps = inputs
+    kwargs |= dict(device=device, division=division, factors=integration is not None)
+    sim = Simulator(start.scene, n, integration or start.sim.integration, start.control_dt, HORIZON, **kwargs)
+    qpos, qvel, steps, *factors = inputs
+    if factors:
+        sim.factors = factors[0]
     for action in steps:
         qpos, qvel = sim.step(qpos, qvel, action)
     assert not sim.nonfinite.any()
     loss = sum((w.to(device) * x).sum() for w, x in zip(weights, (qpos, qvel), strict=True))
     gradients = torch.autograd.grad(loss, inputs)
-    return {
-        k: x.detach().cpu() for k, x in zip(("qpos", "qvel", "d0", "d1", "d2"), (qpos, qvel, *gradients), strict=True)
-    }
+    names = ("qpos", "qvel", *(f"d{k}" for k in range(len(gradients))))
+    return {k: x.detach().cpu() for k, x in zip(names, (qpos, qvel, *gradients), strict=True)}
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", diffsim.TASKS)
-def test_gpu_agrees_with_cpu(name: str) -> None:
-    reference = episode(name, "cpu")
+@pytest.mark.parametrize(
+    "name, integration",
+    [(name, None) for name in diffsim.TASKS]
+    + [(name, Integration("implicit", 16, 0.5)) for name in ("ant", "humanoid_mtu")],
+)
+def test_gpu_agrees_with_cpu(name: str, integration: Integration | None) -> None:
+    """Without factors, and with factors and the gradient in them."""
+    reference = episode(name, "cpu", integration=integration)
     for team in [(1, 1), (2, 1), (4, 1), (8, 4)]:
-        ours = episode(name, "cuda", team)
-        for key, tolerance in (("qpos", 1e-9), ("qvel", 1e-9), ("d0", 1e-8), ("d1", 1e-8), ("d2", 1e-8)):
-            error = (ours[key] - reference[key]).norm() / reference[key].norm()
-            assert error < tolerance, (team, key, error)
+        ours = episode(name, "cuda", team, integration)
+        for key, value in reference.items():
+            error = (ours[key] - value).norm() / value.norm()
+            assert error < (1e-9 if key in ("qpos", "qvel") else 1e-8), (team, key, error)

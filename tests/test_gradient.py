@@ -12,6 +12,7 @@ from scenes import (
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
+    grounded_states,
     leg_scene,
     parse,
     pass_limits,
@@ -23,10 +24,12 @@ from scenes import (
 
 from diffsim.env import DiffEnv
 from diffsim.integration import Integration
+from diffsim.scene import FACTORS
 from diffsim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
+HILL = ("hill", "semi_implicit", 0.0)  # its muscles do not meet the integrator
 ONE = Integration(substeps=1)
 
 
@@ -42,20 +45,24 @@ def measure(qpos, qvel, weights):
 
 
 def gradients(scene, states, weights, dtype=torch.float64, **simulator):
-    """Of the measure after one control step with respect to qpos, qvel and ctrl."""
+    """Of the measure after one control step with respect to qpos, qvel, ctrl and, if there are, factors."""
     leaves = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in states]
-    q, v = Simulator(scene, len(states[0]), dtype=dtype, **simulator).step(*leaves)
+    sim = Simulator(scene, len(states[0]), dtype=dtype, factors=len(states) > 3, **simulator)
+    if len(states) > 3:
+        sim.factors = leaves[3]
+    q, v = sim.step(*leaves[:3])
     measure(q, v, weights).sum().backward()
     return [leaf.grad.double().numpy() for leaf in leaves]
 
 
-def differences(scene, states, weights, steps=(1e-7, 1e-6, 1e-5), **simulator):
+def differences(scene, states, weights, steps=(1e-7, 1e-6, 1e-5, 1e-5), **simulator):
     """The same by central differences of fourth order, all in one batch; small steps, as contacts make corners."""
     rows, sizes = len(states[0]), [x.shape[1] for x in states]
-    eps, splits = np.repeat(steps, sizes), np.cumsum(sizes)[:-1]
+    eps, splits = np.repeat(steps[: len(sizes)], sizes), np.cumsum(sizes)[:-1]
     offsets = np.array([-2.0, -1.0, 1.0, 2.0])[:, None, None, None] * np.diag(eps)[:, None, :]
     batch = (np.concatenate(states, 1) + offsets).reshape(-1, sum(sizes))
-    values = measure(*run(scene, *np.split(batch, splits, axis=1), **simulator), weights)
+    *start, factors = [*np.split(batch, splits, axis=1), None][:4]
+    values = measure(*run(scene, *start, factors=factors, **simulator), weights)
     far_low, low, high, far_high = values.reshape(4, sum(sizes), rows)
     slopes = (8 * (high - low) - (far_high - far_low)) / 12
     return np.split(slopes.T / eps, splits, axis=1)
@@ -64,9 +71,10 @@ def differences(scene, states, weights, steps=(1e-7, 1e-6, 1e-5), **simulator):
 def check_gradients(scene, states, rng, **simulator):
     w = weights(scene, rng)
     values, expected = gradients(scene, states, w, **simulator), differences(scene, states, w, **simulator)
-    for name, value, slope in zip(("qpos", "qvel", "ctrl"), values, expected, strict=True):
+    for name, value, slope in zip(("qpos", "qvel", "ctrl", "factors"), values, expected, strict=False):
         if slope.size:
-            error = np.linalg.norm(value - slope, axis=-1) / np.linalg.norm(slope, axis=-1)
+            axis = 0 if name == "factors" else -1  # a factor weighs as much as any other, however little it moves
+            error = np.linalg.norm(value - slope, axis=axis) / np.linalg.norm(slope, axis=axis)
             assert error.max() < 1e-6, f"gradient with respect to {name}"
 
 
@@ -103,6 +111,17 @@ def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
 def test_muscle_gradient_is_that_of_differences(model, rng):
     scene = leg_scene(model)
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))
+
+
+@pytest.mark.parametrize(
+    "name, integrator, theta", [(name, *kind) for name in ("linear", "planar") for kind in INTEGRATORS] + [HILL]
+)
+def test_gradient_in_factors_is_that_of_differences(name, integrator, theta, rng):
+    """Of every factor by itself; and in state and control where the factors are not one."""
+    scene = tree_scene("planar", 0) if name == "planar" else leg_scene(name, grounded=True)
+    scene, states = grounded_states(scene, 16, rng)
+    states = *states, rng.uniform(0.5, 2.0, (16, len(FACTORS)))
+    check_gradients(scene, states, rng, integration=Integration(integrator, 8, theta))
 
 
 def test_quaternion_of_any_length(rng):
@@ -150,7 +169,7 @@ def test_gradient_where_a_limit_is_exactly_met():
     """It is that of one side."""
     scene, weights = parse(HINGE), [np.array([1.0]), np.array([2.0])]
 
-    def at(angle):  # moving outwards, else the limit's damper would cancel its spring
+    def at(angle):
         return gradients(scene, [np.array([[x]]) for x in (angle, 0.3 * np.sign(angle), 0.1)], weights, integration=ONE)
 
     for bound in (scene.lower[1], scene.upper[1]):
@@ -165,10 +184,11 @@ def test_limit_force_in_closed_form():
     q, v, u = 0.53, -0.4, 0.7
     leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in (q, v, u)]
     _, after = Simulator(scene, 1, ONE, dtype=torch.float64).step(*leaves)
-    torque = 3 * u + 300 * (0.5 - q) - 2 * v
+    firmness, depth = 300 + 200 * v, q - 0.5
+    torque = 3 * u - firmness * depth
     np.testing.assert_allclose(after.item(), v + h * torque / inertia, rtol=1e-12)
     slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
-    np.testing.assert_allclose(slopes, [-300 * h / inertia, 1 - 2 * h / inertia, 3 * h / inertia], rtol=1e-12)
+    np.testing.assert_allclose(slopes, np.array([-firmness, inertia / h - 200 * depth, 3]) * h / inertia, rtol=1e-12)
 
 
 @pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])

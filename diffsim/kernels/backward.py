@@ -27,17 +27,19 @@ from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
+from diffsim.kernels.law import D_LIMIT, K_D, K_LIMIT, K_N, K_T, MASS, MOTOR, MU, environment_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec, module_options
+from diffsim.scene import FACTORS
 
 
 @cache
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
-    T, vec3, vec6, mat3, quat, Model = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model
-    vec6s = wp.array(dtype=vec6)
+    T, vec3, vec6, mat3, quat, Model, Law = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model, t.Law
+    vec6s, array = wp.array(dtype=vec6), t.array
     join, force_at, point_velocity, momentum = sp.join, sp.force_at, sp.point_velocity, sp.momentum
     exp_quat, exp_adjoint, log_adjoint = sp.exp_quat, sp.exp_adjoint, sp.log_adjoint
     to_tangent, from_tangent = sp.to_tangent, sp.from_tangent
@@ -46,16 +48,19 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     contact = contact_law(T)
     touches, contact_force = contact.touches, contact.contact_force
     contact_resistance, contact_adjoint = contact.contact_resistance, contact.contact_adjoint
+    contact_constants_adjoint = contact.contact_constants_adjoint
     muscle = muscle_law(spec, adjoint=True)
     measure, add_pull_adjoint, hill = muscle.measure, muscle.add_pull_adjoint, hill_law(T).hill
     uses = spec.features
-    passive_gain = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses).passive_gain
+    joint, law_of, VARIED = joint_law(spec), environment_law(spec), spec.varied
+    passive_gain, limit_constants_gain = joint.passive_gain, joint.limit_constants_gain
     DRAG, drag = "drag" in uses, drag_law(T)
     drag_wrench, drag_adjoint = drag.drag_wrench, drag.drag_adjoint
     NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
-    MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
+    DRIVEN, MUSCLE, HILL, LIMIT = "motor" in uses, "muscle" in uses, "hill" in uses, "limit" in uses
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in uses
+    NFACTORS = len(FACTORS)
     BASE = 7 * (spec.nlink - 1)  # where the base's factor begins
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
     sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
@@ -84,7 +89,20 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         return v + h * vec3(load(ck_a, row, k, e), load(ck_a, row, k + 1, e), load(ck_a, row, k + 2, e))
 
     @wp.func
-    def link_adjoint(m: Model, k: int, R: mat3, x: vec3, V: vec6, A: vec6, W: vec6, height: T, h: T, theta: T):
+    def link_adjoint(
+        m: Model,
+        law: Law,
+        k: int,
+        R: mat3,
+        x: vec3,
+        V: vec6,
+        A: vec6,
+        W: vec6,
+        height: T,
+        h: T,
+        theta: T,
+        g_factors: array,  # written if varied only
+    ):
         """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position."""
         com = x + R * m.com[k]
         inertia = R * m.inertia[k] * wp.transpose(R)
@@ -94,14 +112,20 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         adj_v = momentum(m.mass[k], com, inertia, wp.spatial_cross(W, V))
         adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
         adj_p = vec6()
+        if wp.static(VARIED):
+            # phi's inertial part is W . adj_w, and all of this is that of a factor of one.
+            g_factors[MASS] = g_factors[MASS] + wp.dot(W, adj_w)
+            adj_a = law.mass * adj_a
+            adj_w = law.mass * adj_w
+            adj_v = law.mass * adj_v
         if wp.static(DRAG):
             adj_w = adj_w - drag_wrench(m, k, R, com, V)
             adj_v = adj_v + drag_adjoint(m, k, R, com, V, W)
         if wp.static(CONTACT):
             for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
                 p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)
-                if touches(m, depth, v):
-                    fc = contact_force(m, depth, v)
+                if touches(law, depth, v):
+                    fc = contact_force(law, depth, v)
                     f = vec3(fc[0], fc[1], fc[2])
                     g_f = -point_velocity(W, p)
                     a = vec3()
@@ -109,9 +133,15 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     if wp.static(IMPLICIT):
                         hi = h
                         a = point_velocity(A, p) + m.gravity
-                        B = contact_resistance(m, depth, fc[3], h, theta)
+                        B = contact_resistance(law, depth, fc[3], h, theta)
                         f = f - wp.cw_mul(B, a)
-                    g = contact_adjoint(m, depth, v, a, g_f, hi, theta)
+                    g = contact_adjoint(law, depth, v, a, g_f, hi, theta)
+                    if wp.static(VARIED):
+                        gk = contact_constants_adjoint(law, depth, v, a, g_f, hi, theta)
+                        g_factors[K_N] = g_factors[K_N] + m.k_n * gk[0]
+                        g_factors[K_D] = g_factors[K_D] + m.k_d * gk[1]
+                        g_factors[K_T] = g_factors[K_T] + m.k_t * gk[2]
+                        g_factors[MU] = g_factors[MU] + m.mu * gk[3]
                     g_v = vec3(g[0], g[1], g[2])
                     wrench = force_at(p, f)
                     G = force_at(p, g_v)
@@ -161,7 +191,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         ck_f: t.array3,
         # the state that came in (its quaternion may not be of unit length), and whether the step was contained
         qpos: t.array2,
-        ctrl: t.array2,
+        ctrl: t.array2,  # and behind it the factors, if varied; so in g_ctrl
         nonfinite: wp.array(dtype=wp.bool),
         # gradient in
         g_qpos_out: t.array2,
@@ -197,6 +227,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         gtau = wp.zeros(shape=SLOTS, dtype=T)
         lam = wp.zeros(shape=SLOTS, dtype=T)
         u = wp.zeros(shape=SLOTS, dtype=T)
+        law = law_of(m, ctrl, e)
+        if wp.static(VARIED):
+            g_factors = wp.zeros(shape=NFACTORS, dtype=T)
+        else:
+            g_factors = u  # nobody reads or writes it there
         for i in range(1, n):
             gq[i] = g_qpos_out[e, qpos_adr(m, at + i)]
             gqd[i] = g_qvel_out[e, VADR + link_of(m, at + i)]
@@ -206,6 +241,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
                 k = m.muscle[entry]
                 pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+                if wp.static(VARIED):
+                    pull[k] = law.motor * pull[k]
             tension = pull
             by_length = pull
             by_rate = pull
@@ -313,7 +350,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 adj_w[i] = vec6()
                 adj_p[i] = vec6()
             for i in range(FIRST, n):
-                la, lv, lw, lp = link_adjoint(m, at + i, R[i], x[i], V[i], A[i], W[i], height, h, theta)
+                la, lv, lw, lp = link_adjoint(m, law, at + i, R[i], x[i], V[i], A[i], W[i], height, h, theta, g_factors)
                 adj_a[i] = la
                 adj_v[i] = lv
                 adj_w[i] = lw
@@ -322,11 +359,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 measure(m, lane, R, x, V, W, path, by_rate, power)
                 for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
                     k = m.muscle[entry]
-                    law = hill(m, k, pull[k], path[k], by_rate[k])
-                    tension[k] = law[0]
-                    g_pull[k] = g_pull[k] + power[k] * law[1]
-                    by_length[k] = power[k] * law[2]
-                    by_rate[k] = power[k] * law[3]
+                    curve = hill(m, k, pull[k], path[k], by_rate[k])
+                    tension[k] = curve[0]
+                    g_pull[k] = g_pull[k] + power[k] * curve[1]
+                    by_length[k] = power[k] * curve[2]
+                    by_rate[k] = power[k] * curve[3]
             if wp.static(MUSCLE):
                 add_pull_adjoint(m, lane, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, g_pull)
             # 4. inward: sum over subtrees, project on the joints
@@ -351,9 +388,17 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         p = m.inboard[k]
                         turned = m.outboard[k]
                     qi = q[i]
+                    end_rate = qd[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
-                    gain = passive_gain(m, k, qi, qd[i])
+                        if wp.static(LIMIT):
+                            end_rate = end_rate + h * load(ck_a, row, VADR + link_of(m, k), e)
+                    gain = passive_gain(m, law, k, qi, qd[i], end_rate)
+                    if wp.static(VARIED and LIMIT):
+                        if m.carried[k] == 1:  # of the lanes that have the joint
+                            by = limit_constants_gain(m, law, k, qi, qd[i], end_rate, theta * h)
+                            g_factors[K_LIMIT] = g_factors[K_LIMIT] - lam[i] * by[0]
+                            g_factors[D_LIMIT] = g_factors[D_LIMIT] - lam[i] * by[1]
                     kv = gain[1]
                     if wp.static(IMPLICIT):
                         kv = kv + theta * h * gain[0]
@@ -411,6 +456,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 k = m.muscle[entry]
                 if not wp.isfinite(g_pull[k]):
                     broken = T(1.0)
+        if wp.static(VARIED):
+            for k in range(NFACTORS):
+                if not wp.isfinite(g_factors[k]):
+                    broken = T(1.0)
         if wp.static(THREADS_PER_ENV > 1):
             broken = add(broken)
         finite = broken == T(0.0)
@@ -421,11 +470,21 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         for k in range(NU):
             if m.motor_lane[k] == lane:
                 g = T(0.0)
-                if wp.static(MOTOR):
+                if wp.static(DRIVEN):
                     g = gtau[m.motor_slot[lane * NU + k]]
                 if wp.static(MUSCLE):
                     g = g + g_pull[k]
+                if wp.static(VARIED):
+                    g_factors[MOTOR] = g_factors[MOTOR] + g * (m.gear[k] * ctrl[e, k] + m.motor_bias[k])
+                    g = law.motor * g
                 g_ctrl[e, k] = wp.where(keep, g * m.gear[k], T(0.0))
+        if wp.static(VARIED):
+            for k in range(NFACTORS):
+                total = g_factors[k]
+                if wp.static(THREADS_PER_ENV > 1):
+                    total = add(total)
+                if lane == 0:
+                    g_ctrl[e, NU + k] = wp.where(keep, total, T(0.0))
         for i in range(1, n):
             g_qpos[e, qpos_adr(m, at + i)] = wp.where(keep, gq[i], T(0.0))
             g_qvel[e, VADR + link_of(m, at + i)] = wp.where(keep, gqd[i], T(0.0))

@@ -18,6 +18,7 @@ from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.lanes import lane_sums
+from diffsim.kernels.law import environment_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
@@ -27,7 +28,7 @@ from diffsim.kernels.spec import MAX_SPEED, KernelSpec, module_options
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
-    T, vec3, vec6, mat3, mat6, quat, Model = spec.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model
+    T, vec3, vec6, mat3, mat6, quat, Model, Law = spec.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model, t.Law
     mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
     join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
     store, place_links, sphere_state = kin.store, kin.place_links, kin.sphere_state
@@ -35,8 +36,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     contact = contact_law(T)
     touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
     uses = spec.features
-    joint = joint_law(T, "stiffness" in uses, "damping" in uses, "limit" in uses)
-    passive_force, passive_gain = joint.passive_force, joint.passive_gain
+    joint, law_of, VARIED = joint_law(spec), environment_law(spec), spec.varied
+    passive_force, passive_resistance = joint.passive_force, joint.passive_resistance
     muscle = muscle_law(spec, adjoint=False)
     add_pull, measure, hill = muscle.add_pull, muscle.measure, hill_law(T).hill
     DRAG, drag_wrench = "drag" in uses, drag_law(T).drag_wrench
@@ -50,11 +51,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
 
     @wp.func
-    def link_inertia(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
+    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
         """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
         com = x + R * m.com[k]
         inertia = R * m.inertia[k] * wp.transpose(R)
         mass = m.mass[k]
+        if wp.static(VARIED):
+            inertia = law.mass * inertia
+            mass = law.mass * mass
         Ib = mass * wp.skew(com)
         Ia = inertia - Ib * wp.skew(com)
         Id = wp.diag(vec3(mass, mass, mass))
@@ -64,11 +68,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(CONTACT):
             for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
                 p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)
-                if touches(m, depth, v):
-                    fc = contact_force(m, depth, v)
+                if touches(law, depth, v):
+                    fc = contact_force(law, depth, v)
                     f = vec3(fc[0], fc[1], fc[2])
                     if wp.static(IMPLICIT):
-                        B = contact_resistance(m, depth, fc[3], h, theta)
+                        B = contact_resistance(law, depth, fc[3], h, theta)
                         f = f - wp.cw_mul(B, m.gravity)
                         D = wp.diag(B)
                         PB = wp.skew(p) * D
@@ -136,7 +140,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         # state in
         qpos: t.array2,
         qvel: t.array2,
-        ctrl: t.array2,
+        ctrl: t.array2,  # and behind it the factors, if varied
         # checkpoint out: rows row0 .. row0 + substeps - 1, written if record is 1
         record: int,
         row0: int,
@@ -174,11 +178,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         q = wp.zeros(shape=SLOTS, dtype=T)
         qd = wp.zeros(shape=SLOTS, dtype=T)
         motor = wp.zeros(shape=SLOTS, dtype=T)
+        law = law_of(m, ctrl, e)
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
             for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
                 k = m.muscle[entry]
                 pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+                if wp.static(VARIED):
+                    pull[k] = law.motor * pull[k]
             tension = pull
         if wp.static(HILL):
             tension = wp.zeros(shape=NU, dtype=T)
@@ -188,6 +195,9 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             for k in range(NU):
                 i = m.motor_slot[lane * NU + k]
                 motor[i] = motor[i] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+            if wp.static(VARIED):
+                for i in range(1, n):
+                    motor[i] = law.motor * motor[i]
         for i in range(1, n):
             q[i] = qpos[e, qpos_adr(m, at + i)]
             qd[i] = qvel[e, VADR + link_of(m, at + i)]
@@ -243,7 +253,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 Id[i] = mat3()
                 P[i] = vec6()
             for i in range(FIRST, n):
-                ia, ib, id, force = link_inertia(m, at + i, R[i], x[i], V[i], height, h, theta)
+                ia, ib, id, force = link_inertia(m, law, at + i, R[i], x[i], V[i], height, h, theta)
                 Ia[i] = ia
                 Ib[i] = ib
                 Id[i] = id
@@ -275,10 +285,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     qi = q[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
-                        gain = passive_gain(m, k, qi, qd[i])
-                        d = d - theta * h * h * gain[0] - h * gain[1]
+                        resistance = passive_resistance(m, law, k, qi, qd[i])
+                        d = d + theta * h * h * resistance[0] + h * resistance[1]
                     di = T(1.0) / d
-                    ui = motor[i] + passive_force(m, k, qi, qd[i]) - wp.dot(S[i], P[i])
+                    ui = motor[i] + passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
                     if wp.static(FLOATING) or p > 0:
                         va = Ua * di
                         vl = Ul * di

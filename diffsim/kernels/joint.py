@@ -1,4 +1,14 @@
-"""The passive force of a hinge or slide: spring, damper and limit (Eq. 4), with its derivatives beside it."""
+"""The passive force of a hinge or slide: spring, damper and limit (Eq. 4), with its derivatives beside it.
+
+With q beyond a bound by x > 0, and the rate v at which it returns, a limit pushes back with
+
+    f = max(k_limit - d_limit v, 0) x,
+
+as contact does: the damper grows with the depth, and a limit never pulls. With q' the rate and a the acceleration,
+
+Implicit step: f(q + theta h q', q') - B a with B = theta h^2 k + h (b + d_limit x), of the whole passive force; x is
+lagged. Where the limit lets go it has no part in B. The explicit law is B = 0, h = theta = 0.
+"""
 
 from functools import cache
 from types import SimpleNamespace
@@ -6,48 +16,102 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.model import types
+from diffsim.kernels.spec import KernelSpec
 
 
 @cache
-def joint_law(dtype: type, stiffness: bool, damping: bool, limit: bool) -> SimpleNamespace:
-    t = types(dtype)
-    T, Model = dtype, t.Model
+def joint_law(spec: KernelSpec) -> SimpleNamespace:
+    t = types(spec.dtype)
+    T, Model, Law = spec.dtype, t.Model, t.Law
     vec2 = wp.types.vector(2, T)
+    STIFFNESS, DAMPING, LIMIT = (name in spec.features for name in ("stiffness", "damping", "limit"))
+    VARIED = spec.varied
 
     @wp.func
-    def limit_force(m: Model, i: int, q: T, qd: T):
-        """It pushes back into the range and never pulls, however fast the joint returns."""
-        force = T(0.0)
+    def way_back(m: Model, i: int, q: T):
+        """From q to the bound that it is beyond; 0 within the range."""
+        way = T(0.0)
         if q < m.lower[i]:
-            force = wp.max(m.k_limit[i] * (m.lower[i] - q) - m.d_limit[i] * qd, T(0.0))
+            way = m.lower[i] - q
         if q > m.upper[i]:
-            force = wp.min(m.k_limit[i] * (m.upper[i] - q) - m.d_limit[i] * qd, T(0.0))
-        return force
+            way = m.upper[i] - q
+        return way
 
     @wp.func
-    def passive_force(m: Model, i: int, q: T, qd: T):
+    def limit_constants(m: Model, law: Law, i: int):
+        k = m.k_limit[i]
+        d = m.d_limit[i]
+        if wp.static(VARIED):
+            k = law.k_limit * k
+            d = law.d_limit * d
+        return k, d
+
+    @wp.func
+    def pushes(k: T, d: T, way: T, qd: T):
+        """Whether the limit acts: beyond a bound, and not left too fast."""
+        return way != T(0.0) and d * wp.where(way > T(0.0), qd, -qd) < k
+
+    @wp.func
+    def passive_force(m: Model, law: Law, i: int, q: T, qd: T):
         force = T(0.0)
-        if wp.static(stiffness):
+        if wp.static(STIFFNESS):
             force = force - m.stiffness[i] * (q - m.spring_ref[i])
-        if wp.static(damping):
+        if wp.static(DAMPING):
             force = force - m.damping[i] * qd
-        if wp.static(limit):
-            force = force + limit_force(m, i, q, qd)
+        if wp.static(LIMIT):
+            way = way_back(m, i, q)
+            k, d = limit_constants(m, law, i)
+            if pushes(k, d, way, qd):
+                force = force + (k - d * wp.where(way > T(0.0), qd, -qd)) * way
         return force
 
     @wp.func
-    def passive_gain(m: Model, i: int, q: T, qd: T):
-        """(d force / d q, d force / d qd)."""
+    def passive_resistance(m: Model, law: Law, i: int, q: T, qd: T):
+        """The parts of B that theta h^2 and h multiply."""
         kq = T(0.0)
         kv = T(0.0)
-        if wp.static(stiffness):
-            kq = kq - m.stiffness[i]
-        if wp.static(damping):
-            kv = kv - m.damping[i]
-        if wp.static(limit):
-            if limit_force(m, i, q, qd) != T(0.0):
-                kq = kq - m.k_limit[i]
-                kv = kv - m.d_limit[i]
+        if wp.static(STIFFNESS):
+            kq = kq + m.stiffness[i]
+        if wp.static(DAMPING):
+            kv = kv + m.damping[i]
+        if wp.static(LIMIT):
+            way = way_back(m, i, q)
+            k, d = limit_constants(m, law, i)
+            if pushes(k, d, way, qd):
+                kq = kq + k
+                kv = kv + d * wp.abs(way)
         return vec2(kq, kv)
 
-    return SimpleNamespace(passive_force=passive_force, passive_gain=passive_gain)
+    @wp.func
+    def passive_gain(m: Model, law: Law, i: int, q: T, qd: T, end_rate: T):
+        """(d force / d q, d force / d qd), -B a included; end_rate is qd + h a, or qd if explicit."""
+        kq = T(0.0)
+        kv = T(0.0)
+        if wp.static(STIFFNESS):
+            kq = kq - m.stiffness[i]
+        if wp.static(DAMPING):
+            kv = kv - m.damping[i]
+        if wp.static(LIMIT):
+            way = way_back(m, i, q)
+            k, d = limit_constants(m, law, i)
+            if pushes(k, d, way, qd):
+                kq = kq - k + d * wp.where(way > T(0.0), end_rate, -end_rate)
+                kv = kv - d * wp.abs(way)
+        return vec2(kq, kv)
+
+    @wp.func
+    def limit_constants_gain(m: Model, law: Law, i: int, q: T, qd: T, end_rate: T, lead: T):
+        """d force / d factor of (k_limit, d_limit); lead is theta h, other arguments as of passive_gain."""
+        way = way_back(m, i, q)
+        k, d = limit_constants(m, law, i)
+        result = vec2()
+        if pushes(k, d, way, qd):
+            result = vec2(m.k_limit[i] * (way - lead * (end_rate - qd)), -m.d_limit[i] * wp.abs(way) * end_rate)
+        return result
+
+    return SimpleNamespace(
+        passive_force=passive_force,
+        passive_resistance=passive_resistance,
+        passive_gain=passive_gain,
+        limit_constants_gain=limit_constants_gain,
+    )

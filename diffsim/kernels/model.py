@@ -36,6 +36,7 @@ def types(dtype: type) -> SimpleNamespace:
         qpos_adr: wp.array(dtype=int)
         inboard: wp.array(dtype=int)
         outboard: wp.array(dtype=int)
+        carried: wp.array(dtype=int)  # 1 on the one lane that has its mass
         mass: wp.array(dtype=dtype)
         com: wp.array(dtype=vec3)
         inertia: wp.array(dtype=mat3)
@@ -76,6 +77,18 @@ def types(dtype: type) -> SimpleNamespace:
         k_t: dtype
         mu: dtype
 
+    @wp.struct
+    class Law:
+        k_n: dtype
+        k_d: dtype
+        k_t: dtype
+        mu: dtype
+        # factors of what each link has its own of, read where they vary only
+        k_limit: dtype
+        d_limit: dtype
+        mass: dtype
+        motor: dtype
+
     return SimpleNamespace(
         dtype=dtype,
         vec3=vec3,
@@ -89,6 +102,7 @@ def types(dtype: type) -> SimpleNamespace:
         array2=wp.array2d(dtype=dtype),
         array3=wp.array3d(dtype=dtype),
         Model=Model,
+        Law=Law,
     )
 
 
@@ -170,6 +184,7 @@ class _Writer:
         carried = np.array([i in weighs[lane] for lane, i in zip(self.lane, link, strict=True)], float)[:, None]
         frame, viscous, force, torque = scene.drag
         self.put(
+            carried=(carried[:, 0], int),
             mass=(scene.mass[link] * carried[:, 0], self.dtype),
             com=(scene.com[link], t.vec3),
             inertia=(scene.inertia[link] * carried[:, None], t.mat3),

@@ -20,6 +20,7 @@ class KernelSpec:
     features: frozenset[str]
     dtype: type
     implicit: bool
+    varied: bool  # constants are multiplied by factors of each environment (law.py)
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, environment, component]
     # how threads share an environment (lanes.py); slots: the most links that one of them has
     threads_per_env: int
@@ -51,7 +52,9 @@ class KernelSpec:
         return 7 * (self.nlink - 1) + (21 if self.floating else 0)
 
 
-def kernel_spec(scene: Scene, division: Division, dtype: type, implicit: bool, env_last: bool) -> KernelSpec:
+def kernel_spec(
+    scene: Scene, division: Division, dtype: type, implicit: bool, env_last: bool, varied: bool = False
+) -> KernelSpec:
     limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
     return KernelSpec(
         nlink=scene.nlink,
@@ -61,6 +64,7 @@ def kernel_spec(scene: Scene, division: Division, dtype: type, implicit: bool, e
         features=scene.features,
         dtype=dtype,
         implicit=implicit,
+        varied=varied,
         env_last=env_last,
         threads_per_env=division.threads_per_env,
         sharers=division.sharers,
