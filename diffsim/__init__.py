@@ -20,7 +20,7 @@ from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.scene import Scene, SceneError
 from diffsim.screen import RenderMode
 from diffsim.simulator import Simulator, check_device
-from diffsim.tasks import TASKS, Accuracy
+from diffsim.tasks import TASKS, Accuracy, Contact
 
 __all__ = [
     "TASKS",
@@ -46,6 +46,7 @@ def make(
     integrator: str | None = None,
     theta: float | None = None,
     accuracy: Accuracy = "default",
+    contact: Contact = "soft",
     penalty: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float32,
     stochastic_init: bool = True,
@@ -54,6 +55,7 @@ def make(
     max_episode_steps: int | None = None,
     render_mode: RenderMode | None = None,
     factors: bool = False,
+    clip_adjoint: float | None = None,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -62,6 +64,8 @@ def make(
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
             docs/accuracy.md has what each costs and how much it errs.
         substeps, integrator, theta: each in place of the preset's, if given.
+        contact: "soft" (the paper's) or "firm" (as MuJoCo's): the constants of contact and limits and how they are
+            integrated; docs/transfer.md has what each costs and how much of a policy's speed is true.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         factors: let constants differ between environments: `env.sim.factors`, see Simulator.
 
@@ -76,9 +80,9 @@ def make(
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
     return DiffEnv(
         task,
-        scene.with_penalty(penalty or {}),
+        scene.with_penalty(task.penalty(contact) | dict(penalty or {})),
         num_envs,
-        integration=task.integration(accuracy).replaced(integrator, substeps, theta),
+        integration=task.integration(accuracy, contact).replaced(integrator, substeps, theta),
         seed=seed,
         horizon=horizon,
         device=device,
@@ -89,6 +93,7 @@ def make(
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,
         factors=factors,
+        clip_adjoint=clip_adjoint,
     )
 
 

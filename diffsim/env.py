@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
@@ -30,6 +31,19 @@ def check_seed(seed: int) -> int:
 
 class ActionError(ValueError):
     """An action that is not a number: the policy that took it has diverged."""
+
+
+def clip_adjoint(state: Tensor, most: float) -> Tensor:
+    """The state (N, ...) itself; rows of its adjoint longer than `most` times their median length are cut to that."""
+
+    def clip(adjoint: Tensor) -> Tensor:
+        norm = torch.linalg.vector_norm(adjoint, dim=1, keepdim=True)
+        typical = norm.masked_fill(norm == 0, math.nan).nanmedian()
+        bound = most * typical.nan_to_num(math.inf)
+        return torch.where(norm > bound, adjoint * (bound / norm), adjoint)
+
+    state.register_hook(clip)
+    return state
 
 
 class DiffEnv(VectorEnv):
@@ -79,11 +93,13 @@ class DiffEnv(VectorEnv):
         max_episode_steps: int | None = None,
         render_mode: RenderMode | None = None,
         factors: bool = False,
+        clip_adjoint: float | None = None,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
         check_memory("start states of a window", num_envs, numbers * dtype.itemsize, check_device(device))
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
+        self._clip_adjoint = clip_adjoint
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         if max_episode_steps is not None:
             self.episode_length = check_count("max_episode_steps", max_episode_steps)
@@ -188,6 +204,9 @@ class DiffEnv(VectorEnv):
             )
         self._recorded += recorded
         self.qpos, self.qvel = self.sim.step(self.qpos, self.qvel, action)
+        if self._clip_adjoint and recorded:
+            state = clip_adjoint(torch.cat((self.qpos, self.qvel), 1), self._clip_adjoint)
+            self.qpos, self.qvel = state.split((self.scene.nq, self.scene.nv), 1)
         nonfinite = self.sim.nonfinite.clone()
         self._obs = obs = self.task.observe(self.qpos, self.qvel, action)
         reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .ant import Ant
-from .base import Accuracy, Task
+from .base import Accuracy, Contact, Firm, Task
 from .cartpole import CartPole
 from .half_cheetah import HalfCheetah
 from .hopper import Hopper
@@ -18,4 +18,4 @@ TASKS: dict[str, type[Task]] = {
 # Those of the SHAC paper, which have presets of every accuracy
 SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
 
-__all__ = ["SHAC_TASKS", "TASKS", "Accuracy", "Task"]
+__all__ = ["SHAC_TASKS", "TASKS", "Accuracy", "Contact", "Firm", "Task"]

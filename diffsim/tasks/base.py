@@ -7,7 +7,7 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -16,6 +16,28 @@ from ..integration import Integration
 from .mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
+Contact = Literal["soft", "firm"]
+
+
+class Firm(NamedTuple):
+    """Contact and limits as firm as MuJoCo's, fitted to its motion: docs/transfer.md. The soft ones are the paper's.
+
+    Attributes:
+        k_n, k_d, k_t, k_limit, d_limit: in place of the file's, see scene.PENALTY_CONSTANTS.
+        integration: on which they are stable.
+    """
+
+    k_n: float
+    k_d: float
+    k_t: float
+    k_limit: float
+    d_limit: float
+    integration: Integration
+
+    @property
+    def penalty(self) -> dict[str, float]:
+        """The constants alone."""
+        return {name: value for name, value in self._asdict().items() if name != "integration"}
 
 
 class Task:
@@ -29,6 +51,7 @@ class Task:
     substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy, semi-implicit Euler
     fast: ClassVar[Integration]  # the other two, chosen by measurement: docs/accuracy.md
     accurate: ClassVar[Integration]
+    firm: ClassVar[Firm]  # tasks without contact have none
     obs_dim: ClassVar[int]
     num_random: ClassVar[int]  # random numbers per reset
     episode_length: ClassVar[int] = 1000  # control steps
@@ -42,19 +65,37 @@ class Task:
         self._spread = torch.tensor(self.spread, device=device, dtype=dtype)
 
     @classmethod
-    def integration(cls, accuracy: str) -> Integration:
-        """The preset "fast", "default" (the paper's) or "accurate".
+    def integration(cls, accuracy: str, contact: str = "soft") -> Integration:
+        """The preset "fast", "default" (the paper's) or "accurate"; with firm contact the first two are one.
 
         Raises:
             ValueError: another name, or a preset that the task has not.
         """
         if accuracy not in get_args(Accuracy):
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
+        if cls.penalty(contact):
+            firm = cls.firm.integration
+            return firm._replace(substeps=4 * firm.substeps) if accuracy == "accurate" else firm
         if accuracy == "default":
             return Integration("semi_implicit", cls.substeps)
         if not hasattr(cls, accuracy):
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
         return getattr(cls, accuracy)
+
+    @classmethod
+    def penalty(cls, contact: str) -> dict[str, float]:
+        """The constants of contact and limits that "soft" (none: the file's) or "firm" puts in place of the file's.
+
+        Raises:
+            ValueError: another name, or firm contact of a task that has none.
+        """
+        if contact not in get_args(Contact):
+            raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(get_args(Contact))}")
+        if contact == "soft":
+            return {}
+        if not hasattr(cls, "firm"):
+            raise ValueError(f"task {cls.name!r} has no firm contact; choose soft")
+        return cls.firm.penalty
 
     @property
     def mirror(self) -> Mirror:

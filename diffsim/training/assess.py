@@ -21,7 +21,7 @@ from diffsim.training.gait import describe
 L = TypeVar("L", bound=Learner)
 
 
-def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> DiffEnv:
+def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, factors: bool = False) -> DiffEnv:
     """The task as the flags ask for it; what is wrong with them ends the script."""
     try:
         return diffsim.make(
@@ -33,7 +33,10 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0) -> Dif
             substeps=args.substeps,
             integrator=args.integrator,
             theta=args.theta,
+            contact=args.contact,
             penalty=parse_penalty(args.penalty),
+            factors=factors,
+            clip_adjoint=getattr(args, "clip_adjoint", 0.0) or None,
             threads=args.threads or None,
         )
     except ValueError as error:

@@ -26,8 +26,10 @@ from diffsim.startup import KernelCacheError, end_in_one_line
 from diffsim.tasks import TASKS
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, parse_command_line
+from diffsim.training.variation import parse_ranges
 
 LARGEST = torch.finfo(torch.float32).max
+RANDOMISED = ("stiffness=0.45:2.2", "friction=0.85:1.17")  # with --contact firm
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,8 @@ class SimulatorFlags:
     """simulation steps per control step (per task and --accuracy)"""
     theta: Fraction = 0.0
     """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
+    contact: Literal["soft", "firm"] = "soft"
+    """constants of contact and limits (docs/transfer.md): the paper's, or such as another simulator agrees with"""
     penalty: tuple[str, ...] = ()
     """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
     threads: Natural = 0
@@ -141,9 +145,23 @@ class ParallelFlags(Flags):
     """parallel environments N, over all processes of torchrun (per task)"""
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
+    clip_adjoint: NonNegative = 0.0
+    """adjoints of a state longer than this many times the environments' median are cut to that (0: none)"""
+    anneal: tuple[Fraction, Fraction] = (0.2, 0.55)
+    """with --contact firm, shares of the iterations between which contact goes from soft to firm"""
+    randomise: tuple[str, ...] = ()
+    """ranges of factors drawn for each environment: friction=0.7:1.3 stiffness mass motor (per --contact)"""
+    redraw: Count = 10
+    """iterations between drawings of the factors"""
 
     def check(self) -> None:
         super().check()
+        if self.anneal[0] > self.anneal[1]:
+            fail(f"--anneal {self.anneal[0]} {self.anneal[1]} are the wrong way round")
+        try:
+            parse_ranges(self.randomise)
+        except ValueError as error:
+            fail(f"--randomise: {error}")
         if self.num_envs % distributed.size():
             fail(f"--num-envs {self.num_envs} cannot be split evenly among {distributed.size()} processes")
 
@@ -178,7 +196,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args = _continue(kind, argv, args, path)
     else:
         args.device = distributed.choose_device(args.device)
-        defaults = dataclasses.replace(kind(), **_integration(args), **args.task_defaults())
+        defaults = dataclasses.replace(kind(), **_presets(args), **args.task_defaults())
         args = _cli(kind, argv, defaults)
         args.device = distributed.choose_device(args.device)
     check_ranges(args)
@@ -195,9 +213,11 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     return args
 
 
-def _integration(args: Flags) -> dict[str, Any]:
+def _presets(args: Flags) -> dict[str, Any]:
+    """What --accuracy and --contact stand for."""
+    ranges = {"randomise": RANDOMISED if args.contact == "firm" else ()} if isinstance(args, ParallelFlags) else {}
     try:
-        return TASKS[args.env].integration(args.accuracy)._asdict()
+        return ranges | TASKS[args.env].integration(args.accuracy, args.contact)._asdict()
     except ValueError as error:
         fail(error)
 
@@ -214,8 +234,10 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         fail(f"{path} was written by a {kind.script()}.py with other flags: {unknown}")
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained
-    if any(word.partition("=")[0] == "--accuracy" for word in argv):  # a preset replaces the saved numbers
-        defaults = dataclasses.replace(defaults, **_integration(dataclasses.replace(defaults, accuracy=given.accuracy)))
+    words = {word.partition("=")[0] for word in argv}
+    if chosen := {name: getattr(given, name) for name in ("accuracy", "contact") if flag(name) in words}:
+        # A preset replaces the saved numbers.
+        defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
     for name in kind.FIXED:

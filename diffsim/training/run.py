@@ -26,8 +26,9 @@ from diffsim.training.checkpoint import Learner
 from diffsim.training.directory import Lock, check_writable
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation
-from diffsim.training.flags import Flags, ParallelFlags
+from diffsim.training.flags import Flags, ParallelFlags, parse_penalty
 from diffsim.training.progress import EpisodeStatistics, ProgressLog
+from diffsim.training.variation import Variation, parse_ranges, soft_factors
 
 L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
@@ -121,6 +122,7 @@ class Run:
         self.last = min(args.iterations, args.stop_after or args.iterations)
         self._totals, self._episodes = dict.fromkeys(TOTALS, 0), EpisodeStatistics()
         self._env: DiffEnv | None = None
+        self._variation: Variation | None = None
         self._samples = 0  # control steps of an iteration, of all ranks
         self._learner: Learner | None = None
         self._log: ProgressLog | None = None
@@ -140,7 +142,14 @@ class Run:
         """This rank's share of the training environments, with its own random start states."""
         self._samples = num_envs * horizon
         seed = self.args.seed + distributed.rank() * RANK_SEED
-        self._env = make_env(self.args, num_envs // distributed.size(), horizon, seed)
+        args, varied = self.args, False
+        if isinstance(args, ParallelFlags):
+            varied = args.contact == "firm" or bool(args.randomise)
+        self._env = make_env(args, num_envs // distributed.size(), horizon, seed, varied)
+        if isinstance(args, ParallelFlags) and varied:
+            begin, end = (share * args.iterations for share in args.anneal) if args.contact == "firm" else (0.0, 0.0)
+            start = soft_factors(self._env.scene, parse_penalty(args.penalty))
+            self._variation = Variation(self._env, start, parse_ranges(args.randomise), (begin, end), args.redraw, seed)
         return self._env
 
     def make_eval_env(self) -> DiffEnv:
@@ -203,6 +212,8 @@ class Run:
         try:
             while self.iteration < self.last and not self._stopping:
                 self.iteration += 1
+                if self._variation is not None:
+                    self._variation.set(self.iteration)
                 yield self.iteration
                 self._end_iteration()
         finally:

@@ -1,0 +1,222 @@
+"""Fits the constants of contact and limits to recorded motion, by the simulator's own gradient.
+
+    python benchmarks/calibrate.py runs/learning/shac/ant__1               to MuJoCo, where this policy acts with noise
+    python benchmarks/calibrate.py --recording walk.npz --env ant          to measurements of your own
+    python benchmarks/calibrate.py runs/... --fit k_n k_d mu mass          other constants
+
+A recording holds qpos (E, T + 1, nq), qvel (E, T + 1, nv) and ctrl (E, T, nu) of E episodes, one row per control step
+of 1/60 s, ctrl as the task's actions in [-1, 1]; or one episode without the E. The fit starts segments of 0.2 s at
+random rows, simulates them and descends the error of the velocities after 0.05, 0.1 and 0.2 s. A fifth of the episodes
+is held out. Writes calibration.csv: the constants before and after, and both errors.
+"""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import common
+import numpy as np
+import torch
+import transfer
+import tyro
+import worlds
+from common import parse
+from tables import Row, markdown
+from torch import Tensor
+
+import diffsim
+from diffsim import DiffEnv
+from diffsim.scene import FACTORS
+from diffsim.training import Count, NonNegative, Positive, fail
+from diffsim.training.evaluation import SEED
+
+STEPS = (3, 6, 12)  # control steps after which the error is measured
+Constant = Literal["k_n", "k_d", "k_t", "mu", "k_limit", "d_limit", "mass", "motor"]
+CONTACT: tuple[Constant, ...] = ("k_n", "k_d", "k_t", "k_limit", "d_limit")
+SKIPPED = 12  # control steps at the start of an episode, which say more of the start state than of the ground
+
+
+@dataclass
+class Args(common.CommonFlags):
+    checkpoint: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT")] = None
+    # of any script, or its run: the policy that acts in MuJoCo
+    recording: Path | None = None  # .npz to fit to instead
+    env: common.Tasks = ()  # the task of the recording
+    contact: Literal["soft", "firm"] = "firm"  # the constants to begin with
+    fit: tuple[Constant, ...] = CONTACT
+    episodes: Count = 20  # of the policy in MuJoCo
+    steps: Count = 200  # control steps of each
+    noise: NonNegative = 0.2  # standard deviation of the noise on its actions
+    segments: Count = 256  # of each iteration, drawn anew
+    iterations: Count = 120
+    lr: Positive = 0.1  # of the constants' logarithms, falling to a tenth
+    substeps: Count = 16  # of the implicit integrator
+
+
+class Recording(NamedTuple):
+    """Episodes of one robot: (E, T + 1, nq), (E, T + 1, nv), (E, T, nu), and how many steps of each count (E,)."""
+
+    qpos: Tensor
+    qvel: Tensor
+    ctrl: Tensor
+    lengths: Tensor
+
+
+def record(args: Args, path: Path) -> tuple[str, Recording]:
+    """The task and the motion of a policy in MuJoCo, with noise on its actions."""
+    found = transfer.Args(episodes=args.episodes, device="cpu")
+    case = transfer.load(path, found)
+    env, name = case.env, case.saved.args["env"]
+    env.reset(seed=SEED)
+    qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
+    generator, actions = torch.Generator().manual_seed(0), list[Tensor]()
+
+    def policy(obs: Tensor) -> Tensor:
+        action = case.saved.network(obs)
+        action = (action + args.noise * torch.randn(action.shape, generator=generator)).clamp(-1.0, 1.0)
+        actions.append(action)
+        return action
+
+    world = worlds.MuJoCo(env.scene, args.episodes, env.control_dt)
+    task = type(env.task)(dtype=torch.float64)
+    motion = transfer.act(world, task, policy, qpos, qvel, env.scene.nu, args.steps)
+    qpos_path, qvel_path = (torch.from_numpy(x).float().transpose(0, 1) for x in (motion.qpos, motion.qvel))
+    lengths = torch.from_numpy(motion.lengths - motion.fallen)
+    return name, Recording(qpos_path, qvel_path, torch.stack(actions, 1), lengths)
+
+
+def read(path: Path, name: str) -> Recording:
+    """The user's recording; one that does not fit the task ends the benchmark with one line."""
+    scene = diffsim.make(name, 1).scene
+    if not path.is_file():
+        fail(f"no such recording: {path}")
+    try:
+        with np.load(path) as file:
+            arrays = [np.asarray(file[key], np.float32) for key in ("qpos", "qvel", "ctrl")]
+    except (KeyError, ValueError, zipfile.BadZipFile, OSError) as error:
+        fail(f"{path} is no .npz of qpos, qvel and ctrl: {error}")
+    arrays = [array[None] if array.ndim == 2 else array for array in arrays]
+    E, T = (*arrays[2].shape, 0, 0)[:2]
+    for key, array, shape in zip(
+        ("qpos", "qvel", "ctrl"), arrays, ((E, T + 1, scene.nq), (E, T + 1, scene.nv), (E, T, scene.nu)), strict=True
+    ):
+        if array.shape != shape:
+            fail(f"{path}: {key} has shape {array.shape}, must be {shape} for task {name}")
+        if not np.isfinite(array).all():
+            fail(f"{path}: {key} holds numbers that are not finite")
+    qpos, qvel, ctrl = map(torch.from_numpy, arrays)
+    return Recording(qpos, qvel, ctrl, torch.full((E,), T))
+
+
+class Segments(NamedTuple):
+    """Rows of a recording at which simulations start: (M,) each."""
+
+    episode: Tensor
+    row: Tensor
+
+
+def starts(recording: Recording, episodes: Sequence[int]) -> Segments:
+    """All rows of some episodes that a whole segment follows."""
+    pairs = [
+        (e, t)
+        for e in episodes
+        for t in range(min(SKIPPED, int(recording.lengths[e]) // 4), int(recording.lengths[e]) - max(STEPS) + 1)
+    ]
+    if not pairs:
+        fail(f"no episode is long enough for a segment of {max(STEPS)} control steps: of what does the robot fall?")
+    return Segments(*torch.tensor(pairs).T)
+
+
+def errors(env: DiffEnv, recording: Recording, at: Segments, factors: Tensor) -> Tensor:
+    """Root mean square error of the velocities (M, len(STEPS)) of segments, differentiable in factors (M, 8)."""
+    env.sim.rewind()
+    env.sim.factors = factors
+    qpos, qvel, found = recording.qpos[at.episode, at.row], recording.qvel[at.episode, at.row], list[Tensor]()
+    for k in range(max(STEPS)):
+        qpos, qvel = env.sim.step(qpos, qvel, recording.ctrl[at.episode, at.row + k])
+        if k + 1 in STEPS:
+            found.append((qvel - recording.qvel[at.episode, at.row + k + 1]).square().mean(1).add(1e-12).sqrt())
+    return torch.stack(found, 1)
+
+
+def fit(args: Args, name: str, recording: Recording) -> list[Row]:
+    """The rows of the csv, one of each constant."""
+    env = diffsim.make(
+        name, args.segments, horizon=max(STEPS), integrator="implicit", substeps=args.substeps, theta=0.0,
+        contact=args.contact, factors=True,
+    )  # fmt: skip
+    number = len(recording.lengths)
+    held = list(range(0, number, 5)) if number > 1 else [0]
+    train = starts(recording, [e for e in range(number) if e not in held] or held)
+    test = starts(recording, held)
+    generator = torch.Generator().manual_seed(0)
+    columns = [FACTORS.index(constant) for constant in args.fit]
+    logs = torch.zeros(len(columns), requires_grad=True)
+    optimizer = torch.optim.Adam([logs], lr=args.lr)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, args.iterations)
+
+    def draw(of: Segments) -> Segments:
+        pick = torch.randint(len(of.row), (args.segments,), generator=generator)
+        return Segments(of.episode[pick], of.row[pick])
+
+    def factors(each: Tensor) -> Tensor:
+        """(M, 8) from the logarithms (M, constants fitted)."""
+        return torch.ones(len(each), len(FACTORS)).index_copy(1, torch.tensor(columns), each.exp())
+
+    @torch.no_grad()
+    def check(of: Segments) -> Tensor:
+        """Mean over two drawings of the median error after each of STEPS."""
+        rows = factors(logs.expand(args.segments, -1))
+        return torch.stack([errors(env, recording, draw(of), rows).median(0).values for _ in range(4)]).mean(0)
+
+    before, began = (check(train), check(test)), time.perf_counter()
+    scale = before[0].clamp(min=1e-6)
+    for iteration in range(args.iterations):
+        each = logs.detach().expand(args.segments, -1).clone().requires_grad_()  # of each segment its own
+        error = errors(env, recording, draw(train), factors(each)) / scale
+        (gradient,) = torch.autograd.grad(error.clamp(max=4.0).sum(), each)
+        # Some segments' gradients explode through contacts: each votes with its direction and a bounded size.
+        norm = gradient.norm(dim=1, keepdim=True)
+        bound = norm.median().clamp(min=1e-12)
+        logs.grad = (gradient / (norm / bound).clamp(min=1.0)).mean(0) / bound
+        optimizer.step()
+        schedule.step()
+        if iteration % 20 == 19:
+            values = ", ".join(f"{c} x{f:.3g}" for c, f in zip(args.fit, logs.detach().exp().tolist(), strict=True))
+            print(f"  {iteration + 1}: error {error.detach().mean():.3f}; {values}", flush=True)
+    after = check(train), check(test)
+    scene, rows = env.scene, list[Row]()
+    for constant, factor in zip(args.fit, logs.detach().exp().tolist(), strict=True):
+        own = {"mass": 1.0, "motor": 1.0}.get(constant) or float(np.max(getattr(scene, constant)))
+        row: dict[str, object] = {"task": name, "reference": args.recording.name if args.recording else "MuJoCo"}
+        row |= {"constant": constant, "before": own, "after": own * factor}
+        for kind, old, new in zip(("", "held out, "), before, after, strict=True):
+            for k, a, b in zip(STEPS, old.tolist(), new.tolist(), strict=True):
+                row[f"{kind}error after {k / 60:.2g} s"] = f"{a:.3g} -> {b:.3g}"
+        rows.append(row | {"seconds": time.perf_counter() - began})
+    return rows
+
+
+def main(args: Args) -> None:
+    if (args.checkpoint is None) == (args.recording is None):
+        fail("give one of a checkpoint, whose policy acts in MuJoCo, and --recording FILE")
+    name: str
+    if args.recording:
+        if len(args.env) != 1:
+            fail("--recording needs the --env of one task")
+        name, recording = args.env[0], read(args.recording, args.env[0])
+    else:
+        assert args.checkpoint
+        name, recording = record(args, args.checkpoint)
+    rows = fit(args, name, recording)
+    args.merge("calibration", rows, ("task", "reference", "constant"))
+    print(markdown(rows))
+
+
+if __name__ == "__main__":
+    main(parse(Args, __doc__))

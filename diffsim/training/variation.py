@@ -1,0 +1,112 @@
+"""Constants that differ between environments and change over a training: firm contact by degrees, robots of many kinds.
+
+A ground as firm as a real one teaches nothing from the start: its gradients are too steep to find a gait by. A soft one
+teaches gaits that only it can carry. So the constants begin soft, become firm while the policy learns, and are then
+drawn at random, which keeps the policy from living on one ground's own errors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from diffsim.env import DiffEnv
+from diffsim.integration import is_real
+from diffsim.mjcf import load_scene
+from diffsim.scene import FACTORS, PENALTY_CONSTANTS, Scene
+
+# What --randomise may name, and the factors of the simulator that it draws, each by itself.
+VARIED = {
+    "friction": ("mu",),
+    "stiffness": ("k_n", "k_d", "k_t", "k_limit", "d_limit"),
+    "mass": ("mass",),
+    "motor": ("motor",),
+}
+SEEDS = 1_000_003  # between the random numbers of one drawing and the next
+
+
+class Range(NamedTuple):
+    """Of factors, drawn so that their logarithm is uniform."""
+
+    least: float
+    most: float
+
+
+def parse_ranges(items: Sequence[str]) -> dict[str, Range]:
+    """Of the flag --randomise friction=0.7:1.3 mass=0.9:1.1, by name.
+
+    Raises:
+        ValueError: anything else.
+    """
+    ranges = {}
+    for item in items:
+        name, _, text = item.partition("=")
+        try:
+            least, most = map(float, text.split(":"))
+        except ValueError:
+            raise ValueError(f"{item!r} is no range of factors like friction=0.7:1.3") from None
+        if name not in VARIED:
+            raise ValueError(f"unknown {name!r}: choose from {', '.join(VARIED)}")
+        if not (is_real(least) and 0 < least <= most < math.inf):
+            raise ValueError(f"{item!r}: factors must be positive and finite, the least one first")
+        ranges[name] = Range(least, most)
+    return ranges
+
+
+def soft_factors(scene: Scene, kept: Collection[str] = ()) -> dict[str, float]:
+    """The robot file's own constants of contact and limits, as factors of the scene's; those kept are left out."""
+    soft, factors = load_scene(scene.path), {}
+    for name in PENALTY_CONSTANTS.keys() - kept:
+        (own, firm) = (np.atleast_1d(getattr(s, name)) for s in (soft, scene))
+        used = firm > 0
+        if used.any():
+            factors[name] = float(np.median(own[used] / firm[used]))
+    return factors
+
+
+class Variation:
+    """Sets the factors of an environment's constants, before each iteration, as the iteration alone decides.
+
+    With progress t from 0 to 1 a constant is start^(1 - t) of its own, times a random factor whose range opens as t
+    does; damping of a limit, which the soft limit lacks, goes with t.
+
+    Args:
+        env: made with factors.
+        start: factors at t = 0, by their names in FACTORS; what is not named has 1.
+        ranges: of random factors, by their names in VARIED.
+        span: iterations between which t rises from 0 to 1.
+        redraw: iterations between drawings.
+        seed: of the drawings.
+    """
+
+    def __init__(
+        self,
+        env: DiffEnv,
+        start: Mapping[str, float],
+        ranges: Mapping[str, Range],
+        span: tuple[float, float],
+        redraw: int,
+        seed: int,
+    ) -> None:
+        self.factors, self.span, self.redraw, self.seed = env.sim.factors, span, redraw, seed
+        drawn = {factor: ranges[name] for name, factors in VARIED.items() if name in ranges for factor in factors}
+        least = [math.log(drawn[name].least) if name in drawn else 0.0 for name in FACTORS]
+        most = [math.log(drawn[name].most) if name in drawn else 0.0 for name in FACTORS]
+        self.least, self.width = torch.tensor(least), torch.tensor(most) - torch.tensor(least)
+        self.start = torch.tensor([start.get(name, 1.0) for name in FACTORS])
+
+    def progress(self, iteration: int) -> float:
+        begin, end = self.span
+        return min(1.0, max(0.0, (iteration - begin) / (end - begin))) if end > begin else float(iteration > begin)
+
+    def set(self, iteration: int) -> None:
+        """The factors (N, len(FACTORS)) of an iteration; between drawings they change by the progress alone."""
+        t = self.progress(iteration)
+        generator = torch.Generator().manual_seed(self.seed + SEEDS * ((iteration - 1) // self.redraw))
+        uniform = torch.rand(self.factors.shape, generator=generator)
+        base = torch.where(self.start > 0, self.start.clamp(min=1e-30) ** (1 - t), torch.full_like(self.start, t))
+        self.factors.copy_(base * (t * (self.least + self.width * uniform)).exp())
