@@ -100,7 +100,7 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "general":       ("Figure 8: one setting for all tasks", ("shac", "shac_general"), TASKS),
     "deterministic": ("Figure 9: deterministic policy", ("shac", "shac_deterministic"), TASKS),
     "accuracy":      ("SHAC at each accuracy", ("shac_fast", "shac", "shac_accurate"), TASKS[:-1]),
-    "records":       ("SHAC, SAPO and PPO", ("shac", "sapo", PPO), TASKS),
+    "records":       ("SHAC, SAPO and PPO", ("shac", "sapo", "sapo_16", PPO, "ppo_many"), TASKS),
     "ablation":      ("SAPO without each of its parts", ("sapo", "sapo_no_entropy", "sapo_no_state_std",
                       "sapo_one_critic", "sapo_elu", "sapo_alone"), ("humanoid",)),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
@@ -151,6 +151,11 @@ def curves(args: Args, learner: str, env: str) -> list[Curve]:
     return [curve(rows) for rows in seeds.values()]
 
 
+def timed(runs: Sequence[Curve]) -> list[Curve]:
+    """Those that had the machine to themselves: of the others the csv files have no seconds."""
+    return [run for run in runs if not np.isnan(run["seconds"]).any()]
+
+
 def table(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> list[Row]:
     """The learners beside each other, on tasks where there are two."""
     rows = list[Row]()
@@ -160,15 +165,18 @@ def table(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> lis
         for learner, runs in found.items() if len(found) > 1 else ():
             best = [np.nanmax(run["return"]) for run in runs]
             last = [values[-1] for run in runs if len(values := run["eval_return"][~np.isnan(run["eval_return"])])]
-            ends = [[run[x][-1] for run in runs] for x in ("control_steps", "seconds")]
-            steps, seconds = (median(passing(runs, target, x)) for x in ("control_steps", "seconds"))
+            own = timed(runs)
+            steps = median(passing(runs, target, "control_steps"))
+            seconds = median(passing(own, target, "seconds")) if own else math.nan
             spread = f" ± {pstdev(best):.0f}" if len(runs) > 1 else ""
             row: dict[str, object] = {"task": env, "learner": learner, "seeds": len(runs)}
             row |= {"best return of training": f"{mean(best):.0f}{spread}", "published": published.get(learner, "")}
             row |= {"last evaluation": f"{median(last):.0f}" if last else ""}
-            row |= {"control steps": f"{median(ends[0]) / 1e6:.3g} M", "training, s": f"{median(ends[1]):.0f}"}
+            row |= {"control steps": f"{median(run['control_steps'][-1] for run in runs) / 1e6:.3g} M"}
+            row |= {"training, s": f"{median(run['seconds'][-1] for run in own):.0f}" if own else ""}
             row |= {"target": target, "steps to target": "never" if steps == math.inf else f"{steps / 1e6:.3g} M"}
-            rows.append(row | {"s to target": "never" if seconds == math.inf else f"{seconds:.0f}"})
+            words = "" if math.isnan(seconds) else "never" if seconds == math.inf else f"{seconds:.0f}"
+            rows.append(row | {"s to target": words})
     return rows
 
 
@@ -180,7 +188,8 @@ def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[TaskNam
         for env in tasks:
             lines, begins, ends, published = list[Line](), list[float](), list[float](), RETURNS[env][2]
             for k, learner in enumerate(learners):
-                if runs := curves(args, learner, env):
+                runs = curves(args, learner, env)
+                if runs := timed(runs) if x == "seconds" else runs:
                     common = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
                     middle = np.median([np.interp(common, run[x], run["return"]) for run in runs], axis=0)
                     lines += [Line(run[x], run["return"], f"C{k}-", width=0.5) for run in runs]

@@ -61,9 +61,10 @@ def write_csv(path: Path, rows: Sequence[Row], device: str = "cpu", older: Itera
     """Write rows that were measured on a device, some of them by other processes, of the older origins."""
     if not rows:
         return
+    lines = [*older, origin(device)]  # before the file, which git would call a change, is touched
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
-        file.writelines([*older, origin(device)])
+        file.writelines(lines)
         columns = dict.fromkeys(name for row in rows for name in row)
         writer = csv.DictWriter(file, list(columns), restval="", lineterminator="\n")
         writer.writeheader()

@@ -17,7 +17,7 @@ class Ant(Locomotion):
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)
-    firm = Firm(k_n=3.3e5, k_d=8.7e5, k_t=3e4, k_limit=4.7e3, d_limit=4.7e3, integration=Integration("implicit", 8))
+    firm = Firm(k_n=3.4e5, k_d=8e5, k_t=1.7e3, k_limit=4.8e3, d_limit=3.9e3, integration=Integration("implicit", 8))
     obs_dim = 37
     num_random = 29
     min_height = 0.27

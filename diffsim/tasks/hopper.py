@@ -19,7 +19,7 @@ class Hopper(Task):
     substeps = 16
     fast = Integration("semi_implicit", 8)
     accurate = Integration("extrapolated", 32)
-    firm = Firm(k_n=1.5e5, k_d=5e5, k_t=1e4, k_limit=1e4, d_limit=3e4, integration=Integration("implicit", 8))
+    firm = Firm(k_n=1.4e5, k_d=4e5, k_t=500, k_limit=3.3e3, d_limit=5.8e3, integration=Integration("implicit", 8))
     obs_dim = 11
     num_random = 12
     min_height = -0.45
