@@ -49,6 +49,7 @@ SAPO_16 = ("sapo", "--integrator", "implicit", "--substeps", "16")  # the humano
 SAPO_CPU = (*SAPO_16, "--iterations", "1000")
 PPO_MANY = (PPO, "--accuracy", "fast", "--num-envs", "4096", "--minibatch-size", "32768", "--entropy-coef", "0.002",
             "--iterations", "2500")
+SHAC_FIRM = ("shac", "--contact", "firm")
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
@@ -65,6 +66,13 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     **{f"shac_{n}":       ("shac", "--num-envs", str(n)) for n in (256, 1024)},
     **{f"shac_h{h}":      ("shac", "--horizon", str(h), "--num-envs", str(2048 // h)) for h in (4, 8, 16, 64, 128)},
     **PRESETS,
+    "shac_firm":          SHAC_FIRM,
+    "shac_firm_sudden":   (*SHAC_FIRM, "--anneal", "0", "0"),
+    "shac_firm_fixed":    (*SHAC_FIRM, "--randomise"),
+    "shac_firm_h16":      (*SHAC_FIRM, "--horizon", "16"),
+    "shac_firm_clip":     (*SHAC_FIRM, "--clip-adjoint", "3"),
+    "sapo_firm":          (*SAPO[:1], *SHAC_FIRM[1:]),
+    "ppo_firm":           (PPO, *SHAC_FIRM[1:]),
     PPO:                  (PPO,),
     "ppo_256":            (PPO, "--num-envs", "256", "--minibatch-size", "2048", "--entropy-coef", "0"),
     "ppo_4096":           (PPO, "--num-envs", "4096", "--minibatch-size", "32768", "--entropy-coef", "0"),
@@ -87,7 +95,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation",
+    "ablation", "firm",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -103,6 +111,9 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "records":       ("SHAC, SAPO and PPO", ("shac", "sapo", "sapo_16", PPO, "ppo_many"), TASKS),
     "ablation":      ("SAPO without each of its parts", ("sapo", "sapo_no_entropy", "sapo_no_state_std",
                       "sapo_one_critic", "sapo_elu", "sapo_alone"), ("humanoid",)),
+    "firm":          ("Learning through firm contact", ("shac_firm", "shac_firm_sudden", "shac_firm_fixed",
+                      "shac_firm_h16", "shac_firm_clip", "sapo_firm", "ppo_firm"),
+                      ("hopper", "half_cheetah", "ant", "humanoid")),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
 }
 # fmt: on

@@ -2,6 +2,7 @@
 
     python benchmarks/stability.py                         every task and integrator, a quarter of an hour
     python benchmarks/stability.py --parts long --steps 100_000
+    python benchmarks/stability.py --contact firm          on firm ground, beside the rows of the soft one
 
 Writes stability_*.csv, stability.png and, with --update-results, the tables of docs/stability.md, which explains them.
 All is float32, from states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below
@@ -31,6 +32,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim import Scene, Simulator
+from diffsim.tasks import Contact
 from diffsim.training import Count
 
 Part = Literal["step", "sweeps", "horizon", "long"]
@@ -55,15 +57,22 @@ NEEDS_GROUND = list(SWEEPS)[:5]
 @dataclass
 class Args(PolicyFlags):
     parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long")  # tables to measure
+    contact: Contact = "soft"  # constants of contact and limits; firm of the tasks that have such
     states: Count = 8  # start states
     steps: Count = 1_000_000  # control steps of the table "long", over all of its 64 environments
+
+
+def label(args: Args, name: TaskName) -> str:
+    """What the csv files call a task."""
+    return name if args.contact == "soft" else f"{name} {args.contact}"
 
 
 class Case(motions.Case):
     """With MuJoCo's model for the energies, and a reference so fine that it is stable."""
 
     def __init__(self, args: Args, name: TaskName) -> None:
-        super().__init__(args, name)
+        super().__init__(args, name, diffsim.TASKS[name].penalty(args.contact))
+        self.label = label(args, name)
         self.model = mujoco.MjModel.from_xml_path(self.scene.path)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 
@@ -92,7 +101,7 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
             stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        row = {"task": name, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
+        row = {"task": case.label, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
         yield row | {"largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
 
 
@@ -178,7 +187,13 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
                 floor = (path[:, 1] - path[:, 0]).min(0)
                 within = bool((path[:, 1] - floor <= 1.1 * (before - floor) + 1e-3).all())
             norm, lost = gradient_norm(sim, qpos, qvel, actions)
-            row = {"task": name, "integrator": integrator, "sweep": sweep, "value": float(value), "finite": bad == 0}
+            row = {
+                "task": case.label,
+                "integrator": integrator,
+                "sweep": sweep,
+                "value": float(value),
+                "finite": bad == 0,
+            }
             yield row | {"contained": bad, "energy bounded": within, "gradient": norm, "gradients not finite": lost}
 
 
@@ -219,7 +234,7 @@ def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
             found = [g.flatten() for g in torch.autograd.grad(total, weights, allow_unused=True) if g is not None]
             lost = int(sim.nonfinite_gradients.sum()) - before
             row = {
-                "task": name,
+                "task": case.label,
                 "integrator": integrator,
                 "horizon": horizon,
                 "gradient": torch.cat(found).norm().item(),
@@ -229,7 +244,7 @@ def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
 
 @torch.no_grad()
 def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
-    env = diffsim.make(name, num_envs=64, seed=0)
+    env = diffsim.make(name, num_envs=64, seed=0, contact=args.contact)
     policy, returns = args.policy(name)[0].float(), list[float]()
     obs, _ = env.reset(seed=0)
     bad, fastest = torch.zeros((), dtype=torch.long), torch.zeros(())
@@ -239,7 +254,7 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
         fastest = torch.maximum(fastest, env.qvel.abs().max())
         returns += info["episode"]["r"][info["_episode"]].tolist()
     row = {
-        "task": name,
+        "task": label(args, name),
         "control steps": 64 * math.ceil(args.steps / 64),
         "contained": int(bad),
         "largest velocity": fastest.item(),
@@ -270,6 +285,8 @@ MEASURES: dict[Part, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str,
 
 
 def main(args: Args) -> None:
+    if args.contact == "firm":
+        args.env = tuple(name for name in args.env if hasattr(diffsim.TASKS[name], "firm"))
     for part in args.parts:
         rows = measured(args, f"stability_{part}", *MEASURES[part])
         if part != "horizon":

@@ -17,7 +17,7 @@ class HalfCheetah(Task):
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)
-    firm = Firm(k_n=6e4, k_d=3e4, k_t=320, k_limit=2e3, d_limit=2e3, integration=Integration("implicit", 8))
+    firm = Firm(k_n=6e4, k_d=6e4, k_t=900, k_limit=3e3, d_limit=4e3, integration=Integration("implicit", 8))
     obs_dim = 17
     num_random = 18
     start = (0.0, -0.2) + (0.0,) * 16
