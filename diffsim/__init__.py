@@ -67,6 +67,7 @@ def make(
         contact: "soft" (the paper's) or "firm" (as MuJoCo's): the constants of contact and limits and how they are
             integrated; docs/transfer.md has what each costs and how much of a policy's speed is true.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
+        clip_adjoint: see DiffEnv.
         factors: let constants differ between environments: `env.sim.factors`, see Simulator.
 
     Raises:

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from diffsim.integration import Integration, check_count
+from diffsim.integration import Integration, check_count, is_real
 from diffsim.launcher import check_memory
 from diffsim.scene import Scene
 from diffsim.screen import RENDER_MODES, Frames, RenderMode, Screen
@@ -63,6 +63,7 @@ class DiffEnv(VectorEnv):
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
+        clip_adjoint: cut adjoints of states that are longer than this many times the environments' median; default none.
         render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
 
     Attributes:
@@ -99,6 +100,8 @@ class DiffEnv(VectorEnv):
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
         check_memory("start states of a window", num_envs, numbers * dtype.itemsize, check_device(device))
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
+        if clip_adjoint is not None and not (is_real(clip_adjoint) and 0 < clip_adjoint < math.inf):
+            raise ValueError(f"clip_adjoint is {clip_adjoint!r}, must be positive, or None to cut nothing")
         self._clip_adjoint = clip_adjoint
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         if max_episode_steps is not None:
