@@ -63,7 +63,7 @@ class DiffEnv(VectorEnv):
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
-        clip_adjoint: cut adjoints of states that are longer than this many times the environments' median; default none.
+        clip_adjoint: cut adjoints of states that are longer than so many times their median to that; default none.
         render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
 
     Attributes:
