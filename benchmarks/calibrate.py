@@ -38,6 +38,8 @@ from diffsim.training.evaluation import SEED
 STEPS = (3, 6, 12)  # control steps after which the error is measured
 Constant = Literal["k_n", "k_d", "k_t", "mu", "k_limit", "d_limit", "mass", "motor"]
 CONTACT: tuple[Constant, ...] = ("k_n", "k_d", "k_t", "k_limit", "d_limit")
+LAST = f"held-out error after {STEPS[-1] / 60:.2g} s"
+SHOWN = ("task", "reference", "constant", "before", "after", f"{LAST}, before", LAST)
 SKIPPED = 12  # control steps at the start of an episode, which say more of the start state than of the ground
 
 
@@ -195,9 +197,9 @@ def fit(args: Args, name: str, recording: Recording) -> list[Row]:
         own = {"mass": 1.0, "motor": 1.0}.get(constant) or float(np.max(getattr(scene, constant)))
         row: dict[str, object] = {"task": name, "reference": args.recording.name if args.recording else "MuJoCo"}
         row |= {"constant": constant, "before": own, "after": own * factor}
-        for kind, old, new in zip(("", "held out, "), before, after, strict=True):
+        for kind, old, new in zip(("error", "held-out error"), before, after, strict=True):
             for k, a, b in zip(STEPS, old.tolist(), new.tolist(), strict=True):
-                row[f"{kind}error after {k / 60:.2g} s"] = f"{a:.3g} -> {b:.3g}"
+                row |= {f"{kind} after {k / 60:.2g} s, before": a, f"{kind} after {k / 60:.2g} s": b}
         rows.append(row | {"seconds": time.perf_counter() - began})
     return rows
 
@@ -214,8 +216,8 @@ def main(args: Args) -> None:
         assert args.checkpoint
         name, recording = record(args, args.checkpoint)
     rows = fit(args, name, recording)
-    args.merge("calibration", rows, ("task", "reference", "constant"))
-    print(markdown(rows))
+    found = args.merge("calibration", rows, ("task", "reference", "constant"))
+    args.publish("calibration", markdown(found, SHOWN), "transfer.md")
 
 
 if __name__ == "__main__":
