@@ -4,6 +4,7 @@
     python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
     python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
+    python benchmarks/speed.py --parts contact                an iteration of SHAC on soft and on firm ground
     python benchmarks/speed.py --parts scene                  links, spheres, limits, dampers, springs, balls, muscles
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
@@ -27,7 +28,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, get_args
 
 import mujoco
 import numpy as np
@@ -40,6 +41,7 @@ import diffsim
 from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
 from diffsim.launcher import available_cores
+from diffsim.tasks import Contact
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
 from diffsim.training.assess import make_env
@@ -62,7 +64,7 @@ MUSCLE = (  # from a link to the next
 )
 Precision = Literal["float32", "float64"]
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
-Part = Literal["physics", "scaling", "training", "time", "scene"]
+Part = Literal["physics", "scaling", "training", "time", "contact", "scene"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; larger settings of the scaling table are left out
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
@@ -316,6 +318,23 @@ def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
     yield row | {f"published {part}, s (TITAN X)": value for part, value in published.items()}
 
 
+def measure_contact(args: Args, name: TaskName) -> Iterator[Row]:
+    """An iteration of SHAC on soft and on firm ground, each half captured and timed alone."""
+    if not hasattr(diffsim.TASKS[name], "firm"):
+        return
+    times = dict[str, float]()
+    for contact in get_args(Contact):
+        settings = parse_script(shac.Args, ["--env", name, "--device", args.device, "--contact", contact])
+        env = make_env(settings, settings.num_envs, settings.horizon, factors=contact == "firm")
+        learner = shac.SHAC(settings, env)
+        halves = (learner.update_actor, env), (learner.update_critic, None)
+        calls = [graph.capture(half, env.device, stepped) for half, stepped in halves]
+        times[contact] = sum(1e3 * median(timed(call, env.device, warmup=4, calls=20)) for call in calls)
+    row: dict[str, object] = {"task": name, "environments": settings.num_envs}
+    row |= {f"{contact}, ms": ms for contact, ms in times.items()}
+    yield row | {"firm / soft": times["firm"] / times["soft"]}
+
+
 def run_shac(cache: str, directory: Path, arguments: list[str]) -> tuple[float, float]:
     """Seconds from the start of shac.py to the end of its first iteration, and its peak memory in MiB."""
     command = [sys.executable, str(ROOT / "shac.py"), "--run-dir", str(directory), "--quiet", *arguments]
@@ -436,6 +455,7 @@ MEASURES: dict[str, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, 
     "scaling": (measure_scaling, ("task", "environments", "horizon", "technique")),
     "training": (measure_training, ("task", "environments", "device")),
     "time": (measure_time, ("task",)),
+    "contact": (measure_contact, ("task",)),
 }
 
 
@@ -444,7 +464,7 @@ def main(args: Args) -> None:
         report_scene(args)
     for part in (part for part in args.parts if part != "scene"):
         rows = measured(args, "time" if part == "time" else f"speed_{part}", *MEASURES[part])
-        args.publish(part, markdown(rows), "experiments.md")
+        args.publish(part, markdown(rows), "transfer.md" if part == "contact" else "experiments.md")
         if part == "scaling" and rows:
             draw(args, rows)
 
