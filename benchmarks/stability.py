@@ -92,7 +92,8 @@ class Case(motions.Case):
 
 def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
     case = Case(args, name)
-    limit, default = case.kinetic(case.reference, case.actions)[0], case.task.substeps
+    limit = case.kinetic(case.reference, case.actions)[0]
+    default = case.task.integration("default", args.contact).substeps
     for integrator in INTEGRATORS:
         stable: dict[int, bool] = {}
         for count in (c for c in COUNTS if c <= 4 * default and (integrator != "extrapolated" or c % 2 == 0)):

@@ -98,11 +98,11 @@ def simulator(scene: Scene, n: int, how: Integration) -> worlds.Here:
 @pytest.mark.parametrize("name", ["hopper", "half_cheetah", "ant", "humanoid"])
 def test_the_control_reproduces_this_simulator(name: str) -> None:
     """The same scheme in float64 from other code: rounding alone differs, and grows along the motion."""
-    env, *start = states(name, 3)
+    env, *start = states(name, 3, penalty={"d_limit": 500.0})
     scene, how = env.scene, Integration("semi_implicit", env.task.substeps)
     expected = end(worlds.Control(scene, 3, DT, how.substeps), scene, *start, steps=40)
     assert np.abs(end(simulator(scene, 3, how), scene, *start, steps=40) - expected).max() < 1e-11
-    for constant in ("k_n", "k_d", "k_t", "mu", "k_limit"):  # a term that is missing or wrong shows
+    for constant in ("k_n", "k_d", "k_t", "mu", "k_limit", "d_limit"):  # a term that is missing or wrong shows
         changed = dataclasses.replace(scene, **{constant: 0.99 * getattr(scene, constant)})
         error = np.abs(end(simulator(changed, 3, how), scene, *start, steps=40) - expected).max()
         assert error > 1e-5, constant
@@ -110,7 +110,7 @@ def test_the_control_reproduces_this_simulator(name: str) -> None:
 
 def test_the_control_and_the_implicit_integrator_meet_at_first_order() -> None:
     """On ground and limits that are firmer than the file's."""
-    env, *start = states("hopper", 3, penalty={"k_n": 1e5, "k_d": 2e5, "k_limit": 5e3})
+    env, *start = states("hopper", 3, penalty={"k_n": 1e5, "k_d": 2e5, "k_limit": 5e3, "d_limit": 5e3})
     errors = []
     for substeps in (64, 128, 256):
         pair = worlds.Control(env.scene, 3, DT, substeps), simulator(env.scene, 3, Integration("implicit", substeps))
