@@ -218,9 +218,10 @@ def compare(case: Case, args: Args) -> dict[str, Motion]:
 
 def table(rows: list[dict[str, str]]) -> str:
     """A line for each policy: in each world the speed in m/s, or the return of a robot that does not travel, with the
-    share of whole episodes; of the feet penetration, median and 95 %, and slip."""
+    share of whole episodes; of the feet penetration, median and 95 %."""
     groups = dict[tuple[str, ...], dict[str, dict[str, str]]]()
-    for row in rows:
+    tasks = [*diffsim.TASKS]
+    for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft", row["seed"])):
         groups.setdefault(tuple(row[k] for k in KEY[:-1]), {})[row["condition"]] = row
     names = {name for group in groups.values() for name in group if name.startswith("MuJoCo")}
     order = ["here", "finer", "control", *sorted(names, key=lambda name: float(name.partition("x")[2]))]
@@ -242,7 +243,6 @@ def table(rows: list[dict[str, str]]) -> str:
             row = group.get(name, {})
             depths = [f"{float(x):.1f}" for x in (row.get("penetration"), row.get("penetration 95 %")) if x]
             line[f"penetration {name} (mm)"] = " / ".join(depths)
-            line[f"slip {name} (m/s)"] = f"{float(row['slip']):.2f}" if row.get("slip") else ""
         lines.append(line)
     return markdown(lines)
 
