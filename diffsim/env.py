@@ -39,7 +39,7 @@ def clip_adjoint(state: Tensor, most: float) -> Tensor:
     def clip(adjoint: Tensor) -> Tensor:
         norm = torch.linalg.vector_norm(adjoint, dim=1, keepdim=True)
         typical = norm.masked_fill(norm == 0, math.nan).nanmedian()
-        bound = most * typical.nan_to_num(math.inf)
+        bound = most * typical.nan_to_num(math.inf)  # NaN: no row has a length, and none is cut
         return torch.where(norm > bound, adjoint * (bound / norm), adjoint)
 
     state.register_hook(clip)

@@ -69,11 +69,12 @@ class Task:
         """The preset "fast", "default" (the paper's) or "accurate"; with firm contact the first two are one.
 
         Raises:
-            ValueError: another name, or a preset that the task has not.
+            ValueError: another name, or a preset or a contact that the task has not.
         """
+        cls.penalty(contact)
         if accuracy not in get_args(Accuracy):
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
-        if cls.penalty(contact):
+        if contact == "firm":
             firm = cls.firm.integration
             return firm._replace(substeps=4 * firm.substeps) if accuracy == "accurate" else firm
         if accuracy == "default":

@@ -21,8 +21,8 @@ from diffsim.training.gait import describe
 L = TypeVar("L", bound=Learner)
 
 
-def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, factors: bool = False) -> DiffEnv:
-    """The task as the flags ask for it; what is wrong with them ends the script."""
+def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **options: Any) -> DiffEnv:
+    """The task as the flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
     try:
         return diffsim.make(
             args.env,
@@ -35,9 +35,8 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, factor
             theta=args.theta,
             contact=args.contact,
             penalty=parse_penalty(args.penalty),
-            factors=factors,
-            clip_adjoint=getattr(args, "clip_adjoint", 0.0) or None,
             threads=args.threads or None,
+            **options,
         )
     except ValueError as error:
         fail(error)

@@ -237,7 +237,10 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     words = {word.partition("=")[0] for word in argv}
     if chosen := {name: getattr(given, name) for name in ("accuracy", "contact") if flag(name) in words}:
         # A preset replaces the saved numbers.
-        defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
+        presets = _presets(dataclasses.replace(defaults, **chosen))
+        if "contact" not in chosen:
+            presets.pop("randomise", None)
+        defaults = dataclasses.replace(defaults, **presets)
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
     for name in kind.FIXED:

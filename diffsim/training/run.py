@@ -142,11 +142,13 @@ class Run:
         """This rank's share of the training environments, with its own random start states."""
         self._samples = num_envs * horizon
         seed = self.args.seed + distributed.rank() * RANK_SEED
-        args, varied = self.args, False
+        args, options = self.args, dict[str, Any]()
         if isinstance(args, ParallelFlags):
-            varied = args.contact == "firm" or bool(args.randomise)
-        self._env = make_env(args, num_envs // distributed.size(), horizon, seed, varied)
-        if isinstance(args, ParallelFlags) and varied:
+            options = dict(
+                factors=args.contact == "firm" or bool(args.randomise), clip_adjoint=args.clip_adjoint or None
+            )
+        self._env = make_env(args, num_envs // distributed.size(), horizon, seed, **options)
+        if isinstance(args, ParallelFlags) and options["factors"]:
             begin, end = (share * args.iterations for share in args.anneal) if args.contact == "firm" else (0.0, 0.0)
             start = soft_factors(self._env.scene, parse_penalty(args.penalty))
             self._variation = Variation(self._env, start, parse_ranges(args.randomise), (begin, end), args.redraw, seed)

@@ -1,7 +1,7 @@
 """Constants that differ between environments and change over a training: firm contact by degrees, robots of many kinds.
 
-A ground as firm as a real one teaches nothing from the start: its gradients are too steep to find a gait by. A soft one
-teaches gaits that only it can carry. So the constants begin soft, become firm while the policy learns, and are then
+On a ground as firm as a real one gradients are steep before there is a gait. A soft one teaches gaits that only it can
+carry. So the constants begin soft, become firm while the policy learns, and are then
 drawn at random, which keeps the policy from living on one ground's own errors.
 """
 
@@ -98,6 +98,7 @@ class Variation:
         most = [math.log(drawn[name].most) if name in drawn else 0.0 for name in FACTORS]
         self.least, self.width = torch.tensor(least), torch.tensor(most) - torch.tensor(least)
         self.start = torch.tensor([start.get(name, 1.0) for name in FACTORS])
+        self._present: tuple[float, int] | None = None
 
     def progress(self, iteration: int) -> float:
         begin, end = self.span
@@ -105,8 +106,11 @@ class Variation:
 
     def set(self, iteration: int) -> None:
         """The factors (N, len(FACTORS)) of an iteration; between drawings they change by the progress alone."""
-        t = self.progress(iteration)
-        generator = torch.Generator().manual_seed(self.seed + SEEDS * ((iteration - 1) // self.redraw))
+        t, drawing = self.progress(iteration), (iteration - 1) // self.redraw
+        if self._present == (t, drawing):
+            return
+        self._present = t, drawing
+        generator = torch.Generator().manual_seed(self.seed + SEEDS * drawing)
         uniform = torch.rand(self.factors.shape, generator=generator)
         base = torch.where(self.start > 0, self.start.clamp(min=1e-30) ** (1 - t), torch.full_like(self.start, t))
         self.factors.copy_(base * (t * (self.least + self.width * uniform)).exp())

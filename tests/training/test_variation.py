@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from learners import assert_same, refusal, run
+from learners import ROOT, assert_same, refusal, run
 
 import diffsim
 import ppo_baseline
 import shac
 from diffsim import TASKS
 from diffsim.scene import FACTORS
+from diffsim.training import parse
 from diffsim.training.flags import RANDOMISED
 from diffsim.training.variation import Range, Variation, parse_ranges, soft_factors
 
@@ -125,6 +126,12 @@ def test_firm_runs_resume_bitwise_and_are_evaluated_on_firm_ground(tmp_path: Pat
     assert_same(part["modules"], whole["modules"])
     assert whole["args"]["randomise"] == RANDOMISED and whole["args"]["integrator"] == "implicit"
 
+    saved, own = str(tmp_path / "part" / "checkpoint.pt"), ("mass=0.9:1.1",)
+    state = torch.load(saved, weights_only=True)
+    torch.save(state | {"args": state["args"] | {"randomise": own}}, saved)
+    for flags, ranges in (("--accuracy accurate", own), ("--contact soft", ()), ("", own)):
+        assert parse(shac.Args, ["--evaluate", saved, *flags.split()]).randomise == ranges
+
 
 def test_learners_without_gradient_vary_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
@@ -140,3 +147,13 @@ def test_learners_without_gradient_vary_too(tmp_path: Path, monkeypatch: pytest.
     assert len(seen) == 2 and not torch.equal(*seen)
     mass = FACTORS.index("mass")
     assert all((factors[:, mass] != 1).all() and (factors[:, :mass] == 1).all() for factors in seen)
+
+
+def test_the_page_has_the_constants_of_the_tasks() -> None:
+    text = (ROOT / "docs" / "transfer.md").read_text()
+    for name in FIRM:
+        *constants, integration = TASKS[name].firm
+        (row,) = (line for line in text.splitlines() if line.strip().startswith(f"| {name} |") and "substeps" in line)
+        cells = [cell.strip() for cell in row.strip(" |").split("|")]
+        assert list(map(float, cells[1:6])) == constants
+        assert cells[6] == f"{integration.integrator}, {integration.substeps} substeps"
