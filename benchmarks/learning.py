@@ -49,7 +49,10 @@ SAPO_16 = ("sapo", "--integrator", "implicit", "--substeps", "16")  # the humano
 SAPO_CPU = (*SAPO_16, "--iterations", "1000")
 PPO_MANY = (PPO, "--accuracy", "fast", "--num-envs", "4096", "--minibatch-size", "32768", "--entropy-coef", "0.002",
             "--iterations", "2500")
-SHAC_FIRM = ("shac", "--contact", "firm")
+FIRM = ("--contact", "firm")
+SHAC_FIRM = ("shac", *FIRM, "--num-envs", "256")
+PPO_MANY_FIRM = (PPO, *FIRM, *PPO_MANY[3:-2], "--iterations", "1200")
+SAC = "sac_baseline"
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
@@ -69,10 +72,10 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "shac_firm":          SHAC_FIRM,
     "shac_firm_sudden":   (*SHAC_FIRM, "--anneal", "0", "0"),
     "shac_firm_fixed":    (*SHAC_FIRM, "--randomise"),
-    "shac_firm_h16":      (*SHAC_FIRM, "--horizon", "16"),
-    "shac_firm_clip":     (*SHAC_FIRM, "--clip-adjoint", "3"),
-    "sapo_firm":          (*SAPO[:1], *SHAC_FIRM[1:]),
-    "ppo_firm":           (PPO, *SHAC_FIRM[1:]),
+    "shac_firm_h16":      ("shac", *FIRM, "--num-envs", "512", "--horizon", "16", "--iterations", "3000"),
+    "sapo_firm":          ("sapo", *FIRM),
+    "ppo_firm":           PPO_MANY_FIRM,
+    "ppo_firm_sudden":    (*PPO_MANY_FIRM, "--anneal", "0", "0"),
     PPO:                  (PPO,),
     "ppo_256":            (PPO, "--num-envs", "256", "--minibatch-size", "2048", "--entropy-coef", "0"),
     "ppo_4096":           (PPO, "--num-envs", "4096", "--minibatch-size", "32768", "--entropy-coef", "0"),
@@ -112,7 +115,7 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "ablation":      ("SAPO without each of its parts", ("sapo", "sapo_no_entropy", "sapo_no_state_std",
                       "sapo_one_critic", "sapo_elu", "sapo_alone"), ("humanoid",)),
     "firm":          ("Learning through firm contact", ("shac_firm", "shac_firm_sudden", "shac_firm_fixed",
-                      "shac_firm_h16", "shac_firm_clip", "sapo_firm", "ppo_firm"),
+                      "shac_firm_h16", "sapo_firm", "ppo_firm", "ppo_firm_sudden"),
                       ("hopper", "half_cheetah", "ant", "humanoid")),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
 }

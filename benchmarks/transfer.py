@@ -57,6 +57,7 @@ class Args(common.CommonFlags):
     episodes: Count = 64  # start states, the same in every world
     steps: Count = 1000  # control steps at most
     friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # of MuJoCo, in multiples of the file's mu
+    control: bool = True  # run "finer" and "control" too, which check the comparison and take most of its time
     finer: Count = FINER  # steps of "finer" and of the control in multiples of the task's substeps
     video: Path | None = None  # write the episode of median return, here and in MuJoCo side by side: .mp4 or .gif
     curves: bool = False  # draw that episode's speed and penetration against time
@@ -175,9 +176,10 @@ def conditions(case: Case, args: Args) -> Iterator[tuple[str, World]]:
     """The worlds, by the names that the csv gives them."""
     env, scene, n = case.env, case.env.scene, case.env.num_envs
     yield "here", worlds.Here(env.sim)
-    finer = Integration("semi_implicit", args.finer * env.task.substeps)
-    yield "finer", worlds.Here(Simulator(scene, n, finer, env.control_dt, device=env.device))
-    yield "control", worlds.Control(scene, n, env.control_dt, finer.substeps)
+    if args.control:
+        finer = Integration("semi_implicit", args.finer * env.task.substeps)
+        yield "finer", worlds.Here(Simulator(scene, n, finer, env.control_dt, device=env.device))
+        yield "control", worlds.Control(scene, n, env.control_dt, finer.substeps)
     for friction in args.friction if scene.ncontact else (1.0,):
         yield f"MuJoCo x{friction:g}", worlds.MuJoCo(scene, n, env.control_dt, friction)
 

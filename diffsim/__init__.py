@@ -55,7 +55,6 @@ def make(
     max_episode_steps: int | None = None,
     render_mode: RenderMode | None = None,
     factors: bool = False,
-    clip_adjoint: float | None = None,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -67,7 +66,6 @@ def make(
         contact: "soft" (the paper's) or "firm" (as MuJoCo's): the constants of contact and limits and how they are
             integrated; docs/transfer.md has what each costs and how much of a policy's speed is true.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
-        clip_adjoint: see DiffEnv.
         factors: let constants differ between environments: `env.sim.factors`, see Simulator.
 
     Raises:
@@ -94,7 +92,6 @@ def make(
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,
         factors=factors,
-        clip_adjoint=clip_adjoint,
     )
 
 

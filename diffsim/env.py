@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
@@ -14,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from diffsim.integration import Integration, check_count, is_real
+from diffsim.integration import Integration, check_count
 from diffsim.launcher import check_memory
 from diffsim.scene import Scene
 from diffsim.screen import RENDER_MODES, Frames, RenderMode, Screen
@@ -31,19 +30,6 @@ def check_seed(seed: int) -> int:
 
 class ActionError(ValueError):
     """An action that is not a number: the policy that took it has diverged."""
-
-
-def clip_adjoint(state: Tensor, most: float) -> Tensor:
-    """The state (N, ...) itself; rows of its adjoint longer than `most` times their median length are cut to that."""
-
-    def clip(adjoint: Tensor) -> Tensor:
-        norm = torch.linalg.vector_norm(adjoint, dim=1, keepdim=True)
-        typical = norm.masked_fill(norm == 0, math.nan).nanmedian()
-        bound = most * typical.nan_to_num(math.inf)  # NaN: no row has a length, and none is cut
-        return torch.where(norm > bound, adjoint * (bound / norm), adjoint)
-
-    state.register_hook(clip)
-    return state
 
 
 class DiffEnv(VectorEnv):
@@ -63,7 +49,6 @@ class DiffEnv(VectorEnv):
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
-        clip_adjoint: cut adjoints of states that are longer than so many times their median to that; default none.
         render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
 
     Attributes:
@@ -94,15 +79,11 @@ class DiffEnv(VectorEnv):
         max_episode_steps: int | None = None,
         render_mode: RenderMode | None = None,
         factors: bool = False,
-        clip_adjoint: float | None = None,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
         check_memory("start states of a window", num_envs, numbers * dtype.itemsize, check_device(device))
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
-        if clip_adjoint is not None and not (is_real(clip_adjoint) and 0 < clip_adjoint < math.inf):
-            raise ValueError(f"clip_adjoint is {clip_adjoint!r}, must be positive, or None to cut nothing")
-        self._clip_adjoint = clip_adjoint
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         if max_episode_steps is not None:
             self.episode_length = check_count("max_episode_steps", max_episode_steps)
@@ -207,9 +188,6 @@ class DiffEnv(VectorEnv):
             )
         self._recorded += recorded
         self.qpos, self.qvel = self.sim.step(self.qpos, self.qvel, action)
-        if self._clip_adjoint and recorded:
-            state = clip_adjoint(torch.cat((self.qpos, self.qvel), 1), self._clip_adjoint)
-            self.qpos, self.qvel = state.split((self.scene.nq, self.scene.nv), 1)
         nonfinite = self.sim.nonfinite.clone()
         self._obs = obs = self.task.observe(self.qpos, self.qvel, action)
         reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)

@@ -145,8 +145,6 @@ class ParallelFlags(Flags):
     """parallel environments N, over all processes of torchrun (per task)"""
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
-    clip_adjoint: NonNegative = 0.0
-    """adjoints of a state longer than this many times the environments' median are cut to that (0: none)"""
     anneal: tuple[Fraction, Fraction] = (0.2, 0.55)
     """with --contact firm, shares of the iterations between which contact goes from soft to firm"""
     randomise: tuple[str, ...] = ()

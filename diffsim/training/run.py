@@ -144,9 +144,7 @@ class Run:
         seed = self.args.seed + distributed.rank() * RANK_SEED
         args, options = self.args, dict[str, Any]()
         if isinstance(args, ParallelFlags):
-            options = dict(
-                factors=args.contact == "firm" or bool(args.randomise), clip_adjoint=args.clip_adjoint or None
-            )
+            options["factors"] = args.contact == "firm" or bool(args.randomise)
         self._env = make_env(args, num_envs // distributed.size(), horizon, seed, **options)
         if isinstance(args, ParallelFlags) and options["factors"]:
             begin, end = (share * args.iterations for share in args.anneal) if args.contact == "firm" else (0.0, 0.0)
