@@ -81,6 +81,8 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "ppo_4096":           (PPO, "--num-envs", "4096", "--minibatch-size", "32768", "--entropy-coef", "0"),
     **{f"ppo_e{c}":       (PPO, "--entropy-coef", c) for c in ("0", "0.002", "0.005", "0.01", "0.02")},
     "bptt":               ("bptt",),
+    "pods":               ("pods",),
+    "pods_second":        ("pods", "--order", "2"),
     "sapo":               SAPO,
     "ppo_many":           PPO_MANY,
     "ppo_many_symmetric": (*PPO_MANY, "--symmetric"),
@@ -98,7 +100,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation", "firm",
+    "ablation", "firm", "orders",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -117,6 +119,8 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "firm":          ("Learning through firm contact", ("shac_firm", "shac_firm_sudden", "shac_firm_fixed",
                       "shac_firm_h16", "sapo_firm", "ppo_firm", "ppo_firm_sudden"),
                       ("hopper", "half_cheetah", "ant", "humanoid")),
+    "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"),
+                      ("cartpole", "half_cheetah", "ant")),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
 }
 # fmt: on
@@ -126,6 +130,9 @@ RESULT_COLUMNS = ("task", "seeds", *KEPT[:2], "published", "training (s)", "retu
 SETTINGS = ("integrator", "substeps", "seeds", "iterations", "training (s)")
 GATE_COLUMNS = ("machine", "task", "learner", *SETTINGS, *KEPT, "gate", "in the reference")  # the gate: 97 % is kept
 MUSCLE_COLUMNS = ("machine", "learner", *SETTINGS, *KEPT[:2], "speed (m/s)", "falls per episode", "return passes")
+
+ORDER_COLUMNS = ("task", "learner", *SETTINGS[2:], *KEPT[:2], "return passes", "kept")
+PAGES = {"muscles": ("humanoid_mtu", MUSCLE_COLUMNS), "orders": ("pods", ORDER_COLUMNS)}  # experiments with their own
 
 
 @dataclass
@@ -236,10 +243,12 @@ def report(args: Args, name: Name) -> None:
     if name == "accuracy":
         text = markdown(summaries(args, ("shac", *PRESETS), tasks), GATE_COLUMNS)
         return args.publish("learning", text, "accuracy.md", everywhere=True)
-    if name == "muscles":
-        text = markdown(summaries(args, learners, tasks), MUSCLE_COLUMNS)
-        args.publish("results", text, "humanoid_mtu.md", everywhere=True)
-        return draw(args, "humanoid_mtu", learners, tasks)
+    if name in PAGES:
+        page, columns = PAGES[name]
+        everywhere, rows = "machine" in columns, summaries(args, learners, tasks)
+        rows = [row for row in rows if everywhere or row["machine"] == args.directory.name]
+        args.publish("results", markdown(rows, columns), f"{page}.md", everywhere)
+        return draw(args, page, learners, tasks)
     rows = table(args, learners, tasks)
     args.publish(name, f"{markdown(rows)}\n![{title}]({args.link(name)})\n", "experiments.md")
     if compared := [env for env in tasks if env in {row["task"] for row in rows}]:
