@@ -83,6 +83,11 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "bptt":               ("bptt",),
     "pods":               ("pods",),
     "pods_second":        ("pods", "--order", "2"),
+    SAC:                  (SAC,),
+    "sac_large":          (SAC, "--large-batch", "--accuracy", "fast"),
+    "redq":               (SAC, "--critics", "10", "--critic-subset", "2", "--updates-per-step", "20"),
+    "mbpo":               ("mbpo",),
+    "se_mbpo":            ("mbpo", "--sample-enhance", "4"),
     "sapo":               SAPO,
     "ppo_many":           PPO_MANY,
     "ppo_many_symmetric": (*PPO_MANY, "--symmetric"),
@@ -124,7 +129,14 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
 }
 # fmt: on
-LEARNER_PAGES = {"shac": "shac.md", "sapo": "sapo.md", PPO: "ppo.md", "bptt": "bptt.md"}
+LEARNER_PAGES = {
+    SAC: "sac.md",
+    "shac": "shac.md",
+    "sapo": "sapo.md",
+    PPO: "ppo.md",
+    "bptt": "bptt.md",
+    "mbpo": "mbpo.md",
+}
 KEPT = ("return", "each seed", "explicit, substeps x4", "kept")
 RESULT_COLUMNS = ("task", "seeds", *KEPT[:2], "published", "training (s)", "return passes", "kept")
 SETTINGS = ("integrator", "substeps", "seeds", "iterations", "training (s)")

@@ -1,0 +1,538 @@
+"""MBPO, Model-Based Policy Optimization (Janner et al. 2019, https://arxiv.org/abs/1906.08253), and SE-MBPO.
+
+An ensemble of networks learns the dynamics; SAC learns from short rollouts of it, branched from real states. With
+--sample-enhance (Qiao et al. 2021, https://arxiv.org/abs/2109.07719) the simulator's exact Jacobians add transitions
+around each real one.
+
+    python mbpo.py --env ant --seed 1                        train; writes runs/ant__mbpo__1__<time>/
+    python mbpo.py --env ant --sample-enhance 4              SE-MBPO: four more transitions around each real one
+    python mbpo.py --resume <run>/checkpoint.pt              continue an interrupted run exactly
+    python mbpo.py --evaluate <run>/checkpoint.pt            evaluate its deterministic policy
+"""
+
+from __future__ import annotations
+
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from diffsim.planning import Dynamics
+from diffsim.training import (
+    ClippedAdam,
+    Count,
+    Ensemble,
+    Fraction,
+    Natural,
+    ObsNormalizer,
+    ParallelFlags,
+    Positive,
+    Run,
+    Stateful,
+    Widths,
+    distributed,
+    episode_metrics,
+    evaluate,
+    evaluate_checkpoint,
+    fail,
+    parse,
+)
+
+# Policies and values: as SAC's, from Table 3 of the SHAC paper. Rollout lengths: MBPO's released settings.
+# fmt: off
+COLUMNS = ("hidden", "model_hidden", "rollout_lengths", "num_envs", "actor_lr", "temperature_lr", "iterations")
+PER_TASK = {
+    "cartpole":     ((64, 64),             (128, 128),           (1, 5),  16, 1e-3, 1e-3,   200),
+    "hopper":       ((256, 128, 64),       (200, 200, 200, 200), (1, 15), 64, 5e-4, 5e-4, 2_000),
+    "half_cheetah": ((256, 128, 64),       (200, 200, 200, 200), (1, 1),  64, 5e-4, 5e-4, 2_000),
+    "ant":          ((256, 128, 64),       (200, 200, 200, 200), (1, 25), 64, 5e-4, 5e-4, 2_000),
+    "humanoid":     ((512, 256),           (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
+    "humanoid_mtu": ((512, 512, 512, 256), (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
+}
+# fmt: on
+SIZES = ("buffer_size", "branches", "rollout_lengths", "retain")  # of buffers
+LOG_STD = (-5.0, 2.0)  # bounds of the policy's log standard deviation
+LOG_VAR = (-10.0, 0.5)  # where the bounds of the models' log variance begin, in normalized units
+BOUND_WEIGHT = 0.01  # of the pull that closes them
+HELD_OUT = 10  # one environment of so many is kept from learning; their transitions measure the models
+HELD_OUT_BATCH = 1024
+
+
+@dataclass
+class Args(ParallelFlags):
+    """The algorithm. Defaults: of a task that is not in the table."""
+
+    FIXED = (*ParallelFlags.FIXED, "hidden", "model_hidden", "models", "elites", *SIZES)
+
+    iterations: Count = 2_000
+    """learning iterations (per task)"""
+    num_envs: Count = 64
+    """parallel environments N, one in ten of which is held out (per task)"""
+    steps: Count = 16
+    """control steps of an iteration (1/60 s each)"""
+    seed_steps: Natural = 64
+    """control steps of each environment with random actions before anything is learnt"""
+    buffer_size: Count = 1_000_000
+    """real transitions that are kept, over all environments"""
+    models: Count = 7
+    """networks of the ensemble"""
+    elites: Count = 5
+    """of which so many, those that predict held-out transitions best, make the rollouts"""
+    model_hidden: Widths = (200, 200, 200, 200)
+    """units of the models' hidden layers (per task)"""
+    model_updates: Count = 50
+    """gradient updates of the models in an iteration"""
+    model_batch_size: Count = 256
+    """samples of each model in such an update"""
+    model_lr: Positive = 1e-3
+    """learning rate of the models"""
+    branches: Count = 1000
+    """rollouts that each elite makes at once, branched from real states"""
+    rollout_lengths: tuple[Count, Count] = (1, 1)
+    """steps of a rollout at first and from the middle of the iterations on, with a linear rise between (per task)"""
+    retain: Count = 4
+    """iterations whose rollouts are kept"""
+    sample_enhance: Natural = 0
+    """SE-MBPO: so many transitions around each real one, by the simulator's Jacobians (0: MBPO)"""
+    enhance_scale: Positive = 0.2
+    """their distance: of states in control steps' root mean square change, of actions in units before tanh"""
+    updates: Count = 160
+    """gradient updates of actor, critics and temperature in an iteration"""
+    batch_size: Count = 256
+    """samples of such an update"""
+    real_ratio: Fraction = 0.05
+    """share of them that are real"""
+    hidden: Widths = (256, 128, 64)
+    """units of the hidden layers of actor and critics (per task)"""
+    actor_lr: Positive = 5e-4
+    """learning rate of actor and critics (per task)"""
+    temperature_lr: Positive = 5e-4
+    """learning rate of the temperature's logarithm (per task)"""
+    initial_temperature: Positive = 1.0
+    """initial weight of the entropy"""
+    gamma: Fraction = 0.99
+    """discount factor"""
+    tau: Fraction = 0.005
+    """target critics <- (1 - tau) target critics + tau critics, after each update"""
+    max_grad_norm: Positive = 100.0
+    """gradients are clipped to this norm, which those of large values reach"""
+    save_every: Natural = 500
+    """save the checkpoint, which holds the buffers, every this many iterations (0: only at the end)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        return dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+
+    def check(self) -> None:
+        super().check()
+        if distributed.size() > 1:
+            fail("one process alone: a replay buffer is not shared among ranks")
+        if self.num_envs < 2:
+            fail("--num-envs must be at least 2: one environment is held out")
+        if self.elites > self.models:
+            fail(f"--elites {self.elites} are more than --models {self.models}")
+        if self.rollout_lengths[0] > self.rollout_lengths[1]:
+            fail(f"--rollout-lengths {self.rollout_lengths[0]} {self.rollout_lengths[1]} are the wrong way round")
+        if self.buffer_size < (rows := self.num_envs * (1 + self.sample_enhance)):
+            fail(f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a control step")
+        if self.sample_enhance and (self.contact == "firm" or self.randomise):
+            fail("--sample-enhance takes Jacobians of one robot: neither --contact firm nor --randomise goes with it")
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+def mlp(inputs: int, hidden: Widths, outputs: int | None, activation: type[nn.Module]) -> nn.Sequential:
+    """Linear and activation per hidden layer, and a linear output, if any."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), activation()]
+        inputs = width
+    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
+
+
+class Actor(nn.Module):
+    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.normalizer = ObsNormalizer(obs_dim)
+        self.body = mlp(obs_dim, args.hidden, None, nn.ReLU)
+        self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
+
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Of normalized observations (..., obs_dim): sampled actions (..., action_dim), their log density (...)."""
+        features = self.body(obs)
+        log_std = self.log_std(features).clamp(*LOG_STD)
+        noise = torch.randn_like(log_std)
+        u = self.mean(features) + log_std.exp() * noise
+        log_slope = 2 * (math.log(2) - u - F.softplus(-2 * u))  # of tanh
+        density = -0.5 * noise.square() - 0.5 * math.log(2 * math.pi) - log_std - log_slope
+        return torch.tanh(u), density.sum(-1)
+
+    def deterministic(self) -> nn.Sequential:
+        """The action without noise, of observations as they come, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
+
+
+class Temperature(nn.Module):
+    """The weight of the entropy."""
+
+    def __init__(self, args: Args) -> None:
+        super().__init__()
+        self.log = nn.Parameter(torch.full((), math.log(args.initial_temperature)))
+
+
+class Models(nn.Module):
+    """p(s' - s, r | s, a): Gaussians of E networks, in units in which changes and rewards have variance 1."""
+
+    elites: Tensor
+    fits: Tensor
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        size = obs_dim + 1
+        networks = [mlp(obs_dim + action_dim, args.model_hidden, 2 * size, nn.SiLU) for _ in range(args.models)]
+        self.ensemble = Ensemble(networks)
+        self.least, self.most = (nn.Parameter(torch.full((size,), bound)) for bound in LOG_VAR)
+        self.target = ObsNormalizer(size)
+        self.register_buffer("elites", torch.arange(args.elites))
+        self.register_buffer("fits", torch.zeros(()))  # iterations in which they learnt
+
+    def forward(self, obs: Tensor, action: Tensor, which: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Of normalized observations and actions (E, B, ...): mean and log variance (E, B, obs_dim + 1).
+
+        The first size runs over all networks, or over those named.
+        """
+        named = self.ensemble.named_parameters()
+        weights: dict[str, Tensor] = {name: weight if which is None else weight[which] for name, weight in named}
+        mean, log_var = functional_call(self.ensemble, weights, torch.cat((obs, action), -1)).chunk(2, -1)
+        log_var = self.most - F.softplus(self.most - log_var)
+        return mean, self.least + F.softplus(log_var - self.least)
+
+    @torch.no_grad()
+    def predict(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Sampled change of the observation (B, obs_dim) and reward (B,); each elite predicts an equal part of them."""
+        parts = [x.unflatten(0, (len(self.elites), -1)) for x in (obs, action)]
+        mean, log_var = (x.flatten(0, 1) for x in self(*parts, self.elites))
+        drawn = self.target.inverse(mean + (0.5 * log_var).exp() * torch.randn_like(mean))
+        return drawn[:, :-1], drawn[:, -1]
+
+
+def gaussian_nll(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
+    """-log N(target; mean, exp(log_var)) of each number."""
+    return 0.5 * ((target - mean).square() * (-log_var).exp() + log_var + math.log(2 * math.pi))
+
+
+# Buffers --------------------------------------------------------------------------------------------------------------
+
+
+class Transition(NamedTuple):
+    """What a learner needs of control steps: (B, ...)."""
+
+    obs: Tensor
+    action: Tensor
+    reward: Tensor
+    next_obs: Tensor  # before any reset
+    terminated: Tensor  # 1 where the episode failed, 0 where it went on or its time ran out
+
+
+class ReplayBuffer(nn.Module):
+    """The last transitions, on the device; adding and sampling wait for nothing, so both can be captured."""
+
+    rows: Tensor
+    count: Tensor
+
+    def __init__(self, size: int, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.size, self.widths = size, (obs_dim, action_dim, 1, obs_dim, 1)
+        self.register_buffer("rows", torch.zeros(size, sum(self.widths)), persistent=False)
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64))  # of transitions ever added
+
+    def add(self, transitions: Transition) -> None:
+        columns = [tensor.flatten(1) if tensor.dim() > 1 else tensor.unsqueeze(1) for tensor in transitions]
+        place = (self.count + torch.arange(len(columns[0]), device=self.count.device)) % self.size
+        self.rows.index_copy_(0, place, torch.cat(columns, 1))
+        self.count += len(columns[0])
+
+    def sample(self, number: int) -> Transition:
+        """Drawn uniformly, with repetition."""
+        filled = self.count.clamp(max=self.size)
+        place = (torch.rand(number, device=self.count.device, dtype=torch.float64) * filled).long()
+        obs, action, reward, next_obs, terminated = self.rows[place].split(self.widths, 1)
+        return Transition(obs, action, reward.squeeze(1), next_obs, terminated.squeeze(1))
+
+    def get_extra_state(self) -> Tensor:
+        """The rows that are filled: a checkpoint holds no others."""
+        return self.rows[: min(int(self.count), self.size)]
+
+    def set_extra_state(self, rows: Tensor) -> None:
+        self.rows[: len(rows)] = rows
+
+
+def enhance(dynamics: Dynamics, x: Tensor, action: Tensor, samples: int, scale: float) -> tuple[Tensor, ...]:
+    """Steps near those from states x (n, nx) with actions (n, nu), to first order; all in float64.
+
+    x + d -> f(x, u) + J d, where u = artanh(action), so no action leaves its bounds, and d is a random tangent vector.
+
+    Returns:
+        States, actions and next states (samples, n, ...); whether the given steps are finite (n,).
+    """
+    u = action.clamp(-1 + 1e-6, 1 - 1e-6).atanh()
+    following, _, finite = dynamics.rollout(x, 1, lambda *_: u)
+    following = following[:, 1]
+    change = dynamics.difference(following, x).square().mean(0).sqrt()  # of a control step: a scale for each number
+    d = scale * torch.randn(samples, len(x), dynamics.nd + dynamics.nu, dtype=x.dtype, device=x.device)
+    d[..., : dynamics.nd] *= change
+    end = (dynamics.jacobians(x, u, following) @ d.unsqueeze(-1)).squeeze(-1)
+    start, push = d.split((dynamics.nd, dynamics.nu), -1)
+    return dynamics.retract(x, start), (u + push).tanh(), dynamics.retract(following, end), finite[:, 0]
+
+
+# The algorithm --------------------------------------------------------------------------------------------------------
+
+
+class MBPO:
+    """All that the next iteration depends on.
+
+    Its methods change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
+    """
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        self.held_out = -(-args.num_envs // HELD_OUT)
+        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        critics = [mlp(obs_dim + action_dim, args.hidden, 1, nn.ReLU) for _ in range(2)]
+        self.critics = Ensemble(critics).to(env.device)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.temperature = Temperature(args).to(env.device)
+        self.models = Models(args, obs_dim, action_dim).to(env.device)
+        self.policy = self.actor.deterministic()
+        self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.actor_lr)
+        self.critic_optimizer = ClippedAdam(self.critics, args.max_grad_norm, lr=args.actor_lr)
+        self.temperature_optimizer = ClippedAdam(self.temperature, args.max_grad_norm, lr=args.temperature_lr)
+        self.model_optimizer = ClippedAdam(self.models, args.max_grad_norm, lr=args.model_lr)
+        imagined = args.retain * args.elites * args.branches * args.rollout_lengths[1]
+        held_out = max(args.steps * self.held_out, args.buffer_size // HELD_OUT)
+        sizes = (args.buffer_size, held_out, imagined)
+        self.real, self.unseen, self.imagined = (
+            ReplayBuffer(size, obs_dim, action_dim).to(env.device) for size in sizes
+        )
+        if args.sample_enhance:
+            integration, threads = env.sim.integration, args.threads or None
+            self.dynamics = Dynamics(env.scene, integration, env.control_dt, env.device, threads)
+        self.modules: dict[str, Stateful] = {
+            "actor": self.actor,
+            "critics": self.critics,
+            "targets": self.targets,
+            "temperature": self.temperature,
+            "models": self.models,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+            "model_optimizer": self.model_optimizer,
+            "real": self.real,
+            "unseen": self.unseen,
+            "imagined": self.imagined,
+        }
+
+    # Real transitions ------------------------------------------------------------------------------------------------
+
+    def explore(self) -> dict[str, Tensor]:
+        """Control steps with uniformly random actions."""
+        return self.act(random=True)
+
+    def collect(self) -> dict[str, Tensor]:
+        """Control steps with the policy."""
+        return self.act(random=False)
+
+    @torch.no_grad()
+    def act(self, random: bool) -> dict[str, Tensor]:
+        """Control steps of all environments into the buffers."""
+        env, steps = self.env, []
+        obs = env.detach()
+        for _ in range(self.args.steps):
+            if random:
+                action = 2 * torch.rand(env.num_envs, env.scene.nu, device=env.device) - 1
+            else:
+                action, _ = self.actor(self.actor.normalizer(obs))
+            state = torch.cat((env.qpos, env.qvel), 1) if self.args.sample_enhance else None
+            next_obs, reward, terminated, truncated, info = env.step(action)
+            made = Transition(obs, action, reward, info["final_obs"], terminated.to(reward.dtype))
+            self.unseen.add(Transition(*(x[: self.held_out] for x in made)))
+            seen = Transition(*(x[self.held_out :] for x in made))
+            self.real.add(seen)
+            if state is not None:
+                self.real.add(self.around(state[self.held_out :], seen))
+            self.actor.normalizer.update(obs)
+            self.models.target.update(self.changes(seen))
+            episode = info["episode"]
+            steps.append((terminated | truncated, info["nonfinite"], episode["r"], episode["l"]))
+            obs = next_obs
+        done, nonfinite, returns, lengths = (torch.stack(tensors) for tensors in zip(*steps, strict=True))
+        found = episode_metrics(env, done, {"r": returns, "l": lengths}, nonfinite)
+        optimizers = (self.actor_optimizer, self.critic_optimizer, self.model_optimizer)
+        return found | {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
+
+    def around(self, state: Tensor, made: Transition) -> Transition:
+        """SE-MBPO: transitions near real ones, observed and rewarded as the task does."""
+        task, args, nq = self.env.task, self.args, self.env.scene.nq
+        doubled = state.double(), made.action.double()
+        *near, finite = enhance(self.dynamics, *doubled, args.sample_enhance, args.enhance_scale)
+        start, action, end = (x.to(state.dtype) for x in near)
+
+        def observe(x: Tensor, action: Tensor) -> Tensor:
+            return task.observe(x[..., :nq], x[..., nq:], action)
+
+        # A part of the observation may be the action before, which stays as it was.
+        obs = made.obs + observe(start, 0 * action) - observe(state, 0 * made.action)
+        next_obs = observe(end, action)
+        reward, terminated = task.reward(next_obs, action) * finite, task.terminated(next_obs) | ~finite
+        parts = Transition(obs, action, reward, next_obs, terminated.to(reward.dtype))
+        return Transition(*(x.flatten(0, 1) for x in parts))
+
+    # Models ----------------------------------------------------------------------------------------------------------
+
+    def changes(self, batch: Transition) -> Tensor:
+        """What the models predict (B, obs_dim + 1)."""
+        return torch.cat((batch.next_obs - batch.obs, batch.reward.unsqueeze(1)), 1)
+
+    def fit(self) -> dict[str, Tensor]:
+        """Descend each model's negative log likelihood, on samples of its own; then choose the elites."""
+        args, models, losses = self.args, self.models, []
+        for _ in range(args.model_updates):
+            batch = self.real.sample(args.models * args.model_batch_size)
+            target = models.target(self.changes(batch))
+            each = (self.actor.normalizer(batch.obs), batch.action, target)
+            obs, action, target = (x.unflatten(0, (args.models, -1)) for x in each)
+            mean, log_var = models(obs, action)
+            nll = gaussian_nll(mean, log_var, target)
+            width = (models.most - models.least).sum()
+            self.model_optimizer.step(nll.mean((1, 2)).sum() + BOUND_WEIGHT * width)
+            losses.append(nll.detach().mean())
+        with torch.no_grad():
+            batch = self.unseen.sample(HELD_OUT_BATCH)
+            obs, action = self.actor.normalizer(batch.obs), batch.action
+            mean, _ = models(*(x.expand(args.models, *x.shape) for x in (obs, action)))
+            error = (mean - models.target(self.changes(batch))).square().mean(1)  # (models, obs_dim + 1)
+            models.elites.copy_(error.mean(1).topk(args.elites, largest=False).indices)
+            models.fits += 1
+            chosen = error[models.elites].mean(0)
+        found = {"models/train_nll": torch.stack(losses).mean(), "models/holdout_mse": chosen[:-1].mean()}
+        return found | {"models/holdout_reward_mse": chosen[-1]}
+
+    @torch.no_grad()
+    def imagine(self) -> dict[str, Tensor]:
+        """Rollouts of the elites with the policy, branched from real states; one that ends is followed by another."""
+        args, task, models = self.args, self.env.task, self.models
+        least, most = args.rollout_lengths
+        length = (least + (most - least) * (2 * models.fits / args.iterations).clamp(max=1.0)).floor()
+        obs = self.real.sample(args.elites * args.branches).obs
+        age = torch.zeros_like(obs[:, 0])
+        for _ in range(most):
+            order = torch.rand(len(obs), device=obs.device).argsort()  # each step another elite's
+            obs, age = obs[order], age[order] + 1
+            seen = self.actor.normalizer(obs)
+            action, _ = self.actor(seen)
+            change, reward = models.predict(seen, action)
+            next_obs = obs + change
+            terminated = task.terminated(next_obs)
+            self.imagined.add(Transition(obs, action, reward, next_obs, terminated.to(reward.dtype)))
+            over = terminated | (age >= length)
+            obs = torch.where(over.unsqueeze(1), self.real.sample(len(obs)).obs, next_obs)
+            age = age.masked_fill(over, 0.0)
+        return {"models/rollout_length": length}
+
+    # SAC -------------------------------------------------------------------------------------------------------------
+
+    def update(self) -> dict[str, Tensor]:
+        """SAC on a mixture of imagined and real transitions."""
+        metrics = []
+        for _ in range(self.args.updates):
+            batch = self.mixture()
+            obs, next_obs = (self.actor.normalizer(x) for x in (batch.obs, batch.next_obs))
+            metrics.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
+        found = {name: torch.stack([row[name] for row in metrics]).mean() for name in metrics[0]}
+        return found | {"charts/temperature": self.temperature.log.detach().exp()}
+
+    def mixture(self) -> Transition:
+        size = self.args.batch_size
+        real = round(self.args.real_ratio * size)
+        parts = self.real.sample(real), self.imagined.sample(size - real)
+        return Transition(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
+
+    def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
+        """Descend the soft Bellman residual, and let the target critics follow."""
+        args = self.args
+        with torch.no_grad():
+            action, density = self.actor(next_obs)
+            value = self.values(self.targets, next_obs, action).amin(0) - self.temperature.log.exp() * density
+            target = soft_bellman(batch.reward, value, batch.terminated, args.gamma)
+        values = self.values(self.critics, obs, batch.action)
+        loss = (values - target).square().mean(1).sum()
+        norm = self.critic_optimizer.step(loss)
+        for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
+            slow.lerp_(fast.detach(), args.tau)
+        return {"losses/critic": loss.detach() / 2, "charts/value": values.detach().mean(), "grad/norm": norm}
+
+    def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
+        """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
+        action, density = self.actor(obs)
+        value = self.values(self.critics, obs, action).amin(0)
+        loss = (self.temperature.log.detach().exp() * density - value).mean()
+        self.actor_optimizer.step(loss)
+        surplus = action.shape[1] - density.detach().mean()  # of entropy over the target
+        self.temperature_optimizer.step(self.temperature.log.exp() * surplus)
+        return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
+
+    def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
+        """Each critic's Q(s, a) (2, B)."""
+        inputs = torch.cat((obs, action), -1)
+        return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
+
+
+def soft_bellman(reward: Tensor, next_soft_value: Tensor, terminated: Tensor, gamma: float) -> Tensor:
+    """r + gamma V(s'), without a value after a failure; where time ran out the episode could have gone on."""
+    return reward + gamma * (1 - terminated) * next_soft_value
+
+
+# The run --------------------------------------------------------------------------------------------------------------
+
+
+def train(args: Args) -> None:
+    run = Run(args)
+    env, eval_env = run.make_env(args.num_envs, args.steps), run.make_eval_env()
+    mbpo = run.restore(MBPO(args, env))
+    explore, collect = run.capture(mbpo.explore, env), run.capture(mbpo.collect, env)
+    learn = [run.capture(part) for part in (mbpo.fit, mbpo.imagine, mbpo.update)]
+    for iteration in run:
+        if iteration * args.steps <= args.seed_steps:
+            run.log(explore())
+        else:
+            metrics = collect()
+            for part in learn:
+                metrics |= part()
+            run.log(metrics)
+        if run.evaluation_due:
+            run.log_evaluation(evaluate(eval_env, mbpo.policy))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(Args, argv)
+    if args.evaluate:
+        evaluate_checkpoint(args)
+    else:
+        train(args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,375 @@
+"""SAC, Soft Actor-Critic (Haarnoja et al. 2018, https://arxiv.org/abs/1812.05905), the off-policy baseline, and REDQ.
+
+It acts in the same environments as the other learners, without their gradients, and learns from a replay buffer on the
+device. REDQ (Chen et al. 2021, https://arxiv.org/abs/2101.05982) is the same script with more critics and updates.
+
+    python sac_baseline.py --env ant --seed 1                train; writes runs/ant__sac_baseline__1__<time>/
+    python sac_baseline.py --env ant --critics 10 --critic-subset 2 --updates-per-step 20         REDQ
+    python sac_baseline.py --resume <run>/checkpoint.pt      continue an interrupted run exactly
+    python sac_baseline.py --evaluate <run>/checkpoint.pt    evaluate its deterministic policy
+"""
+
+from __future__ import annotations
+
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from diffsim.training import (
+    ClippedAdam,
+    Count,
+    Ensemble,
+    Fraction,
+    Natural,
+    ObsNormalizer,
+    ParallelFlags,
+    Positive,
+    Run,
+    Stateful,
+    Widths,
+    distributed,
+    episode_metrics,
+    evaluate,
+    evaluate_checkpoint,
+    fail,
+    parse,
+)
+
+# Table 3 of the SHAC paper; networks, seed steps, hopper and half_cheetah: its authors' released settings.
+# fmt: off
+COLUMNS = ("hidden", "num_envs", "batch_size", "temperature_lr", "actor_lr", "critic_lr", "seed_steps", "iterations")
+PER_TASK = {
+    "cartpole":     ((64, 64),              32, 1024, 5e-3, 5e-4, 5e-4, 640,  4_000),
+    "hopper":       ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 5e-4, 640, 20_000),
+    "half_cheetah": ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 5e-4, 640, 20_000),
+    "ant":          ((256, 128, 64),       128, 4096, 5e-3, 5e-4, 5e-4, 640, 20_000),
+    "humanoid":     ((512, 256),            64, 2048, 2e-4, 3e-4, 3e-4, 256, 20_000),
+    "humanoid_mtu": ((512, 512, 512, 256), 256, 4096, 2e-4, 3e-4, 3e-4, 256, 40_000),
+}
+# fmt: on
+# Chosen here, on hopper, ant and humanoid: on a GPU a step of 1,024 environments costs as much as one of 64.
+LARGE_BATCH: dict[str, Any] = {
+    "num_envs": 1024,
+    "batch_size": 8192,
+    "updates_per_step": 4,
+    "actor_updates": 2,
+    "iterations": 800,
+}
+LARGE_BATCH |= {"layer_norm": True, "gamma": 0.98, "tau": 0.05}
+CPU = {"num_envs": 64, "batch_size": 512, "updates_per_step": 2, "actor_updates": 1}  # of those, at most
+LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
+
+
+@dataclass
+class Args(ParallelFlags):
+    """The algorithm. Defaults: of a task that is not in the table."""
+
+    FIXED = (*ParallelFlags.FIXED, "hidden", "critics", "layer_norm", "buffer_size")
+
+    iterations: Count = 20_000
+    """learning iterations, `steps` control steps of all environments with their updates each (per task)"""
+    large_batch: bool = False
+    """many environments, large batches, layer-normalized critics: hopper, ant and humanoid in minutes of a GPU"""
+    num_envs: Count = 64
+    """parallel environments N (per task)"""
+    steps: Count = 32
+    """control steps of an iteration (1/60 s each)"""
+    updates_per_step: Count = 1
+    """gradient updates of the critics after each control step of all environments"""
+    actor_updates: Count = 1
+    """of which so many, the last ones, also update the actor and the temperature"""
+    batch_size: Count = 2048
+    """samples of an update (per task)"""
+    buffer_size: Count = 1_000_000
+    """transitions in the replay buffer, over all environments"""
+    seed_steps: Natural = 640
+    """control steps of each environment with random actions before the first update (per task)"""
+    hidden: Widths = (256, 128, 64)
+    """units of the hidden layers of actor and critics (per task)"""
+    critics: Count = 2
+    """value functions"""
+    critic_subset: Count = 2
+    """the target is the least of so many, drawn anew for each update"""
+    layer_norm: bool = False
+    """normalize the critics' hidden layers, which steadies many updates on large batches"""
+    actor_lr: Positive = 5e-4
+    """learning rate of the actor (per task)"""
+    critic_lr: Positive = 5e-4
+    """learning rate of the critics (per task)"""
+    temperature_lr: Positive = 5e-3
+    """learning rate of the temperature's logarithm (per task)"""
+    initial_temperature: Positive = 1.0
+    """initial weight of the entropy"""
+    target_entropy: float = -1.0
+    """of the policy per action, in nats, to which the temperature is steered"""
+    gamma: Fraction = 0.99
+    """discount factor"""
+    tau: Fraction = 0.005
+    """target critics <- (1 - tau) target critics + tau critics, after each update"""
+    max_grad_norm: Positive = 100.0
+    """gradients are clipped to this norm, which ordinary ones do not reach"""
+    eval_every: Natural = 500
+    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
+    save_every: Natural = 5000
+    """save the checkpoint, which holds the replay buffer, every this many iterations (0: only at the end)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        if self.large_batch:
+            values |= LARGE_BATCH | (CPU | {"iterations": 2000} if self.device == "cpu" else {})
+        return values
+
+    def check(self) -> None:
+        super().check()
+        if distributed.size() > 1:
+            fail("one process alone: a replay buffer is not shared among ranks")
+        if self.critic_subset > self.critics:
+            fail(f"--critic-subset {self.critic_subset} is larger than --critics {self.critics}")
+        if self.buffer_size < self.steps * self.num_envs:
+            fail(f"--buffer-size {self.buffer_size} holds no iteration of {self.steps} steps of {self.num_envs}")
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+def mlp(inputs: int, args: Args, outputs: int | None = None, layer_norm: bool = False) -> nn.Sequential:
+    """Linear and ReLU per hidden layer, with LayerNorm after it if asked for; and a linear output."""
+    layers: list[nn.Module] = []
+    for width in args.hidden:
+        layers += [nn.Linear(inputs, width), nn.ReLU()] + ([nn.LayerNorm(width)] if layer_norm else [])
+        inputs = width
+    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
+
+
+class Actor(nn.Module):
+    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.normalizer = ObsNormalizer(obs_dim)
+        self.body = mlp(obs_dim, args)
+        self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
+
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Of normalized observations (..., obs_dim): sampled actions (..., action_dim), their log density (...)."""
+        features = self.body(obs)
+        log_std = self.log_std(features).clamp(*LOG_STD)
+        noise = torch.randn_like(log_std)
+        u = self.mean(features) + log_std.exp() * noise
+        log_slope = 2 * (math.log(2) - u - F.softplus(-2 * u))  # of tanh
+        density = -0.5 * noise.square() - 0.5 * math.log(2 * math.pi) - log_std - log_slope
+        return torch.tanh(u), density.sum(-1)
+
+    def deterministic(self) -> nn.Sequential:
+        """The action without noise, of observations as they come, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
+
+
+class Temperature(nn.Module):
+    """The weight of the entropy."""
+
+    def __init__(self, args: Args) -> None:
+        super().__init__()
+        self.log = nn.Parameter(torch.full((), math.log(args.initial_temperature)))
+
+
+# The replay buffer ----------------------------------------------------------------------------------------------------
+
+
+class Transition(NamedTuple):
+    """What a learner needs of control steps: (B, ...)."""
+
+    obs: Tensor
+    action: Tensor
+    reward: Tensor
+    next_obs: Tensor  # before any reset
+    terminated: Tensor  # 1 where the episode failed, 0 where it went on or its time ran out
+
+
+class ReplayBuffer(nn.Module):
+    """The last transitions, on the device; adding and sampling wait for nothing, so both can be captured."""
+
+    rows: Tensor
+    count: Tensor
+
+    def __init__(self, size: int, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.size, self.widths = size, (obs_dim, action_dim, 1, obs_dim, 1)
+        self.register_buffer("rows", torch.zeros(size, sum(self.widths)), persistent=False)
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64))  # of transitions ever added
+
+    def add(self, transitions: Transition) -> None:
+        columns = [tensor.flatten(1) if tensor.dim() > 1 else tensor.unsqueeze(1) for tensor in transitions]
+        place = (self.count + torch.arange(len(columns[0]), device=self.count.device)) % self.size
+        self.rows.index_copy_(0, place, torch.cat(columns, 1))
+        self.count += len(columns[0])
+
+    def sample(self, number: int) -> Transition:
+        """Drawn uniformly, with repetition."""
+        filled = self.count.clamp(max=self.size)
+        place = (torch.rand(number, device=self.count.device, dtype=torch.float64) * filled).long()
+        obs, action, reward, next_obs, terminated = self.rows[place].split(self.widths, 1)
+        return Transition(obs, action, reward.squeeze(1), next_obs, terminated.squeeze(1))
+
+    def get_extra_state(self) -> Tensor:
+        """The rows that are filled: a checkpoint holds no others."""
+        return self.rows[: min(int(self.count), self.size)]
+
+    def set_extra_state(self, rows: Tensor) -> None:
+        self.rows[: len(rows)] = rows
+
+
+# The algorithm --------------------------------------------------------------------------------------------------------
+
+
+class SAC:
+    """All that the next iteration depends on.
+
+    Its methods change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
+    """
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        critics = [mlp(obs_dim + action_dim, args, 1, args.layer_norm) for _ in range(args.critics)]
+        self.critics = Ensemble(critics).to(env.device)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.temperature = Temperature(args).to(env.device)
+        self.policy = self.actor.deterministic()
+        self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.actor_lr)
+        self.critic_optimizer = ClippedAdam(self.critics, args.max_grad_norm, lr=args.critic_lr)
+        self.temperature_optimizer = ClippedAdam(self.temperature, args.max_grad_norm, lr=args.temperature_lr)
+        self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
+        self.modules: dict[str, Stateful] = {
+            "actor": self.actor,
+            "critics": self.critics,
+            "targets": self.targets,
+            "temperature": self.temperature,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+            "buffer": self.buffer,
+        }
+
+    def explore(self) -> dict[str, Tensor]:
+        """An iteration of uniformly random actions, from which only the buffer and the normalizer learn."""
+        return self.iterate(learning=False)
+
+    def learn(self) -> dict[str, Tensor]:
+        """An iteration: after each control step of all environments, the updates."""
+        return self.iterate(learning=True)
+
+    def iterate(self, learning: bool) -> dict[str, Tensor]:
+        steps, metrics = [], []
+        obs = self.env.detach()
+        for _ in range(self.args.steps):
+            obs, step = self.act(obs, random=not learning)
+            steps.append(step)
+            if learning:
+                metrics.append(self.update())
+        done, nonfinite, returns, lengths = (torch.stack(tensors) for tensors in zip(*steps, strict=True))
+        found = episode_metrics(self.env, done, {"r": returns, "l": lengths}, nonfinite)
+        if learning:
+            found |= {name: torch.stack([row[name] for row in metrics]).mean() for name in metrics[0]}
+        skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped
+        return found | {"charts/temperature": self.temperature.log.detach().exp(), "grad/skipped": skipped}
+
+    @torch.no_grad()
+    def act(self, obs: Tensor, random: bool) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """One control step of all environments into the buffer."""
+        env = self.env
+        if random:
+            action = 2 * torch.rand(env.num_envs, env.scene.nu, device=env.device) - 1
+        else:
+            action, _ = self.actor(self.actor.normalizer(obs))
+        next_obs, reward, terminated, truncated, info = env.step(action)
+        self.buffer.add(Transition(obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
+        self.actor.normalizer.update(obs)
+        episode = info["episode"]
+        return next_obs, (terminated | truncated, info["nonfinite"], episode["r"], episode["l"])
+
+    def update(self) -> dict[str, Tensor]:
+        """The updates of one control step."""
+        args = self.args
+        for left in reversed(range(args.updates_per_step)):
+            batch = self.buffer.sample(args.batch_size)
+            obs, next_obs = (self.actor.normalizer(x) for x in (batch.obs, batch.next_obs))
+            metrics = self.update_critics(batch, obs, next_obs)
+            if left < args.actor_updates:
+                metrics |= self.update_actor(obs)
+        return metrics
+
+    def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
+        """Descend the soft Bellman residual, and let the target critics follow."""
+        args = self.args
+        with torch.no_grad():
+            action, density = self.actor(next_obs)
+            values = self.values(self.targets, next_obs, action)
+            if args.critic_subset < args.critics:
+                values = values[torch.rand(args.critics, device=obs.device).argsort()[: args.critic_subset]]
+            entropy = -self.temperature.log.exp() * density
+            target = soft_bellman(batch.reward, values.amin(0) + entropy, batch.terminated, args.gamma)
+        values = self.values(self.critics, obs, batch.action)
+        loss = (values - target).square().mean(1).sum()
+        norm = self.critic_optimizer.step(loss)
+        for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
+            slow.lerp_(fast.detach(), args.tau)
+        found = {"losses/critic": loss.detach() / args.critics, "charts/value": values.detach().mean()}
+        return found | {"grad/norm": norm}
+
+    def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
+        """Ascend value and entropy; steer the temperature to the target entropy."""
+        action, density = self.actor(obs)
+        values = self.values(self.critics, obs, action)
+        value = values.amin(0) if self.args.critic_subset == self.args.critics else values.mean(0)  # REDQ: the mean
+        loss = (self.temperature.log.detach().exp() * density - value).mean()
+        self.actor_optimizer.step(loss)
+        surplus = -density.detach().mean() - self.args.target_entropy * action.shape[1]  # of entropy over the target
+        self.temperature_optimizer.step(self.temperature.log.exp() * surplus)
+        return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
+
+    def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
+        """Each critic's Q(s, a) (critics, B)."""
+        inputs = torch.cat((obs, action), -1)
+        return critics(inputs.expand(self.args.critics, *inputs.shape)).squeeze(-1)
+
+
+def soft_bellman(reward: Tensor, next_soft_value: Tensor, terminated: Tensor, gamma: float) -> Tensor:
+    """r + gamma V(s'), without a value after a failure; where time ran out the episode could have gone on."""
+    return reward + gamma * (1 - terminated) * next_soft_value
+
+
+# The run --------------------------------------------------------------------------------------------------------------
+
+
+def train(args: Args) -> None:
+    run = Run(args)
+    env, eval_env = run.make_env(args.num_envs, args.steps), run.make_eval_env()
+    sac = run.restore(SAC(args, env))
+    explore, learn = run.capture(sac.explore, env), run.capture(sac.learn, env)
+    for iteration in run:
+        run.log(explore() if iteration * args.steps <= args.seed_steps else learn())
+        if run.evaluation_due:
+            run.log_evaluation(evaluate(eval_env, sac.policy))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(Args, argv)
+    if args.evaluate:
+        evaluate_checkpoint(args)
+    else:
+        train(args)
+
+
+if __name__ == "__main__":
+    main()

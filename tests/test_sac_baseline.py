@@ -1,0 +1,215 @@
+"""SAC's parts against torch's distributions, closed forms, and problems whose soft optimum is known."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from learners import refusal, run
+from torch import Tensor
+from torch.distributions import Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
+
+import diffsim
+import sac_baseline as sac
+from diffsim.training import parse
+
+FLAGS = "--env ant --device cpu --hidden 16 --num-envs 3 --steps 4 --batch-size 32 --seed-steps 0"
+
+
+def build(*arguments: str, env: Any = None) -> sac.SAC:
+    args = parse(sac.Args, [*FLAGS.split(), *arguments])
+    return sac.SAC(args, env or diffsim.make("ant", num_envs=3, seed=0, horizon=4))
+
+
+def test_density_is_that_of_the_squashed_gaussian() -> None:
+    torch.manual_seed(0)
+    actor = build().actor.double()
+    obs = torch.randn(50, 37, dtype=torch.float64)
+    action, density = actor(obs)
+    features = actor.body(obs)
+    log_std = actor.log_std(features).clamp(*sac.LOG_STD)
+    expected = TransformedDistribution(Normal(actor.mean(features), log_std.exp()), TanhTransform())
+    torch.testing.assert_close(density, expected.log_prob(action).sum(-1))
+    assert action.std(0).min() > 0.1
+    torch.testing.assert_close(actor.deterministic()(obs), torch.tanh(actor.mean(features)))
+
+
+def test_soft_bellman_backup() -> None:
+    """A failure ends the value; where time ran out the episode could have gone on."""
+    reward, value = torch.tensor([1.0, 2.0]), torch.tensor([10.0, 10.0])
+    torch.testing.assert_close(
+        sac.soft_bellman(reward, value, torch.tensor([0.0, 1.0]), 0.9), torch.tensor([10.0, 2.0])
+    )
+
+
+def test_the_buffer_keeps_the_last_transitions() -> None:
+    """It wraps round; samples are uniform over what is filled; its state holds no more than that."""
+    buffer = sac.ReplayBuffer(10, 2, 1)
+
+    def add(numbers: list[int]) -> None:
+        x = torch.tensor(numbers, dtype=torch.float32)
+        two = torch.stack((x, -x), 1)
+        buffer.add(sac.Transition(two, x.unsqueeze(1), 100 + x, two + 1000, (x % 2)))
+
+    add([0, 1, 2, 3])
+    assert set(buffer.sample(500).reward.tolist()) == {100, 101, 102, 103}
+    add([4, 5, 6, 7])
+    add([8, 9, 10, 11])  # over the first two
+    sample = buffer.sample(20_000)
+    x = sample.reward - 100
+    counts = torch.bincount(x.long(), minlength=12)
+    assert (counts[:2] == 0).all() and (counts[2:] > 1700).all() and (counts[2:] < 2300).all()
+    torch.testing.assert_close(sample.obs, torch.stack((x, -x), 1))
+    torch.testing.assert_close(sample.next_obs, sample.obs + 1000)
+    torch.testing.assert_close(sample.action.squeeze(1), x)
+    torch.testing.assert_close(sample.terminated, x % 2)
+
+    young, copy = sac.ReplayBuffer(10, 2, 1), sac.ReplayBuffer(10, 2, 1)
+    young.add(sac.Transition(*(part[:3] for part in sample)))
+    state = young.state_dict()
+    assert state["_extra_state"].shape == (3, 7)
+    copy.load_state_dict(state)
+    assert torch.equal(copy.rows, young.rows) and copy.count == 3
+
+
+def test_time_limits_are_bootstrapped_and_failures_are_not() -> None:
+    """Of three ants that run out of time, fall, and do neither, what the buffer keeps."""
+    learner = build()
+    env = learner.env
+    env.episode_step[0] = env.episode_length - 1
+    qpos, qvel = env.qpos.clone(), env.qvel.clone()
+    qpos[1, 2], qvel[1, 2] = 0.28, -6.0
+    obs = env.set_state(qpos, qvel)
+    next_obs, (done, *_) = learner.act(obs, random=True)
+    rows = sac.Transition(*learner.buffer.rows[:3].split(learner.buffer.widths, 1))
+    assert done.tolist() == [True, True, False] and rows.terminated.squeeze(1).tolist() == [0, 1, 0]
+    torch.testing.assert_close(rows.obs, obs)
+    assert (rows.next_obs[:2] != next_obs[:2]).any(1).all() and torch.equal(rows.next_obs[2], next_obs[2])
+
+
+@pytest.mark.parametrize("redq", [False, True])
+def test_targets_and_losses(redq: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    learner = build(*("--critics 4 --critic-subset 2" if redq else "").split(), "--initial-temperature", "0.3")
+    batch = sac.Transition(
+        torch.randn(32, 37), torch.rand(32, 8), torch.randn(32), torch.randn(32, 37), (torch.rand(32) < 0.3).float()
+    )
+    state = torch.get_rng_state()
+    action, density = learner.actor(batch.next_obs)
+    order = torch.rand(4).argsort()[:2] if redq else torch.arange(2)
+    values = torch.stack(
+        [learner.targets[k](torch.cat((batch.next_obs, action), 1)).squeeze(1) for k in range(learner.args.critics)]
+    )
+    target = batch.reward + 0.99 * (1 - batch.terminated) * (values[order].amin(0) - 0.3 * density)
+    own = torch.stack(
+        [learner.critics[k](torch.cat((batch.obs, batch.action), 1)).squeeze(1) for k in range(learner.args.critics)]
+    )
+    before = [p.clone() for p in learner.targets.parameters()]
+    torch.set_rng_state(state)
+    metrics = learner.update_critics(batch, batch.obs, batch.next_obs)
+    torch.testing.assert_close(metrics["losses/critic"], (own - target.detach()).square().mean())
+    for old, slow, fast in zip(before, learner.targets.parameters(), learner.critics.parameters(), strict=True):
+        torch.testing.assert_close(slow, old + 0.005 * (fast - old))
+
+    losses: list[Tensor] = []
+    monkeypatch.setattr(learner.actor_optimizer, "step", losses.append)
+    monkeypatch.setattr(learner.temperature_optimizer, "step", losses.append)
+    state = torch.get_rng_state()
+    learner.update_actor(batch.obs)
+    torch.set_rng_state(state)
+    action, density = learner.actor(batch.obs)
+    values = learner.values(learner.critics, batch.obs, action)
+    value = values.mean(0) if redq else values.amin(0)
+    torch.testing.assert_close(losses[0], (0.3 * density - value).mean())
+    torch.testing.assert_close(losses[1], 0.3 * (8 - density.mean().detach()))
+
+
+class Problem:
+    """An environment without simulator, whose soft optimum is known."""
+
+    device, num_envs, episode_length = torch.device("cpu"), 16, 10**9
+    scene = SimpleNamespace(nu=1)
+    task = SimpleNamespace(obs_dim=1)
+    sim = SimpleNamespace(nonfinite_gradients=torch.zeros(16, dtype=torch.int32))
+
+    def __init__(self, bandit: bool) -> None:
+        self.bandit, self.x = bandit, torch.zeros(16, 1)
+
+    def detach(self) -> Tensor:
+        return self.x
+
+    def step(self, action: Tensor) -> tuple[Any, ...]:
+        """The bandit pays for a = 0.3; the linear system x' = 0.8 x + a + noise costs x^2 + a^2."""
+        no = torch.zeros(16, dtype=torch.bool)
+        if self.bandit:
+            reward, next_obs, terminated = -4 * (action - 0.3).square().squeeze(1), self.x, ~no
+        else:
+            reward = -(self.x.square() + action.square()).squeeze(1)
+            next_obs, terminated = 0.8 * self.x + action + 0.3 * torch.randn(16, 1), no
+        self.x = next_obs
+        info = {"final_obs": next_obs, "nonfinite": no, "episode": {"r": reward, "l": torch.ones(16)}}
+        return next_obs, reward, terminated, no, info
+
+
+def learnt(bandit: bool, temperature: float, iterations: int, monkeypatch: pytest.MonkeyPatch) -> sac.SAC:
+    monkeypatch.setattr(sac, "episode_metrics", lambda *_: {})
+    torch.manual_seed(0)
+    rates = f"--actor-lr 3e-3 --critic-lr 3e-3 --temperature-lr 1e-12 --initial-temperature {temperature} --gamma 0.9"
+    flags = "--hidden 32 32 --num-envs 16 --steps 8 --batch-size 128 --tau 0.05 --buffer-size 5000"
+    learner = build(*rates.split(), *flags.split(), env=Problem(bandit))
+    for _ in range(10):
+        learner.explore()
+    for _ in range(iterations):
+        learner.learn()
+    return learner
+
+
+def test_a_bandit_is_learnt_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The soft optimum is proportional to exp(r / alpha): here the Gaussian of mean 0.3 and variance alpha / 8."""
+    learner = learnt(True, 0.05, 60, monkeypatch)
+    action, _ = learner.actor(torch.zeros(4000, 1))
+    assert action.mean().item() == pytest.approx(0.3, abs=0.03)
+    assert action.std().item() == pytest.approx(math.sqrt(0.05 / 8), rel=0.25)
+
+
+def test_a_linear_quadratic_system_is_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The optimal gain is that of the discounted Riccati equation; entropy shows more actions."""
+    learner = learnt(False, 0.1, 400, monkeypatch)
+    p = 1.0
+    for _ in range(200):
+        p = 1 + 0.9 * 0.64 * p - (0.9 * 0.8 * p) ** 2 / (1 + 0.9 * p)
+    gain = 0.9 * 0.8 * p / (1 + 0.9 * p)
+    x = torch.linspace(-0.6, 0.6, 13).unsqueeze(1)
+    action = learner.policy(x).detach()
+    slope = ((x * action).sum() / x.square().sum()).item()
+    assert slope == pytest.approx(-gain, rel=0.2)
+
+
+def test_a_run_resumes_bitwise_with_its_buffer(tmp_path: Path) -> None:
+    flags = "--env cartpole --num-envs 4 --steps 8 --seed-steps 16 --batch-size 16 --hidden 16 --iterations 8 --quiet"
+    flags += " --eval-episodes 2 --device cpu --threads 1 --buffer-size 100"
+    whole = run(sac, tmp_path / "whole", *flags.split())
+    run(sac, tmp_path / "part", *flags.split(), "--stop-after", 5)
+    part = run(sac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
+    for name, module in whole["modules"].items():
+        for key, value in module.items():
+            other = part["modules"][name][key]
+            assert torch.equal(value, other) if isinstance(value, Tensor) else str(value) == str(other), (name, key)
+    assert whole["modules"]["buffer"]["_extra_state"].shape[0] == 100
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ("--critics 2 --critic-subset 3", "--critic-subset 3 is larger than --critics 2"),
+        ("--buffer-size 10", "--buffer-size 10 holds no iteration of 32 steps of 128"),
+        ("--tau 2", "--tau must be in [0, 1]"),
+    ],
+)
+def test_wrong_arguments_are_refused(arguments: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert message in refusal(lambda: sac.main(["--env", "ant", *arguments.split()]), capsys)
