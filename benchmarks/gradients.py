@@ -31,8 +31,8 @@ from diffsim.training.variation import VARIED, soft_factors
 
 GROUPS = 16  # of environments, whose gradients are compared
 FIRMER = 4.0  # the last ground's constants in multiples of the firm ones
-SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the way from soft to firm
-COLUMNS = {"norm": ("norm, median", "xy"), "norm 95 %": ("norm, 95 %", "xy"), "cosine": ("cosine", "x")}
+GROUNDS = {"soft": 0.0, "25 % firm": 0.25, "50 % firm": 0.5, "75 % firm": 0.75, "firm": 1.0}  # of the way to firm
+COLUMNS = {"norm": ("norm, median", "y"), "norm 95 %": ("norm, 95 %", "y"), "cosine": ("cosine", "")}
 KEY = ("task", "learner", "horizon", "stiffness")
 
 
@@ -52,8 +52,11 @@ def grounds(env: DiffEnv) -> dict[str, Tensor]:
     """Factors (len(FACTORS),) of the firm constants, by the name of the ground."""
     soft = torch.tensor([soft_factors(env.scene).get(name, 1.0) for name in FACTORS])
     found = {}
-    for share in SHARES:  # a limit's damping, which is none where it is soft, goes with the share, as in Variation
-        found[f"{share:.0%} firm"] = torch.where(soft > 0, soft.clamp(min=1e-30) ** (1 - share), share)
+    for (
+        name,
+        share,
+    ) in GROUNDS.items():  # a limit's damping, which is none where it is soft, goes with the share, as in Variation
+        found[name] = torch.where(soft > 0, soft.clamp(min=1e-30) ** (1 - share), share)
     varied = torch.tensor([name in VARIED["stiffness"] for name in FACTORS])
     return found | {f"{FIRMER:g} x firm": torch.where(varied, FIRMER, 1.0)}
 
@@ -147,7 +150,7 @@ def main(args: Args) -> None:
         grid.append(panels)
     if tasks:
         plot(args.picture("gradients"), grid)
-    ends = {f"{SHARES[0]:.0%} firm", f"{SHARES[-1]:.0%} firm", f"{FIRMER:g} x firm"}
+    ends = {"soft", "firm", f"{FIRMER:g} x firm"}
     shown = [row for row in rows if row["ground"] in ends and row["horizon"] in ("8", "32")]
     columns = ("task", "horizon", "ground", *COLUMNS)
     args.publish("gradients", markdown(shown, columns), "transfer.md")

@@ -72,6 +72,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "shac_firm":          SHAC_FIRM,
     "shac_firm_sudden":   (*SHAC_FIRM, "--anneal", "0", "0"),
     "shac_firm_fixed":    (*SHAC_FIRM, "--randomise"),
+    "shac_firm_wide":     (*SHAC_FIRM, "--anneal", "0", "0", "--randomise", "stiffness=0.3:4", "friction=0.7:1.3"),
     "shac_firm_h16":      ("shac", *FIRM, "--num-envs", "512", "--horizon", "16", "--iterations", "3000"),
     "sapo_firm":          ("sapo", *FIRM),
     "ppo_firm":           PPO_MANY_FIRM,
@@ -122,7 +123,7 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "ablation":      ("SAPO without each of its parts", ("sapo", "sapo_no_entropy", "sapo_no_state_std",
                       "sapo_one_critic", "sapo_elu", "sapo_alone"), ("humanoid",)),
     "firm":          ("Learning through firm contact", ("shac_firm", "shac_firm_sudden", "shac_firm_fixed",
-                      "shac_firm_h16", "sapo_firm", "ppo_firm", "ppo_firm_sudden"),
+                      "shac_firm_wide", "shac_firm_h16", "sapo_firm", "ppo_firm", "ppo_firm_sudden"),
                       ("hopper", "half_cheetah", "ant", "humanoid")),
     "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"),
                       ("cartpole", "half_cheetah", "ant")),
@@ -229,12 +230,13 @@ def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[TaskNam
                     lines.append(Line(common, middle, f"C{k}-", learner, width=2))
                     begins.append(common[0])
                     ends.append(common[-1])
-            for learner in (learner for learner in learners if learner in published):
+            for learner in (learner for learner in learners if ends and learner in published):
                 value, style = [published[learner]] * 2, f"C{learners.index(learner)}--"
                 lines.append(Line((min(begins), max(ends)), value, style, f"{learner}, published", 0.8))
-            log = "x" if max(ends) > 10 * min(ends) else ""
+            log = "x" if ends and max(ends) > 10 * min(ends) else ""
             panels.append(Panel(lines, env, text, "" if panels else "return of training episodes", log))
-        grid.append(panels)
+        if any(panel.lines for panel in panels):  # not where all runs shared their machine, and have no seconds
+            grid.append(panels)
     plot(args.picture(name), grid)
 
 

@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import mean, median
 from typing import Annotated, NamedTuple
 
 import common
@@ -219,32 +220,40 @@ def compare(case: Case, args: Args) -> dict[str, Motion]:
 
 
 def table(rows: list[dict[str, str]]) -> str:
-    """A line for each policy: in each world the speed in m/s, or the return of a robot that does not travel, with the
-    share of whole episodes; of the feet penetration, median and 95 %."""
-    groups = dict[tuple[str, ...], dict[str, dict[str, str]]]()
+    """A line for each task, contact and learner, over its seeds: medians of the speed in each world in m/s, or of the
+    return of a robot that does not travel, mean shares of whole episodes in MuJoCo, medians of the feet's penetration.
+
+    Runs that are not named {learner}/{task}__{seed} have a line each.
+    """
+    groups = dict[tuple[str, ...], dict[str, list[dict[str, str]]]]()
     tasks = [*diffsim.TASKS]
-    for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft", row["seed"])):
-        groups.setdefault(tuple(row[k] for k in KEY[:-1]), {})[row["condition"]] = row
+    for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft")):
+        folder, _, run = row["checkpoint"].rpartition("/")
+        learner = folder if run == f"{row['task']}__{row['seed']}" else row["checkpoint"]
+        key = row["task"], row["contact"], learner
+        groups.setdefault(key, {}).setdefault(row["condition"], []).append(row)
     names = {name for group in groups.values() for name in group if name.startswith("MuJoCo")}
-    order = ["here", "finer", "control", *sorted(names, key=lambda name: float(name.partition("x")[2]))]
-
-    def cell(row: dict[str, str] | None) -> str:
-        if row is None:
-            return ""
-        value = f"{float(row['speed']):.2f}" if row["speed"] else row["return"]
-        return f"{value} ({float(row['whole']):.0%})"
-
+    order = sorted(names, key=lambda name: float(name.partition("x")[2]))
     lines = list[Row]()
-    for group in groups.values():
-        some = next(iter(group.values()))
-        line = {column: some[column] for column in ("task", "learner", "contact", "seed")}
-        line |= {name: cell(group.get(name)) for name in order}
-        kept = group.get("MuJoCo x1", {}).get("kept")
-        line["kept"] = f"{float(kept):.0%}" if kept else ""
-        for name in ("here", "MuJoCo x1"):
-            row = group.get(name, {})
-            depths = [f"{float(x):.1f}" for x in (row.get("penetration"), row.get("penetration 95 %")) if x]
-            line[f"penetration {name} (mm)"] = " / ".join(depths)
+
+    def middle(found: list[dict[str, str]], column: str, form: str) -> str:
+        values = [float(row[column]) for row in found if row[column]]
+        return format(median(values), form) if values else ""
+
+    for (task, contact, learner), group in groups.items():
+        seeds = len(group["here"])
+        line = {"task": task, "contact": contact, "learner": learner, "seeds": seeds}
+        unit = ("speed", ".2f") if group["here"][0]["speed"] else ("return", ".0f")
+        line |= {name: middle(group.get(name, []), *unit) for name in ("here", *order)}
+        there = group.get("MuJoCo x1", [])
+        kept = [float(row["kept"]) for row in there if row["kept"]]
+        line |= {"kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
+        own = {row["seed"]: float(row[unit[0]]) for row in group["here"]}
+        errors = [abs(float(row[unit[0]]) - own[row["seed"]]) for row in group.get("control", [])]
+        line["control off by"] = format(max(errors), unit[1]) if errors else ""
+        shares = [mean(float(row["whole"]) for row in group[name]) for name in order if name in group]
+        line["whole"] = " / ".join(f"{share:.0%}" for share in shares)
+        line |= {f"depth {name}": middle(group.get(name, []), "penetration", ".1f") for name in ("here", "MuJoCo x1")}
         lines.append(line)
     return markdown(lines)
 

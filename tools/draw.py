@@ -1,7 +1,8 @@
-"""Pictures of policies at work, written to docs/figures: a gif of each task, or a strip of frames of a learned gait.
+"""Pictures of policies at work, written to docs/figures: a gif of each task, a strip of frames, a gif of videos.
 
     python tools/draw.py loops
     python tools/draw.py gait runs/<run>/checkpoint.pt --start 2 --every 0.1 --frames 8
+    python tools/draw.py stack humanoid.mp4 ant.mp4          videos of benchmarks/transfer.py --video below each other
 
 Muscles are coloured by activation, as in the SHAC paper's Figure 5. A gif shows the median one of several episodes of
 the policy in diffsim/policies; that of a runner ends where it resembles its first frame most, so that it plays in a
@@ -24,7 +25,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
-from diffsim.render import Frame, render_frames
+from diffsim.render import VIDEO_FPS, Frame, render_frames
 from diffsim.training import Count, NonNegative, Positive, evaluate, fail, load_policy, make_policy_env, parse_penalty
 from diffsim.training.evaluation import travels
 from diffsim.training.flags import check_ranges
@@ -72,6 +73,20 @@ class Gait:
     """number of frames"""
     size: Count = 240
     """width and height of a frame in pixels"""
+
+
+@dataclass
+class Stack:
+    """A gif of videos, below each other and half as large."""
+
+    videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """of one width, 30 frames/s and true speed"""
+    start: NonNegative = 2.0
+    """seconds into the videos at which the gif begins"""
+    seconds: Positive = 3.0
+    """of the gif"""
+    every: Count = 3
+    """frames of the videos between its frames"""
 
 
 def halve(frame: Frame) -> Frame:
@@ -138,12 +153,24 @@ def draw_gait(args: Gait) -> None:
     print(path)
 
 
+def stack(args: Stack) -> None:
+    chosen = slice(round(args.start * VIDEO_FPS), round((args.start + args.seconds) * VIDEO_FPS), args.every)
+    videos = [[halve(frame) for frame in imageio.imread(path)[chosen]] for path in args.videos]
+    write_gif(
+        FIGURES / "transfer.gif",
+        [np.concatenate(frames) for frames in zip(*videos, strict=True)],
+        VIDEO_FPS / args.every,
+    )
+
+
 if __name__ == "__main__":
-    args = tyro.cli(Loops | Gait, description=__doc__)
+    args = tyro.cli(Loops | Gait | Stack, description=__doc__)
     check_ranges(args)
     torch.set_num_threads(1)
     if isinstance(args, Gait):
         draw_gait(args)
+    elif isinstance(args, Stack):
+        stack(args)
     else:
         for task in args.tasks:
             draw_loop(task, args)

@@ -192,11 +192,23 @@ def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.
     assert (tmp_path / "transfer.png").stat().st_size > 5_000
     header, _, *lines = transfer.table(rows).splitlines()
     assert transfer.table(rows) in capsys.readouterr().out
-    assert header.startswith(
-        "| task | learner | contact | seed | here | finer | control | MuJoCo x0.5 | MuJoCo x1 | kept |"
-    )
+    assert header.startswith("| task | contact | learner | seeds | here | MuJoCo x0.5 | MuJoCo x1 | kept | worst |")
     assert [line.split(" | ")[0] for line in lines] == ["| cartpole", "| hopper"]
-    assert "| -4" in lines[0] and f"| {here:.2f} (100%) | {finer:.2f} (100%) | {control:.2f} (100%) |" in lines[1]
+    assert "| -4" in lines[0] and f"| policies/hopper | 1 | {here:.2f} |" in lines[1]
+
+
+def test_the_table_joins_seeds() -> None:
+    """Medians over seeds, the worst of what is kept, the control's largest error, shares of each friction."""
+    rows = list[dict[str, str]]()
+    for seed, here, control, there, whole in (("1", 4, 4.1, 2, 1), ("2", 3, 2.7, 2.7, 0.5), ("3", 2, 2, 1.8, 0.9)):
+        own = {"task": "ant", "contact": "firm", "seed": seed, "checkpoint": f"shac_firm/ant__{seed}"}
+        for name, value in (("here", here), ("control", control), ("MuJoCo x1", there)):
+            kept, depth = str(value / here), str(10 * value)
+            row = own | {"condition": name, "speed": str(value), "return": "5", "kept": kept, "penetration": depth}
+            rows.append(row | {"whole": str(whole)})
+    (line,) = transfer.table(rows).splitlines()[2:]
+    cells = line.strip("| ").split(" | ")
+    assert cells == "ant firm shac_firm 3 3.00 2.00 90% 50% 0.30 80% 30.0 20.0".split()
 
 
 @pytest.mark.parametrize(
