@@ -51,7 +51,7 @@ from diffsim.training import (
 # fmt: off
 COLUMNS = ("hidden", "model_hidden", "rollout_lengths", "num_envs", "actor_lr", "temperature_lr", "iterations")
 PER_TASK = {
-    "cartpole":     ((64, 64),             (128, 128),           (1, 5),  16, 1e-3, 1e-3,   200),
+    "cartpole":     ((64, 64),             (128, 128),           (1, 5),  16, 1e-3, 1e-3,   600),
     "hopper":       ((256, 128, 64),       (200, 200, 200, 200), (1, 15), 64, 5e-4, 5e-4, 2_000),
     "half_cheetah": ((256, 128, 64),       (200, 200, 200, 200), (1, 1),  64, 5e-4, 5e-4, 2_000),
     "ant":          ((256, 128, 64),       (200, 200, 200, 200), (1, 25), 64, 5e-4, 5e-4, 2_000),

@@ -160,6 +160,7 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
     axes = figure.subplots(len(grid), len(grid[0]), squeeze=False)
     legend: dict[str, Line2D] = {}
     for axis, panel in zip(axes.flat, chain(*grid), strict=True):
+        axis.set_visible(bool(panel.lines))
         for line in panel.lines:
             (drawn,) = axis.plot(line.x, line.y, line.style, linewidth=line.width, markersize=4)
             legend |= {line.label: drawn} if line.label else {}

@@ -21,6 +21,7 @@ from itertools import product
 from statistics import mean, median, pstdev
 from typing import Literal
 
+import common
 import numpy as np
 from common import TASKS, Line, Panel, TaskName, plot
 from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, parse, passing, seed, summary
@@ -106,7 +107,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation", "firm", "orders",
+    "ablation", "firm", "orders", "off_policy",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -125,8 +126,10 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "firm":          ("Learning through firm contact", ("shac_firm", "shac_firm_sudden", "shac_firm_fixed",
                       "shac_firm_wide", "shac_firm_h16", "sapo_firm", "ppo_firm", "ppo_firm_sudden"),
                       ("hopper", "half_cheetah", "ant", "humanoid")),
-    "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"),
-                      ("cartpole", "half_cheetah", "ant")),
+    "off_policy":    ("Figures 4 and 10: off-policy, model-based and sequence learners",
+                      ("shac", PPO, SAC, "sac_large", "redq", "mbpo", "se_mbpo", "pods"),
+                      ("cartpole", "hopper", "ant", "humanoid")),
+    "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"), ("cartpole",)),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
 }
 # fmt: on
@@ -178,9 +181,13 @@ def collect(args: Args, learner: str, env: TaskName) -> None:
 
 
 def curves(args: Args, learner: str, env: str) -> list[Curve]:
-    """Of each seed, from the csv file."""
+    """Of each seed, from the csv file; where this machine has none, from another one's, without the seconds."""
     seeds: dict[str, list[dict[str, str]]] = {}
-    for row in args.read(f"{learner}_{env}"):
+    rows = args.read(name := f"{learner}_{env}")
+    if not rows and args.directory.parent == common.RESULTS:
+        paths = sorted(common.RESULTS.glob(f"*/{name}.csv"))
+        rows = [row | {"seconds": ""} for path in paths[:1] for row in read_csv(path)]
+    for row in rows:
         seeds.setdefault(row["seed"], []).append(row)
     return [curve(rows) for rows in seeds.values()]
 
@@ -224,12 +231,12 @@ def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[TaskNam
             for k, learner in enumerate(learners):
                 runs = curves(args, learner, env)
                 if runs := timed(runs) if x == "seconds" else runs:
-                    common = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
-                    middle = np.median([np.interp(common, run[x], run["return"]) for run in runs], axis=0)
+                    shared = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
+                    middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
                     lines += [Line(run[x], run["return"], f"C{k}-", width=0.5) for run in runs]
-                    lines.append(Line(common, middle, f"C{k}-", learner, width=2))
-                    begins.append(common[0])
-                    ends.append(common[-1])
+                    lines.append(Line(shared, middle, f"C{k}-", learner, width=2))
+                    begins.append(shared[0])
+                    ends.append(shared[-1])
             for learner in (learner for learner in learners if ends and learner in published):
                 value, style = [published[learner]] * 2, f"C{learners.index(learner)}--"
                 lines.append(Line((min(begins), max(ends)), value, style, f"{learner}, published", 0.8))
