@@ -107,7 +107,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation", "firm", "orders", "off_policy",
+    "ablation", "firm", "orders", "off_policy", "models",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -129,6 +129,7 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "off_policy":    ("Figures 4 and 10: off-policy, model-based and sequence learners",
                       ("shac", PPO, SAC, "sac_large", "redq", "mbpo", "se_mbpo", "pods"),
                       ("cartpole", "hopper", "ant", "humanoid")),
+    "models":        ("MBPO and SE-MBPO", ("shac", "mbpo", "se_mbpo"), ("cartpole", "ant")),
     "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"), ("cartpole",)),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
 }
