@@ -55,6 +55,7 @@ def make(
     max_episode_steps: int | None = None,
     render_mode: RenderMode | None = None,
     factors: bool = False,
+    forces: bool = False,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -67,6 +68,7 @@ def make(
             integrated; docs/transfer.md has what each costs and how much of a policy's speed is true.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         factors: let constants differ between environments: `env.sim.factors`, see Simulator.
+        forces: let external forces act on the bodies: `env.sim.forces`, see Simulator.
 
     Raises:
         ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
@@ -92,6 +94,7 @@ def make(
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,
         factors=factors,
+        forces=forces,
     )
 
 

@@ -44,7 +44,7 @@ class DiffEnv(VectorEnv):
         task: task on the simulator's device and dtype.
         scene: its robot.
         integration: default the task's "default".
-        num_envs, horizon, threads, factors: see Simulator; env.sim.factors has the factors.
+        num_envs, horizon, threads, factors, forces: see Simulator; env.sim has the factors and the forces.
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
@@ -79,6 +79,7 @@ class DiffEnv(VectorEnv):
         max_episode_steps: int | None = None,
         render_mode: RenderMode | None = None,
         factors: bool = False,
+        forces: bool = False,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
@@ -100,6 +101,7 @@ class DiffEnv(VectorEnv):
             dtype,
             threads,
             factors=factors,
+            forces=forces,
         )
         self.device, self.dtype = self.sim.device, dtype
         real = np.float32 if dtype == torch.float32 else np.float64
@@ -179,7 +181,7 @@ class DiffEnv(VectorEnv):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
             raise ActionError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
-        start = (self.qpos, self.qvel, action, self.sim.factors)
+        start = (self.qpos, self.qvel, action, self.sim.factors, self.sim.forces)
         recorded = torch.is_grad_enabled() and any(part.requires_grad for part in start)
         if recorded and self._recorded == self.horizon:
             raise RuntimeError(
@@ -292,7 +294,7 @@ class DiffEnv(VectorEnv):
         return self._obs
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the simulator's factors that continues the episodes exactly, as of the start of a window."""
+        """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
         return {
             "task": self.task.name,
             "qpos": self.qpos.detach().clone(),

@@ -48,7 +48,7 @@ def relative_error(value, expected):
 # Against MuJoCo
 
 
-def mujoco_acceleration(scene, qpos, qvel, ctrl):
+def mujoco_acceleration(scene, qpos, qvel, ctrl, forces=None):
     model = copy.copy(scene.mj_model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     muscles = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
@@ -62,6 +62,8 @@ def mujoco_acceleration(scene, qpos, qvel, ctrl):
         data.qpos, data.qvel, data.ctrl = qpos[e], qvel[e], low + (ctrl[e] + 1) / 2 * (high - low)
         if model.na:  # of a <muscle>, whose activation follows ctrl at once here
             data.act = (ctrl[e, muscles] + 1) / 2
+        if forces is not None:
+            data.xfrc_applied = forces[e]
         mujoco.mj_forward(model, data)
         qacc[e] = data.qacc
     return qacc
