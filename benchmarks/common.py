@@ -208,7 +208,8 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     columns = max(1, round(len(grid[0]) * size[0] / 1.8))
-    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
+    if legend:
+        figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     print(path)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import bptt
+import pfpn
 import ppo_baseline
 import sapo
 import shac
@@ -53,7 +54,7 @@ def restore(run: Run, learner: Learner, restore: Callable[[Run, Learner], Learne
 def main(directory: str, *setting: str) -> None:
     Run.restore = restore
     finalize, distributed.finalize = distributed.finalize, lambda: None  # the ranks stay connected until the last one
-    for script in (bptt, ppo_baseline, sapo, shac):
+    for script in (bptt, pfpn, ppo_baseline, sapo, shac):
         if script is shac:
             shac.Actor.sample_noise, DiffEnv._draw, distributed.finalize = sample_noise, draw, finalize
         rank, path = distributed.rank(), Path(directory) / script.__name__

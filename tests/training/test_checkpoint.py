@@ -70,7 +70,7 @@ def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> Non
     torch.manual_seed(0)
     args = parse(SCRIPTS[name].Args, "--env cartpole --device cpu --num-envs 2 --horizon 4".split())
     env = diffsim.make("cartpole", num_envs=2, horizon=4)
-    learner = getattr(SCRIPTS[name], {"ppo_baseline": "PPO"}.get(name, name.upper()))(args, env)
+    learner = getattr(SCRIPTS[name], {"ppo_baseline": "PPO", "pfpn": "PPO"}.get(name, name.upper()))(args, env)
     with torch.no_grad():
         for parameter in learner.policy.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
