@@ -31,6 +31,7 @@ from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.restarts import best_of_random_starts, starting_actions
 from diffsim.planning.system import System
+from diffsim.tasks import TASKS
 from diffsim.training import (
     Count,
     Finite,
@@ -150,8 +151,11 @@ class Args(Flags):
         return dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
 
     def check(self) -> None:
+        super().check()
         if distributed.size() > 1:
             fail("trains in one process; start it without torchrun")
+        if TASKS[self.env].timed:
+            fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
         if self.env == "cartpole" and self.reward == "target":
             fail("--reward target is of robots that walk or swim; cartpole has --reward native")
         least = dict(horizon=2, samples=2, guiding_samples=max(2, self.guides), restarts=self.guides)

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from diffsim.planning import Dynamics
+from diffsim.tasks import TASKS
 from diffsim.training import (
     ClippedAdam,
     Count,
@@ -145,6 +146,8 @@ class Args(ParallelFlags):
             fail(f"--rollout-lengths {self.rollout_lengths[0]} {self.rollout_lengths[1]} are the wrong way round")
         if self.buffer_size < (rows := self.num_envs * (1 + self.sample_enhance)):
             fail(f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a control step")
+        if self.sample_enhance and TASKS[self.env].timed:
+            fail(f"--sample-enhance takes Jacobians of states that do not hold the time, on which {self.env} depends")
         if self.sample_enhance and (self.contact == "firm" or self.randomise):
             fail("--sample-enhance takes Jacobians of one robot: neither --contact firm nor --randomise goes with it")
 

@@ -21,6 +21,8 @@ from diffsim.tasks import TASKS
 
 Array = NDArray[np.float64]
 
+ROBOTS = [name for name in TASKS if TASKS[name].asset == f"{name}.xml"]  # one task of each
+
 # A free sphere of 2 kg; it falls, rolls, slides and rests.
 BALL = """
 <mujoco>

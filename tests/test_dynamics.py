@@ -16,6 +16,7 @@ from scenes import (
     BLOCK,
     CRANE,
     PENDULUM,
+    ROBOTS,
     SHOULDER,
     acceleration,
     acting_states,
@@ -77,7 +78,7 @@ def check_against_mujoco(scene, dtype, rng):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_task_accelerations_are_mujocos(name, dtype, rng):
     check_against_mujoco(task_scene(name), dtype, rng)
 
@@ -169,7 +170,7 @@ def check_against_reference(scene, qpos, qvel, ctrl, integration):
 
 
 @pytest.mark.parametrize("integrator, theta", INTEGRATORS)
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_task_steps_are_the_references(name, integrator, theta, rng):
     scene = task_scene(name)
     states = acting_states(scene, 3, rng)

@@ -8,6 +8,7 @@ import torch
 from scenes import (
     BALL,
     HINGE,
+    ROBOTS,
     SHOULDER,
     acting_states,
     check_that_ground_and_limits_act,
@@ -85,7 +86,7 @@ def check_gradients(scene, states, rng, optional=None, **simulator):
 
 
 @pytest.mark.parametrize("integrator, theta", INTEGRATORS)
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
     scene = task_scene(name)
     states = acting_states(scene, 8, rng)
@@ -141,7 +142,7 @@ def test_quaternion_of_any_length(rng):
     check_gradients(scene, (longer, qvel, ctrl), rng)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_float32_gradient_is_that_of_float64(name, rng):
     scene, simulator = task_scene(name), {"integration": TASKS[name].integration("default")}
     states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 16, rng)]
@@ -235,7 +236,9 @@ def test_gradcheck_through_policy_reward_and_three_control_steps(name, rng):
 
     def total_reward(policy):
         # gradcheck holds on to its first graph while it makes others, so each has an environment of its own.
-        env = DiffEnv(task(dtype=torch.float64), scene, 2, horizon=3, dtype=torch.float64, early_termination=False)
+        env = DiffEnv(
+            task(dtype=torch.float64), scene, 2, seed=0, horizon=3, dtype=torch.float64, early_termination=False
+        )
         obs, total = env.set_state(qpos, qvel), 0.0
         for _ in range(3):
             obs, reward, _, _, _ = env.step(torch.tanh((obs @ features) @ policy))
