@@ -543,7 +543,7 @@ def follow(slow: nn.Module, fast: nn.Module, rate: float) -> None:
 class PPO:
     """Proximal Policy Optimization, with the constants of ppo_baseline.py."""
 
-    target_kl, lr_bounds, clip, value_coef, bound_coef = 0.008, (1e-6, 1e-2), 0.2, 2.0, 1e-4
+    target_kl, lr_bounds, clip_coef, value_coef, bound_coef = 0.008, (1e-6, 1e-2), 0.2, 2.0, 1e-4
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
@@ -594,7 +594,7 @@ class PPO:
                 kl = (log_ratio.detach().expm1() - log_ratio.detach()).mean()  # estimated; not below zero
                 adapt(self.optimizer.lr, distributed.average(kl), self.target_kl, self.lr_bounds)
                 ratio = log_ratio.exp()
-                clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
+                clipped = ratio.clamp(1 - self.clip_coef, 1 + self.clip_coef)
                 policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()
                 value_loss = (value - target).square().mean()
                 bound_loss = (mixture.loc.abs() - 1.1).clamp(min=0).square().mean(-1).sum(-1).mean()

@@ -149,7 +149,7 @@ def test_a_bandit_is_learnt_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_linear_quadratic_system_is_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
     """The optimal gain is that of the discounted Riccati equation; entropy shows more actions."""
-    learner = learnt(False, 0.1, 400, monkeypatch)
+    learner = learnt(False, 0.1, 300, monkeypatch)
     p = 1.0
     for _ in range(200):
         p = 1 + 0.9 * 0.64 * p - (0.9 * 0.8 * p) ** 2 / (1 + 0.9 * p)

@@ -125,7 +125,7 @@ class Task:
 
     def first_step(self, rand: Tensor) -> Tensor:
         """At which control step (...) int64 of the task's own time an episode from rand (..., num_random) starts."""
-        return torch.zeros_like(rand[..., 0], dtype=torch.int64)
+        return torch.zeros(rand.shape[:-1], dtype=torch.int64, device=rand.device)
 
     def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
         """`observe` at a control step (...) int64, which is `first_step` at the start of an episode."""
