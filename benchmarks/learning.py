@@ -54,8 +54,8 @@ FIRM = ("--contact", "firm")
 SHAC_FIRM = ("shac", *FIRM, "--num-envs", "256")
 PPO_MANY_FIRM = (PPO, *FIRM, *PPO_MANY[3:-2], "--iterations", "1200")
 SAC = "sac_baseline"
-PFPN_PPO = ("pfpn", "--algorithm", "ppo")
-PFPN_SHAC = ("pfpn", "--algorithm", "shac")
+PFPN_PPO = ("pfpn", "--algorithm", "ppo", *PPO_MANY[1:-2], "--iterations", "1200")
+PFPN_SHAC = ("pfpn", "--algorithm", "shac", "--accuracy", "fast")
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
@@ -95,7 +95,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "pfpn_ppo":           PFPN_PPO,
     "pfpn_shac":          PFPN_SHAC,
     "pfpn_sac":           ("pfpn", "--algorithm", "sac"),
-    "pfpn_gaussian_ppo":  (*PFPN_PPO, "--policy", "gaussian"),
+    **{f"pfpn_{p}_ppo":   (*PFPN_PPO, "--policy", p) for p in ("gaussian", "gmm", "discrete")},
     "pfpn_gaussian_shac": (*PFPN_SHAC, "--policy", "gaussian"),
     **{f"pfpn_{how}":     (*PFPN_PPO, "--resampling", how) for how in ("uniform", "none")},
     **{f"pfpn_{n}":       (*PFPN_PPO, "--particles", str(n)) for n in (5, 10, 100)},
@@ -116,7 +116,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation", "firm", "orders", "off_policy", "models", "particles", "resampling",
+    "ablation", "firm", "orders", "off_policy", "models", "particles", "resampling", "imitation",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -141,8 +141,10 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "models":        ("MBPO and SE-MBPO", ("shac", "mbpo", "se_mbpo"), ("cartpole", "ant")),
     "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"), ("cartpole",)),
     "particles":     ("PFPN and a Gaussian policy, by PPO, through the simulator's gradient and off-policy",
-                      ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac"),
+                      ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac", SAC),
                       ("hopper", "ant", "humanoid")),
+    "imitation":     ("Imitation by the four policies", ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_gmm_ppo",
+                      "pfpn_discrete_ppo", "pfpn_shac", "pfpn_gaussian_shac"), ("humanoid_imitation",)),
     "resampling":    ("PFPN by PPO: its 35 particles, others, and other ways to resample them", ("pfpn_ppo",
                       "pfpn_uniform", "pfpn_none", "pfpn_5", "pfpn_10", "pfpn_100"), ("hopper", "ant", "humanoid")),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
