@@ -51,10 +51,8 @@ def grounds(env: DiffEnv) -> dict[str, Tensor]:
     """Factors (len(FACTORS),) of the firm constants, by the name of the ground."""
     soft = torch.tensor([soft_factors(env.scene).get(name, 1.0) for name in FACTORS])
     found = {}
-    for (
-        name,
-        share,
-    ) in GROUNDS.items():  # a limit's damping, which is none where it is soft, goes with the share, as in Variation
+    # A limit's damping, which is none where it is soft, goes with the share, as in Variation.
+    for name, share in GROUNDS.items():
         found[name] = torch.where(soft > 0, soft.clamp(min=1e-30) ** (1 - share), share)
     varied = torch.tensor([name in VARIED["stiffness"] for name in FACTORS])
     return found | {f"{FIRMER:g} x firm": torch.where(varied, FIRMER, 1.0)}
