@@ -109,7 +109,7 @@ class Args(Flags):
             fail("one process alone: sequences are not shared among ranks")
         if task.timed:
             fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
-        if self.early_termination and task.min_height is not None:
+        if self.early_termination and task.falls():
             fail(f"{self.env} ends episodes early, and all sequences have one length: give --no-early-termination")
         if task.episode_length % self.horizon:
             fail(f"--horizon {self.horizon} does not divide the {task.episode_length} control steps of an episode")
