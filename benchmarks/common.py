@@ -86,6 +86,23 @@ class CommonFlags:
             tables.fill(DOCS / page, name, text)
 
 
+@dataclass
+class CheckpointFlags(CommonFlags):
+    """Of benchmarks of saved policies, which say their task."""
+
+    checkpoints: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
+    ] = ()
+    env: tyro.conf.Suppress[Tasks] = TASKS
+
+    @property
+    def measured(self) -> tuple[Path, ...]:
+        """Those to measure: none with --draw-only. Without any the benchmark ends with one line."""
+        if not (self.checkpoints or self.draw_only):
+            fail("of what? give a checkpoint or the directory of a run")
+        return () if self.draw_only else self.checkpoints
+
+
 class Case(NamedTuple):
     """A policy with the task on which it was trained."""
 

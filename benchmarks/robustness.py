@@ -23,13 +23,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import common
 import mujoco
 import numpy as np
 import torch
-import tyro
 from common import Case, Line, Panel, load_case, parse, plot
 from tables import digits, markdown
 from torch import Tensor
@@ -54,11 +53,7 @@ COLUMNS = ("task", "learner", "contact", "seed", "mass", "forward N", "sideways 
 
 
 @dataclass
-class Args(common.CommonFlags):
-    checkpoints: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
-    ] = ()
-    env: tyro.conf.Suppress[common.Tasks] = common.TASKS
+class Args(common.CheckpointFlags):
     num_envs: Count = 64  # robots that begin to walk
     body: str = ""  # the pushed one, by its name in the MJCF (default: the robot's first)
     after: Positive = 3.0  # s from the beginning of the push in which a robot falls, or has survived
@@ -274,9 +269,7 @@ def table(rows: list[dict[str, str]]) -> str:
 
 
 def main(args: Args) -> None:
-    if not (args.checkpoints or args.draw_only):
-        fail("of what? give a checkpoint or the directory of a run")
-    for case, body in [] if args.draw_only else [load(path, args) for path in args.checkpoints]:
+    for case, body in [load(path, args) for path in args.measured]:
         print(f"{case.label}: {case.env.task.name}, {case.saved.script}.py", flush=True)
         measure(case, body, args)
     if rows := args.read("robustness_curves"):
