@@ -185,11 +185,12 @@ def collect(args: Args, learner: str, env: TaskName) -> None:
         returns = np.array([float(row.get("return") or "nan") for row in rows])
         if np.isnan(returns).all():
             continue
+        columns = (*COLUMNS, *(name for name in rows[0] if name.startswith("models_")))
         keep = {*np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).round().astype(int)}
         keep |= {np.nanargmax(returns), *np.flatnonzero(returns >= RETURNS[env][0])[:1]}
         keep |= {k for k, row in enumerate(rows) if row.get("eval_return")}
         for row in (rows[k] for k in sorted(keep)):
-            points.append({"seed": seed(folder)} | {c: row.get(c) and f"{float(row[c]):.6g}" or "" for c in COLUMNS})
+            points.append({"seed": seed(folder)} | {c: row.get(c) and f"{float(row[c]):.6g}" or "" for c in columns})
     args.write(f"{learner}_{env}", points)
     records = {RECORDS[env]} if learner.startswith("sapo") and env in RECORDS else set()
     if found := summary(args.runs / learner, env, sorted({*RETURNS[env][1]} | records)):
