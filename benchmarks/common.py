@@ -28,8 +28,9 @@ from diffsim.training.flags import check_ranges
 
 RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
 OUTPUT = ROOT / "runs" / "benchmarks"
-TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu"]
-TASKS: tuple[TaskName, ...] = get_args(TaskName)  # of the SHAC paper
+TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu", "humanoid_imitation"]
+LEARNT: tuple[TaskName, ...] = get_args(TaskName)
+TASKS = LEARNT[:-1]  # of the SHAC paper
 Tasks = Annotated[tuple[TaskName, ...], tyro.conf.arg(aliases=["--env-id"])]
 F = TypeVar("F", bound="CommonFlags")
 
@@ -168,7 +169,7 @@ def measured(
         for row in measure(args, env):
             print("  " + ", ".join(f"{column} {tables.digits(value)}" for column, value in row.items()), flush=True)
             args.merge(name, [row], key)
-    return sorted(args.read(name), key=lambda row: TASKS.index(row["task"].split()[0]))
+    return sorted(args.read(name), key=lambda row: LEARNT.index(row["task"].split()[0]))
 
 
 Numbers = Sequence[float] | np.ndarray

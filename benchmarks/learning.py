@@ -23,7 +23,7 @@ from typing import Literal
 
 import common
 import numpy as np
-from common import TASKS, Line, Panel, TaskName, plot
+from common import LEARNT, TASKS, Line, Panel, TaskName, Tasks, plot
 from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, parse, passing, seed, summary
 from tables import ROOT, Row, markdown, read_csv
 
@@ -42,6 +42,7 @@ RETURNS: dict[TaskName, tuple[int, tuple[int, ...], dict[str, int]]] = {
     "ant":          (5000, (5000, 7300, 7661), {"shac": 7661, PPO: 6605}),
     "humanoid":     (5000, (5000, 7000, 8387), {"shac": 8387, PPO: 7293}),
     "humanoid_mtu": (4246, (4246, 6114, 6964), {"shac": 6114, PPO: 4246}),
+    "humanoid_imitation": (500, (),            {}),
 }
 # The best published of any learner, timed for SAPO: AHAC's (Georgiev et al. 2024).
 RECORDS: dict[TaskName, int] = {"ant": 9313, "humanoid": 9845}
@@ -170,6 +171,7 @@ PAGES = {"muscles": ("humanoid_mtu", MUSCLE_COLUMNS), "orders": ("pods", ORDER_C
 
 @dataclass
 class Args(ScriptFlags):
+    env: Tasks = LEARNT  # tasks
     algorithm: str = "shac"  # learner: a script in the repository's root, without .py, or a variant, e.g. shac_1024
     experiment: Name | None = None  # several learners beside each other, among them those of the paper's Figures 4 to 9
     seeds: tuple[int, ...] = (1, 2, 3)  # seeds of each
@@ -295,7 +297,7 @@ def report(args: Args, name: Name) -> None:
 
 
 def main(args: Args) -> None:
-    _, learners, tasks = EXPERIMENTS[args.experiment] if args.experiment else ("", (args.algorithm,), TASKS)
+    _, learners, tasks = EXPERIMENTS[args.experiment] if args.experiment else ("", (args.algorithm,), LEARNT)
     scripts = {learner: LEARNERS.get(learner, (learner,)) for learner in learners}
     if missing := [script for script, *_ in scripts.values() if not (ROOT / f"{script}.py").is_file()]:
         fail(f"no script {missing[0]}.py in {ROOT}")
@@ -314,9 +316,9 @@ def main(args: Args) -> None:
         report(args, args.experiment)
     else:
         rows = [row for row in args.read("learning") if row["learner"] == args.algorithm]
-        rows.sort(key=lambda row: TASKS.index(row["task"]))
+        rows.sort(key=lambda row: LEARNT.index(row["task"]))
         args.publish("results", markdown(rows, RESULT_COLUMNS), LEARNER_PAGES.get(args.algorithm, "experiments.md"))
-        draw(args, args.algorithm, learners, [env for env in TASKS if curves(args, args.algorithm, env)])
+        draw(args, args.algorithm, learners, [env for env in LEARNT if curves(args, args.algorithm, env)])
 
 
 if __name__ == "__main__":
