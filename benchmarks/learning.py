@@ -57,6 +57,7 @@ PPO_MANY_FIRM = (PPO, *FIRM, *PPO_MANY[3:-2], "--iterations", "1200")
 SAC = "sac_baseline"
 PFPN_PPO = ("pfpn", "--algorithm", "ppo", *PPO_MANY[1:-2], "--iterations", "1200")
 PFPN_SHAC = ("pfpn", "--algorithm", "shac", "--accuracy", "fast")
+PFPN_SAC = ("pfpn", "--algorithm", "sac")
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
@@ -95,9 +96,10 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "se_mbpo":            ("mbpo", "--sample-enhance", "4"),
     "pfpn_ppo":           PFPN_PPO,
     "pfpn_shac":          PFPN_SHAC,
-    "pfpn_sac":           ("pfpn", "--algorithm", "sac"),
+    "pfpn_sac":           PFPN_SAC,
     **{f"pfpn_{p}_ppo":   (*PFPN_PPO, "--policy", p) for p in ("gaussian", "gmm", "discrete")},
     "pfpn_gaussian_shac": (*PFPN_SHAC, "--policy", "gaussian"),
+    "pfpn_gaussian_sac":  (*PFPN_SAC, "--policy", "gaussian"),
     **{f"pfpn_{how}":     (*PFPN_PPO, "--resampling", how) for how in ("uniform", "none")},
     **{f"pfpn_{n}":       (*PFPN_PPO, "--particles", str(n)) for n in (5, 10, 100)},
     "sapo":               SAPO,
@@ -142,7 +144,8 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "models":        ("MBPO and SE-MBPO", ("shac", "mbpo", "se_mbpo"), ("cartpole", "ant")),
     "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"), ("cartpole",)),
     "particles":     ("PFPN and a Gaussian policy, by PPO, through the simulator's gradient and off-policy",
-                      ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac", SAC),
+                      ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac",
+                      "pfpn_gaussian_sac"),
                       ("hopper", "ant", "humanoid")),
     "imitation":     ("Imitation by the four policies", ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_gmm_ppo",
                       "pfpn_discrete_ppo", "pfpn_shac", "pfpn_gaussian_shac"), ("humanoid_imitation",)),
@@ -241,6 +244,21 @@ def table(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> lis
     return rows
 
 
+def ratios(args: Args, tasks: Sequence[TaskName]) -> list[Row]:
+    """Of PFPN and the Gaussian policy, by each algorithm: the best return within control steps that all runs made."""
+    rows = list[Row]()
+    for env, algorithm in product(tasks, ("ppo", "shac", "sac")):
+        both = [curves(args, f"{policy}_{algorithm}", env) for policy in ("pfpn", "pfpn_gaussian")]
+        if all(both):
+            end = min(run["control_steps"][-1] for runs in both for run in runs)
+            best = [[np.nanmax(run["return"][run["control_steps"] <= end]) for run in runs] for runs in both]
+            row: dict[str, object] = {"task": env, "algorithm": algorithm, "control steps": f"{end / 1e6:.3g} M"}
+            for policy, values in zip(("PFPN", "Gaussian"), best, strict=True):
+                row[policy] = f"{mean(values):.0f} ± {pstdev(values):.0f}" if len(values) > 1 else f"{values[0]:.0f}"
+            rows.append(row | {"PFPN / Gaussian": f"{mean(best[0]) / mean(best[1]):.2f}"})
+    return rows
+
+
 def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[TaskName]) -> None:
     """Each seed (thin) and the median (bold) against control steps and seconds, on log axes if ends lie far apart."""
     grid = list[list[Panel]]()
@@ -291,7 +309,10 @@ def report(args: Args, name: Name) -> None:
         args.publish("results", markdown(rows, columns), f"{page}.md", everywhere)
         return draw(args, page, learners, tasks)
     rows = table(args, learners, tasks)
-    args.publish(name, f"{markdown(rows)}\n![{title}]({args.link(name)})\n", "experiments.md")
+    of_particles = name in ("particles", "resampling", "imitation")
+    beside = f"{markdown(ratios(args, tasks))}\n" if of_particles else ""
+    page = "pfpn.md" if of_particles else "experiments.md"
+    args.publish(name, f"{markdown(rows)}\n{beside}![{title}]({args.link(name)})\n", page)
     if compared := [env for env in tasks if env in {row["task"] for row in rows}]:
         draw(args, name, learners, compared)
 
