@@ -116,7 +116,7 @@ def test_a_bandit_is_learnt_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_linear_quadratic_system_is_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_system_controlled(learnt(False, 0.1, 300, monkeypatch).policy)
+    assert_system_controlled(learnt(False, 0.1, 75, monkeypatch).policy)
 
 
 def test_a_run_resumes_bitwise_with_its_buffer(tmp_path: Path) -> None:
