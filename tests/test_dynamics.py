@@ -90,12 +90,6 @@ def test_tree_accelerations_are_mujocos(base, seed, rng):
     check_against_mujoco(tree_scene(base, seed), torch.float64, rng)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_tree_accelerations_in_float32_are_mujocos(seed, rng):
-    """With ball joints, which no task has."""
-    check_against_mujoco(tree_scene("ball", seed), torch.float32, rng)
-
-
 def test_ball_joint_on_the_world_has_mujocos_accelerations(rng):
     check_against_mujoco(parse(SHOULDER), torch.float64, rng)
 

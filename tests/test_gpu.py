@@ -37,7 +37,7 @@ def compiled(module: wp.Module, arch: int) -> Path:
     return result
 
 
-@pytest.mark.parametrize("name", DISTINCT)
+@pytest.mark.parametrize("name", sorted({*DISTINCT} - {"humanoid"}))  # the ant below is much like it
 def test_kernels_compile_for_a_gpu_without_one(name: str) -> None:
     """And they hold no code for what the scene lacks."""
     scene = task_scene(name)
