@@ -76,9 +76,9 @@ def make(
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         factors: let constants differ between environments: `env.sim.factors`, see Simulator.
         forces: let external forces act on the bodies: `env.sim.forces`, see Simulator.
-        terrain: the ground, vertices (x, z) [m] of one profile (K, 2) or of one for each environment (num_envs, K, 2), in
-            place of the plane z = 0: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task observes,
-            rewards and ends by are then those over the ground below the root.
+        terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
+            of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
+            observes, rewards and ends by are then those over the ground below the root.
         clip: the motion that humanoid_imitation tracks, or its .npz file, see read_clip; default the shipped run.
 
     Raises:

@@ -366,7 +366,7 @@ class DiffEnv(VectorEnv):
 
     @torch.no_grad()
     def _start_states(self, rand: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The first step (...), qpos, qvel and obs (..., each) of rand (..., num_random), of all environments or rows."""
+        """The first step (...), qpos, qvel and obs (..., each) of rand (..., num_random), of all or of rows."""
         if not self.stochastic_init:
             rand = torch.full_like(rand, 0.5)
         first, (qpos, qvel) = self.task.first_step(rand), self.task.reset(rand)

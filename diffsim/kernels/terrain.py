@@ -79,7 +79,7 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         a = m.terrain[row, below]
         above = z - a[1] - (x - a[0]) * a[3] / a[2]
         result = vec4(above - r, T(0.0), T(1.0), T(0.0))
-        # The ground straight below or above is no nearer than the nearest, so what is farther off in x need not be seen.
+        # The nearest point is no farther than the one straight below or above: nor is it so in x.
         bound = wp.abs(above)
         if above > T(0.0):
             bound = wp.min(above, reach)
