@@ -57,4 +57,5 @@ class System(Dynamics):
         return self.task.reward(self._observe(x, action), action)
 
     def _observe(self, x: Tensor, action: Tensor) -> Tensor:
-        return self.task.observe(*self.over_ground(x).split((self.nq, self.nv), -1), action)
+        qpos, qvel = self.over_ground(x).split((self.nq, self.nv), -1)
+        return self.task.observe(qpos, qvel, action)
