@@ -48,7 +48,7 @@ def pressed(scene: Scene, x: np.ndarray, rng: np.random.Generator):
 
 def everywhere(rng: np.random.Generator) -> np.ndarray:
     """Places on the hills, most of them near a vertex."""
-    return np.concatenate([rng.uniform(-1.5, 3.5, 40), *(rng.uniform(x - 0.05, x + 0.05, 10) for x in HILLS[:, 0])])
+    return np.concatenate([rng.uniform(-1.5, 3.5, 16), *(rng.uniform(x - 0.05, x + 0.05, 6) for x in HILLS[:, 0])])
 
 
 def hopping(vertices: np.ndarray, count: int, rng: np.random.Generator):
@@ -79,7 +79,7 @@ def test_steps_of_a_ball_are_the_references(ball, rng):
     runs = np.diff(HILLS, axis=0)
     slopes = np.stack([-runs[:, 1], runs[:, 0]], 1) / np.linalg.norm(runs, axis=1, keepdims=True)
     between = ~np.isclose(normals[:, None], slopes, atol=1e-6).all(2).any(1)
-    assert between.sum() > 10  # in valleys and on ridges
+    assert between.sum() > 5  # in valleys and on ridges
 
 
 def test_steps_of_the_hopper_are_the_references(rng):
