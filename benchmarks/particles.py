@@ -2,14 +2,17 @@
 
     python benchmarks/particles.py                       a bandit with two equal peaks; ten minutes of a CPU
     python benchmarks/particles.py --run <directory>     a run of pfpn.py instead, trained with --log-particles
+    python benchmarks/particles.py --resample <run>      what one resampling does to the return of a trained policy
 
 Writes bandit.csv (each policy's actions near the peaks), bandit_density.csv and particles.csv (locations and weights
-of the first seed's particles, or of the run's), a picture of each, and with --update-results the table of docs/pfpn.md.
-PPO trains all policies with one setting. The Gaussian's standard deviation begins at 0.37.
+of the first seed's particles, or of the run's), a picture of each, and with --update-results the table of docs/pfpn.md;
+with --resample resampling.csv and its table instead. PPO trains all policies with one setting. The Gaussian's standard
+deviation begins at 0.37.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +27,8 @@ from common import CommonFlags, Line, Panel, parse, plot
 from tables import ROOT, markdown, read_csv
 from torch import Tensor, nn
 
-from diffsim.training import fail
+from diffsim.training import Count, checkpoint, evaluate, fail
+from diffsim.training.assess import make_env
 
 sys.path.append(str(ROOT))
 import pfpn  # noqa: E402
@@ -41,6 +45,8 @@ Log = list[dict[str, str]]
 @dataclass
 class Args(CommonFlags):
     run: Path | None = None  # directory of a run of pfpn.py, trained with --log-particles, whose particles are drawn
+    resample: tuple[Path, ...] = ()  # checkpoints of pfpn.py, or its runs, that are resampled once
+    episodes: Count = 256  # before it and after it
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5)  # seeds of the bandit
 
 
@@ -120,6 +126,35 @@ def measure(args: Args) -> None:
     args.write("bandit_density", densities)
 
 
+def resample(path: Path, args: Args) -> dict[str, object]:
+    """Returns of the policy with its noise before and after a resampling by the weights that were seen before it."""
+    path = path / "checkpoint.pt" if path.is_dir() else path
+    state = checkpoint.load(path, "pfpn")
+    settings = pfpn.parse(pfpn.Args, ["--evaluate", str(path), "--device", args.device, "--resampling-interval", "1"])
+    if settings.policy != "pfpn":
+        fail(f"{path} has a policy without particles to resample: --policy {settings.policy}")
+    env = make_env(settings, args.episodes)
+    learner = pfpn.ALGORITHMS[settings.algorithm](settings, env)
+    checkpoint.restore(learner, state)
+    learner.resampling.total.zero_()
+    returns = list[Tensor]()
+    for _ in range(2):
+        torch.manual_seed(0)
+        returns.append(evaluate(env, lambda obs: learner.act(obs)[0]).returns.double())
+        if len(returns) == 1:
+            moved = float(learner.resampling.moved)
+            found = learner.resampling.end_iteration(learner.actor.head, learner.optimizer)
+    error = math.sqrt(sum(float(x.var()) for x in returns) / args.episodes)  # of the difference
+    row: dict[str, object] = {"task": settings.env, "algorithm": settings.algorithm, "seed": settings.seed}
+    row |= {"iteration": state["iteration"], "moved": float(found["particles/moved"]) - moved}
+    row |= {
+        "of": learner.resampling.total.numel(),
+        "before": returns[0].mean().item(),
+        "after": returns[1].mean().item(),
+    }
+    return row | {"standard error of the difference": error}
+
+
 def panel(rows: Sequence[dict[str, str]], each: str, x: str, y: str, title: str) -> Panel:
     """A line for each value of a column."""
     lines = list[Line]()
@@ -146,6 +181,10 @@ def draw(args: Args) -> None:
 
 
 def main(args: Args) -> None:
+    if args.resample:
+        rows = [resample(path, args) for path in args.resample]
+        found = args.merge("resampling", rows, ("task", "algorithm", "seed"))
+        return args.publish("resampled", markdown(found), "pfpn.md")
     if args.run and not args.draw_only:
         if not (rows := paths(read_csv(args.run / "progress.csv"))):
             fail(f"{args.run}: no progress.csv of a run of pfpn.py with --log-particles")
