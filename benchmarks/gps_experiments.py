@@ -1,29 +1,30 @@
 """Guided policy search: runs its variants on tasks and seeds, and draws and tabulates what came of them.
 
     python benchmarks/gps_experiments.py                  the runs of docs/gps.md; finished ones are kept
-    python benchmarks/gps_experiments.py --env cartpole --seeds 1 --variants full nonguided    a part of them
+    python benchmarks/gps_experiments.py --env hopper --cases full adaptive --seeds 1 2 --train-only    a part of them
     python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
+    python benchmarks/gps_experiments.py --list           a command for each run, to be run side by side
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
     python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
 
 Writes gps_runs.csv (every iteration of every run), gps_generalisation.csv (the policy, the DDP controller
-and that of the nearest state, from perturbed starts and under pushes), gps_paths.csv (where the root went) and
-gps_time.csv (one iteration of iLQR), their tables in gps.md, and the pictures figures/gps_variants.png, gps_paths.png
-and gps_generalisation.png: Figures 2, 1 and 3 of the paper. An interrupted run is resumed.
+and that of the nearest step, from perturbed starts and under pushes), gps_paths.csv (where the root went), their
+tables in gps.md, and the pictures figures/gps_variants.png, gps_paths.png and gps_generalisation.png: Figures 2, 1 and
+3 of the paper. An interrupted run is resumed.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import shlex
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from statistics import mean, median
 from typing import Annotated, Any, get_args
@@ -33,11 +34,11 @@ import numpy as np
 import torch
 import tyro
 from common import DOCS, OUTPUT, RESULTS
-from tables import ROOT, fill, markdown, read_csv, write_csv
+from tables import ROOT, fill, markdown, origins, read_csv, write_csv
 from torch import Tensor
 
 import diffsim
-from diffsim.planning import REAL, ilqr
+from diffsim.planning import REAL, nearest_feedback
 from diffsim.training import checkpoint, fail, load_policy, parse_penalty
 
 sys.path.append(str(ROOT))
@@ -46,25 +47,36 @@ import gps  # noqa: E402
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
-HALF = "--iterations 30 --horizon 160 --ilqr-iterations 100"
-SHORT = "--iterations 30 --horizon 100 --ilqr-iterations 100"
-# What docs/gps.md shows, per task: seeds, variants, flags
-SUITE: dict[str, tuple[tuple[int, ...], tuple[gps.Variant, ...], str]] = {
-    "cartpole": ((1, 2, 3, 4, 5), ("full", "unregularized"), "--iterations 30"),
-    "hopper": ((1,), ("full", "policy-gradient", "single-example"), HALF),
-    "swimmer": ((1,), ("full",), HALF),
-    "walker": ((1,), ("full",), SHORT),
-    "ant": ((1,), ("full",), SHORT),
+# What a run is called, and its flags: Figure 2's variants, adaptive guides of Section 4.2, what feedback consists of,
+# and fewer samples
+CASES: dict[str, str] = {variant: f"--variant {variant}" for variant in get_args(gps.Variant)}
+CASES |= {"adaptive": "--variant full --adaptive 10 --adaptive-iterations 10"}
+ABLATIONS = {"only": "--imitation 1000", "unbounded": "--bound 100", "tail": "--tail 0", "narrow": "--spread 1"}
+ABLATIONS |= {"stiff": "--tracking 0.05", "before": "--bound 100 --tail 0 --spread 1 --tracking 0.05"}
+ABLATIONS |= {"short": "--horizon 160", "few": "--samples 4 --guiding-samples 10 --active 40"}
+CASES |= {f"feedback-{name}": f"--variant feedback {flags}" for name, flags in ABLATIONS.items()}
+ABLATED = [f"feedback-{name}" for name in ABLATIONS if name != "short"]
+FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
+PLAN = "--ilqr-iterations 2 --demonstration benchmarks/plans/"
+# What docs/gps.md shows, per task: seeds, cases, flags
+SUITE: dict[str, tuple[tuple[int, ...], tuple[str, ...], str]] = {
+    "cartpole": ((1, 2, 3, 4, 5), tuple(FIGURE_2), "--iterations 24"),
+    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), f"--imitation 14 --iterations 19 {PLAN}hopper_500.npz"),
+    "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--imitation 28 --iterations 31 {PLAN}walker_500.npz"),
+    "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--horizon 160 --iterations 24 {PLAN}swimmer_500.npz"),
 }
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
     "gps_guides gps_guides_std gps_fit eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
-    "gps_ess gps_guide_share sim_model_steps"
+    "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
-TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (250, 400)}  # returns to which learners are compared
+PLANNED = "full", "feedback", "feedback-short"  # cases whose generalisation is measured
+COMPARED = "full", "feedback", "feedback-few"  # cases whose samples are
+TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (600, 1200)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
-COLOURS = {variant: f"C{i}" for i, variant in enumerate(get_args(gps.Variant))}
+DRAWN = (*FIGURE_2, "feedback-short")
+COLOURS = {case: f"C{i}" for i, case in enumerate(CASES)}
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 STYLES = {"plan": ("k", 2.0, 3), "guides": ("0.6", 0.8, 1), "policy": ("C0", 0.8, 2)}  # colour, width, order
 AXES = {"cartpole": ("x (m)", "angle (rad)"), "swimmer": ("x (m)", "y (m)"), "ant": ("x (m)", "y (m)")}
@@ -78,21 +90,25 @@ class Args:
     """tasks"""
     seeds: tuple[int, ...] = ()
     """seeds (default: the suite's)"""
-    variants: tuple[gps.Variant, ...] = ()
-    """variants (default: the suite's)"""
+    cases: tuple[str, ...] = ()
+    """variants, adaptive, wide or feedback-wide (default: the suite's)"""
     jobs: int = 1
     """runs at a time, each with one thread"""
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
     count: int = 20
     """perturbed starts and pushes of each size"""
     runs: Path = ROOT / "runs" / "gps"
-    """directory of the runs: {runs}/{env}__{variant}__{seed}"""
+    """directory of the runs: {runs}/{env}__{case}__{seed}"""
     results: Path = OUTPUT / "cpu"
     """directory of the csv files"""
     docs: Path = OUTPUT
     """directory of gps.md, whose tables are filled, and of figures/"""
     update_results: bool = False
     """write to results/cpu and docs/ of this repository"""
+    train_only: bool = False
+    """only train: several such commands may run side by side"""
+    list: bool = False
+    """only print a command for each of the runs"""
     draw_only: bool = False
     """train nothing: collect, draw and tabulate the runs there are"""
     record: Path | None = None
@@ -138,10 +154,10 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 
-def train(directory: Path, flags: Sequence[str]) -> str:
-    """Trains, or resumes, or finds that it is done; returns what there is to say."""
-    path, (env, variant, seed) = directory / "checkpoint.pt", directory.name.split("__")
-    start = ["--env", env, "--variant", variant, "--seed", seed]
+def train(directory: Path, flags: Sequence[str], count: int) -> str:
+    """Trains, or resumes, or finds that it is done, and perturbs; returns what there is to say."""
+    path, (env, case, seed) = directory / "checkpoint.pt", directory.name.split("__")
+    start = ["--env", env, *CASES[case].split(), "--seed", seed]
     if path.exists():
         state = checkpoint.load(path, "gps")
         if state["iteration"] >= state["args"]["iterations"]:
@@ -150,37 +166,37 @@ def train(directory: Path, flags: Sequence[str]) -> str:
     command = [sys.executable, str(ROOT / "gps.py"), *start, "--run-dir", str(directory), "--threads", "1", *flags]
     with (directory.parent / f"{directory.name}.log").open("a") as log:
         code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT).returncode
-    return f"{directory.name}: {'done' if code == 0 else f'exit code {code}, see {log.name}'}"
+    if code:
+        return f"{directory.name}: exit code {code}, see {log.name}"
+    measure(directory, count)
+    return f"{directory.name}: done"
+
+
+def jobs(args: Args) -> dict[str, list[str]]:
+    """The flags of each run, by its name."""
+    result = {}
+    for env in args.env:
+        seeds, cases, flags = SUITE.get(env, ((1,), ("full",), "--iterations 30"))
+        for case, seed in product(args.cases or cases, args.seeds or seeds):
+            result[f"{env}__{case}__{seed}"] = [*flags.split(), *args.arguments]
+    return result
 
 
 def train_all(args: Args) -> None:
     args.runs.mkdir(parents=True, exist_ok=True)
-    jobs = []
-    for env in args.env:
-        seeds, variants, flags = SUITE.get(env, ((1,), ("full",), "--iterations 30"))
-        names = [f"{env}__{v}__{seed}" for v in args.variants or variants for seed in args.seeds or seeds]
-        jobs += [(args.runs / name, [*flags.split(), *args.arguments]) for name in names]
     with ThreadPoolExecutor(args.jobs) as pool:
-        for text in pool.map(lambda job: train(*job), jobs):
+        for text in pool.map(lambda job: train(args.runs / job[0], job[1], args.count), jobs(args).items()):
             print(text, flush=True)
 
 
-def time_ilqr(env: str = "hopper", horizon: int = 500, repeats: int = 5) -> list[Row]:
-    """Seconds of an iLQR iteration of one trajectory: Jacobians and quadratics, backward pass, line search."""
-    rows = []
-    for threads in (1, 0):
-        flags = ["--env", env, "--horizon", str(horizon), "--device", "cpu", "--threads", str(threads)]
-        search = gps.Search(gps.parse(gps.Args, flags), diffsim.make(env, 1))
-        system, rng = search.system, torch.Generator().manual_seed(1)
-        u = 0.1 * torch.randn(1, horizon, system.nu, generator=rng, dtype=REAL)
-        x, _, _ = system.rollout(system.start(), horizon, lambda t, _, u=u: u[:, t])  # type: ignore[misc]
-        ilqr(system, search.cost, x, u, 1)  # compiles
-        wall, cpu = time.perf_counter(), time.process_time()  # the second is not disturbed by other work on the machine
-        ilqr(system, search.cost, x, u, repeats)
-        wall, cpu = (time.perf_counter() - wall) / repeats, (time.process_time() - cpu) / repeats
-        seconds = {"seconds": round(wall, 3), "seconds of CPU": round(cpu, 3)}
-        rows.append(dict(env=env, horizon=horizon, threads=threads or "all cores") | seconds)
-    return rows
+def commands(args: Args) -> Iterator[str]:
+    """One for each run, of one thread."""
+    runs = args.runs.relative_to(ROOT) if args.runs.is_relative_to(ROOT) else args.runs
+    rest = ["--", *args.arguments] if args.arguments else []
+    for name in jobs(args):
+        env, case, seed = name.split("__")
+        flags = f"--env {env} --cases {case} --seeds {seed} --runs {runs} --train-only".split()
+        yield shlex.join(["python", "benchmarks/gps_experiments.py", *flags, *rest])
 
 
 # Generalisation -------------------------------------------------------------------------------------------------------
@@ -193,23 +209,21 @@ def load_search(path: Path) -> gps.Search:
     return search
 
 
+def measure(directory: Path, count: int) -> None:
+    """Where a finished run's trajectories go and, in a case of PLANNED, what perturbations do to them."""
+    search = load_search(directory / "checkpoint.pt")
+    write_csv(directory / "paths.csv", paths(search))
+    if directory.name.split("__")[1] in PLANNED:
+        write_csv(directory / "generalisation.csv", generalisation(search, count))
+
+
 def controllers(search: gps.Search) -> dict[str, Act]:
-    """The policy's mean; the DDP controller; and the DDP controller of the nearest state (TBDP), in scaled tangents."""
+    """The policy's mean; the DDP controller; and the DDP controller of the step that looks most alike (TBDP)."""
     system, policy, guide = search.system, search.network, search.guides[0]
-    path = guide.x[:-1]
-    scale = system.difference(path, path[:1]).std(0).clamp(min=1e-3)
-    if search.args.env != "cartpole":
-        scale[0] = math.inf  # wherever it is along x
-
-    def nearest(_: int, x: Tensor) -> Tensor:
-        distance = (system.difference(x.unsqueeze(1), path.unsqueeze(0)) / scale).square().sum(-1)
-        t = distance.argmin(1)
-        return guide.u[t] + (guide.K[t] @ system.difference(x, path[t]).unsqueeze(-1)).squeeze(-1)
-
     return {
         "policy": lambda _, x: policy.mean(policy.theta, system.observe(x)),
         "ddp": lambda t, x: guide.mean(system, t, x),
-        "tbdp": nearest,
+        "tbdp": lambda _, x: nearest_feedback(system, [guide], x, policy.obs_std)[0],
     }
 
 
@@ -269,66 +283,103 @@ def grouped(rows: Iterable[dict[str, str]], *keys: str) -> dict[tuple[str, ...],
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
     tables: dict[str, list[Row]] = {"runs": [], "generalisation": [], "paths": []}
+    older = set[str]()
     for directory in sorted(path for path in args.runs.glob("*__*__*") if (path / "progress.csv").is_file()):
         run = dict(zip(RUN, directory.name.split("__"), strict=True))
         horizon = json.loads((directory / "args.json").read_text())["horizon"]
         for row in read_csv(directory / "progress.csv"):
             kept = {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT}
             tables["runs"].append(run | dict(horizon=horizon) | kept)
-        if run["variant"] == "full" and (directory / "checkpoint.pt").is_file():
-            if not (directory / "generalisation.csv").is_file():
-                search = load_search(directory / "checkpoint.pt")
-                write_csv(directory / "generalisation.csv", generalisation(search, args.count))
-                write_csv(directory / "paths.csv", paths(search))
-            for name in ("generalisation", "paths"):
-                tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
-    first: dict[str, str] = {}  # one seed a task is drawn, every fourth step
-    drawn = [row for row in tables["paths"] if row["seed"] == first.setdefault(row["env"], row["seed"])]
+        for name in ("generalisation", "paths"):
+            tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
+            older |= {line.rpartition("; ")[0] + "; --list\n" for line in origins(directory / f"{name}.csv")}
+    first: dict[str, tuple[str, ...]] = {}  # one run a task is drawn, every fourth step
+    learned = [
+        row for case in ("feedback", "feedback-short", "full") for row in tables["paths"] if row["variant"] == case
+    ]
+    drawn = [r for r in learned if (r["variant"], r["seed"]) == first.setdefault(r["env"], (r["variant"], r["seed"]))]
     tables["paths"] = [row | {k: f"{float(row[k]):.4g}" for k in "xy"} for row in drawn if int(row["step"]) % 4 == 0]
     for name, rows in tables.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
         rows += [row for row in read_csv(args.table(name)) if tuple(row[key] for key in RUN) not in here]
-        write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)))
+        known = older | {line for line in origins(args.table(name)) if line.endswith("; --list\n")}
+        write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)), older=sorted(known))
 
 
-def summarise(run: tuple[str, ...], rows: list[dict[str, str]]) -> Row:
-    first, last, half = rows[0], rows[-1], rows[len(rows) // 2 :]
-    final = next((row for row in reversed(rows) if row["eval_objective"]), dict.fromkeys(KEPT, ""))
-    objective, plan = number(final["eval_objective"]), number(first["gps_plan"])
-    return dict(zip(("task", "variant", "seed"), run, strict=True)) | {
-        "T": first["horizon"],
-        "plan": f"{plan:.1f}",
-        "guides": f"{number(first['gps_guides']):.1f} ± {number(first['gps_guides_std']):.1f}",
-        "fit": f"{number(first['gps_fit']):.2f}",
-        "pretrained": f"{number(first['gps_objective']):.1f}",
-        "iterations": last["iteration"],
-        "accepted": sum(number(row["gps_accepted"]) == 1 for row in rows),
-        "proposals, last half": f"{mean(number(row['gps_objective']) for row in half):.1f}",
-        "final policy": f"{objective:.1f} ± {number(final['eval_objective_std']):.1f}",
-        "reaches plan": "yes" if objective >= plan else "no",
-        "own return": final["eval_return"],
-        "speed": final["eval_speed"],
-        "control steps": f"{number(last['control_steps']):,.0f}",
-        "of planning": f"{number(last['sim_model_steps']):,.0f}",
-        "seconds": f"{number(last['seconds']):.0f}",
+def final_return(rows: list[dict[str, str]]) -> float:
+    """Of the best policy's last evaluation; of a run that was stopped before one, its own estimate."""
+    evaluated = [row["eval_objective"] for row in rows if row["eval_objective"]]
+    return number(evaluated[-1] if evaluated else rows[-1]["gps_best_estimate"])
+
+
+def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
+    """One row of a case: means over its seeds, and each seed's end. In the band: at least the guides' mean - 2 std."""
+    ends = [[row for row in rows if row["eval_objective"]][-1:] for rows in seeds]
+    final = [final_return(rows) for rows in seeds]
+    low = [number(rows[0]["gps_guides"]) - 2 * number(rows[0]["gps_guides_std"]) for rows in seeds]
+
+    def average(column: str, place: int = 0) -> float:
+        return mean(number(rows[place].get(column, "")) for rows in seeds)
+
+    def spoken(column: str) -> str:
+        values = [number(end[0][column]) for end in ends if end and end[0].get(column)]
+        return f"{mean(values):.2f}" if values else ""
+
+    return {
+        "task": env,
+        "case": case,
+        "T": seeds[0][0]["horizon"],
+        "guides": f"{average('gps_guides'):.1f} ± {average('gps_guides_std'):.1f}",
+        "pretrained": f"{average('gps_objective'):.0f}",
+        "end, each seed": ", ".join(f"{value:.1f}" for value in final),
+        "in band": f"{sum(a >= b for a, b in zip(final, low, strict=True))} of {len(seeds)}",
+        "m/s": spoken("eval_speed"),
+        "steps until a fall": spoken("eval_length"),
+        "iterations": f"{min(int(rows[-1]['iteration']) for rows in seeds)}",
+        "control steps": f"{average('control_steps', -1):,.0f}",
+        "of planning": f"{average('sim_model_steps', -1):,.0f}",
+        "seconds": f"{average('seconds', -1):.0f}",
     }
 
 
 def tabulate(args: Args) -> dict[str, str]:
     """The tables of docs/gps.md, by the names of their places."""
     runs, kept = grouped(read_csv(args.table("runs")), *RUN), []
-    for (env, kind), rows in grouped(read_csv(args.table("generalisation")), "env", "kind").items():
+    cases: dict[tuple[str, str], list[list[dict[str, str]]]] = {}
+    for (env, case, _), rows in runs.items():
+        cases.setdefault((env, case), []).append(rows)
+    table = [summarise(env, case, seeds) for (env, case), seeds in cases.items()]
+    for (env, variant, kind), rows in grouped(read_csv(args.table("generalisation")), "env", "variant", "kind").items():
         cells = dict.fromkeys(map(str, sorted({*STARTS, *PUSHES})), "")
         for (size,), own in grouped(rows, "size").items():
             shares = (mean(float(row["kept"]) for row in own if row["controller"] == name) for name in CONTROLLERS)
             cells[size] = " / ".join(f"{share:.0%}" for share in shares)
-        kept.append({"task": env, "perturbed": kind} | cells)
+        kept.append({"task": env, "variant": variant, "perturbed": kind} | cells)
     return {
-        "runs": markdown([summarise(run, rows) for run, rows in runs.items()]),
+        "runs": markdown([row for row in table if row["case"] not in ABLATED]),
+        "ablation": markdown([row for row in table if row["case"] in ABLATED]),
+        "diagnosis": markdown(diagnose(runs)),
         "generalisation": markdown(kept),
         "samples": markdown(compare(args)),
-        "time": markdown(read_csv(args.table("time"))),
+        "swimmer": markdown(read_csv(args.table("swimmer"))),
     }
+
+
+def diagnose(runs: dict[tuple[str, ...], list[dict[str, str]]]) -> list[Row]:
+    """Why a search does or does not learn: a row a case, means over the last half of the iterations and the seeds."""
+    table, cases = [], dict[tuple[str, ...], list[list[dict[str, str]]]]()
+    for (env, case, _), rows in runs.items():
+        cases.setdefault((env, rows[0]["horizon"], case), []).append(rows)
+    for (env, horizon, case), seeds in cases.items():
+        late = [row for rows in seeds for row in rows[len(rows) // 2 :]]
+        ends = [final_return(rows) for rows in seeds]
+        cells = {"nats": "gps_guide_nats", "guide share": "gps_guide_share", "ESS": "gps_ess", "near": "gps_near"}
+        row = {"task": env, "T": horizon, "case": case, "seeds": len(seeds)}
+        row["pretrained"] = f"{mean(number(rows[0]['gps_objective']) for rows in seeds):.1f}"
+        row["end"] = f"{mean(ends):.1f}"
+        row["accepted"] = f"{mean(sum(number(row['gps_accepted']) == 1 for row in rows) for rows in seeds):.1f}"
+        table.append(row | {k: f"{mean(number(row.get(name, '')) for row in late):.3g}" for k, name in cells.items()})
+    return table
 
 
 def compare(args: Args) -> list[Row]:
@@ -338,15 +389,16 @@ def compare(args: Args) -> list[Row]:
     """
     runs, table = grouped(read_csv(args.table("runs")), *RUN), []
     for env, targets in TARGETS.items():
-        learners = {"gps": [rows for (task, variant, _), rows in runs.items() if (task, variant) == (env, "full")]}
+        own = {case: [rows for (e, c, _), rows in runs.items() if (e, c) == (env, case)] for case in COMPARED}
+        learners = {f"gps, {case}": seeds for case, seeds in own.items() if seeds}
+        if not learners:
+            continue
+        first = next(iter(learners.values()))
+        T, planning = float(first[0][0]["horizon"]), median(float(rows[0]["sim_model_steps"]) for rows in first)
         for name in ("shac", "ppo_baseline"):
             learners[name] = list(grouped(read_csv(args.results / f"{name}_{env}.csv"), "seed").values())
-        if not learners["gps"]:
-            continue
-        T = float(learners["gps"][0][0]["horizon"])
-        planning = median(float(rows[0]["sim_model_steps"]) for rows in learners["gps"])
         for target in targets:
-            cells = {}
+            cells = {f"gps, {case}": "" for case in COMPARED}
             for name, seeds in learners.items():
                 steps = [first_pass(rows, target, T) for rows in seeds]
                 reached = [count for count in steps if count < math.inf]
@@ -365,23 +417,19 @@ def first_pass(rows: list[dict[str, str]], target: float, T: float) -> float:
 
 
 def draw_variants(ax: plt.Axes, env: str, runs: dict[tuple[str, ...], list[dict[str, str]]]) -> None:
-    """Mean return of the proposals: thin, each run; bold, their median; grey, two deviations of the guiding samples."""
-    low, high = list[float](), list[float]()
-    for variant in sorted({v for e, v, _ in runs if e == env}):
-        seeds = [rows for (e, v, _), rows in runs.items() if (e, v) == (env, variant)]
-        curves = [[number(row["gps_objective"]) for row in rows] for rows in seeds]
-        for rows, curve in zip(seeds, curves, strict=True):
+    """Mean cost of the proposals: thin, each run; bold, their median; grey, two deviations of the guiding samples."""
+    for variant in dict.fromkeys(case for e, case, _ in runs if e == env and case in DRAWN):
+        seeds = [rows for (e, case, _), rows in runs.items() if (e, case) == (env, variant)]
+        curves = [[-number(row["gps_objective"]) for row in rows] for rows in seeds]
+        for curve in curves:
             ax.plot(range(len(curve)), curve, color=COLOURS[variant], lw=0.6, alpha=0.5)
-            plan, guides = number(rows[0]["gps_plan"]), number(rows[0]["gps_guides"])
-            low, high = [*low, plan, guides, np.percentile(curve, 20)], [*high, plan, *curve]
-        guides, std = (number(seeds[0][0][key]) for key in ("gps_guides", "gps_guides_std"))
-        ax.axhspan(guides - 2 * std, guides + 2 * std, color="0.6", alpha=0.4, lw=0)
         length = min(map(len, curves))
         middle = np.median([curve[:length] for curve in curves], 0)
-        ax.plot(range(length), middle, color=COLOURS[variant], lw=2, label=variant)
-    bottom, top = min(low), max(high)
-    ax.set_ylim(bottom - 0.3 * (top - bottom), top + 0.1 * (top - bottom))
-    ax.set(title=env, xlabel="iteration", ylabel="mean return of the proposed policy")
+        ax.plot(range(length), middle, color=COLOURS[variant], lw=2, label=f"{variant}, T = {seeds[0][0]['horizon']}")
+        guides, std = (number(seeds[0][0][key]) for key in ("gps_guides", "gps_guides_std"))
+        ax.axhspan(-guides - 2 * std, -guides + 2 * std, color="0.6", alpha=0.3, lw=0)
+    ax.set(title=env, xlabel="iteration", ylabel="minus the return of the proposed policy", yscale="log")
+    ax.invert_yaxis()
 
 
 def draw_paths(ax: plt.Axes, env: str, rows: list[dict[str, str]]) -> None:
@@ -392,33 +440,41 @@ def draw_paths(ax: plt.Axes, env: str, rows: list[dict[str, str]]) -> None:
     ax.set(title=env, **dict(zip(("xlabel", "ylabel"), AXES.get(env, ("x (m)", "height (m)")), strict=True)))
 
 
-def draw_kept(ax: plt.Axes, env: str, kind: str, rows: list[dict[str, str]]) -> None:
+def draw_kept(ax: plt.Axes, title: str, kind: str, rows: list[dict[str, str]]) -> None:
     for name, colour in CONTROLLERS.items():
         sizes = grouped((row for row in rows if row["controller"] == name), "size")
         kept = {float(size): 100 * mean(float(row["kept"]) for row in own) for (size,), own in sizes.items()}
         ax.plot(list(kept), list(kept.values()), "o-", color=colour, label=name)
     unit = "perturbation of the start" if kind == "start" else "push (m/s)"
-    ax.set(title=env, xlabel=unit, ylabel="kept (%)", ylim=(-5, 105))
+    ax.set(title=title, xlabel=unit, ylabel="kept (%)", ylim=(-5, 105))
 
 
 def draw(args: Args) -> None:
     runs, tracks = grouped(read_csv(args.table("runs")), *RUN), grouped(read_csv(args.table("paths")), "env")
-    groups = grouped(read_csv(args.table("generalisation")), "env", "kind")
+    groups = grouped(read_csv(args.table("generalisation")), "env", "variant", "kind")
     pictures: dict[str, list[list[Callable[[plt.Axes], None]]]] = {
-        "variants": [[partial(draw_variants, env=env, runs=runs) for env in sorted({env for env, _, _ in runs})]],
+        "variants": [
+            [partial(draw_variants, env=env, runs=runs) for env in SUITE if any(env == e for e, _, _ in runs)]
+        ],
         "paths": [[partial(draw_paths, env=env, rows=rows) for (env,), rows in tracks.items()]],
         "generalisation": [
-            [partial(draw_kept, env=env, kind=kind, rows=rows) for (env, k), rows in groups.items() if k == kind]
+            [
+                partial(draw_kept, title=f"{env}, {variant}", kind=kind, rows=rows)
+                for (env, variant, k), rows in groups.items()
+                if k == kind
+            ]
             for kind in ("start", "push")
         ],
     }
     for name, grid in pictures.items():
         if not grid[0]:
             continue
-        figure, axes = plt.subplots(len(grid), len(grid[0]), figsize=(4 * len(grid[0]), 3 * len(grid)), squeeze=False)
+        figure, axes = plt.subplots(
+            len(grid), len(grid[0]), figsize=(4.5 * len(grid[0]), 3.6 * len(grid)), squeeze=False
+        )
         for ax, panel in zip(axes.flat, chain(*grid), strict=True):
             panel(ax)
-            ax.legend(fontsize=7)
+            ax.legend(fontsize=5)
         figure.tight_layout()
         (args.docs / "figures").mkdir(parents=True, exist_ok=True)
         figure.savefig(args.docs / "figures" / f"gps_{name}.png", dpi=110)
@@ -435,12 +491,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.record:
         record(args.record, args.actor, args.steps)
         return
+    for case in args.cases:
+        if case not in CASES:
+            fail(f"unknown case {case!r}: choose from {', '.join(CASES)}")
     for env in args.env:
         if env not in diffsim.TASKS:
             fail(f"unknown task {env!r}: choose from {', '.join(diffsim.TASKS)}")
+    if args.list:
+        print("\n".join(commands(args)))
+        return
     if not args.draw_only:
         train_all(args)
-        write_csv(args.table("time"), time_ilqr())
+    if args.train_only:
+        return
     collect(args)
     draw(args)
     for name, text in tabulate(args).items():

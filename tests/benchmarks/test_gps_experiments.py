@@ -17,8 +17,8 @@ import diffsim
 import gps
 
 SMALL = (
-    "--env cartpole --horizon 12 --restarts 2 --screening 2 --ilqr-iterations 10 --pretraining 20 --gate 1 --hidden 8 "
-    "--pretraining-samples 8 --guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 1 "
+    "--env cartpole --horizon 12 --restarts 2 --screening 2 --ilqr-iterations 10 --pretraining 20 --hidden 8 "
+    "--guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 1 "
     "--lbfgs-iterations 3 --eval-episodes 2 --quiet"
 ).split()
 
@@ -26,7 +26,9 @@ SMALL = (
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs")
-    run(gps, directory / "cartpole__full__1", *SMALL)
+    path = directory / "cartpole__full__1"
+    run(gps, path, *SMALL)
+    experiments.measure(path, 4)
     return directory
 
 
@@ -40,14 +42,14 @@ def test_tables_and_pictures(runs: Path, tmp_path: Path) -> None:
     plan = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt").plan_return
     ddp = next(row for row in rows if row["controller"] == "ddp" and float(row["size"]) == 0)
     assert float(ddp["mean"]) == pytest.approx(plan, rel=1e-9)  # unperturbed, it repeats the plan
-    assert "| cartpole | full | 1 | 12 |" in (docs / "gps.md").read_text()
+    assert "| cartpole | full | 12 |" in (docs / "gps.md").read_text()
     before = {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
     experiments.main([*options, "--runs", str(tmp_path / "nowhere")])
     assert before == {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
     assert len(list((docs / "figures").glob("gps_*.png"))) == 3
 
 
-def test_nearest_controller_acts_by_the_nearest_state(runs: Path) -> None:
+def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -> None:
     search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
     guide, act = search.guides[0], experiments.controllers(search)
     torch.testing.assert_close(act["tbdp"](0, guide.x[8:9]), guide.u[8:9])
@@ -55,9 +57,20 @@ def test_nearest_controller_acts_by_the_nearest_state(runs: Path) -> None:
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
 
 
+def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str]) -> None:
+    options = "--env hopper --cases full adaptive --seeds 1 2 --runs there".split()
+    experiments.main([*options, "--list", "--", "--horizon", "160"])
+    lines = capsys.readouterr().out.splitlines()
+    part = "--env hopper --cases adaptive --seeds 2 --runs there --train-only -- --horizon 160"
+    assert len(lines) == 4 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
+    assert experiments.CASES["adaptive"].startswith("--variant full --adaptive")
+    for flags in experiments.CASES.values():
+        gps.parse(gps.Args, ["--env", "hopper", *flags.split()])
+
+
 def test_a_finished_run_is_kept(runs: Path) -> None:
     before = (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns
-    assert experiments.train(runs / "cartpole__full__1", []) == "cartpole__full__1: done before"
+    assert experiments.train(runs / "cartpole__full__1", [], 4) == "cartpole__full__1: done before"
     assert (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns == before
 
 
