@@ -49,6 +49,7 @@ PER_TASK = {
     "ant":          ((128, 64, 32), 128, 32, 4e-3, True,  2000),
     "humanoid":     ((256, 128),    128, 32, 2e-3, True,  2000),
     "humanoid_mtu": ((512, 256),    128, 16, 2e-3, True,  2000),
+    "humanoid_imitation": ((256, 128),    128, 32, 2e-3, True,  2000),
 }
 # fmt: on
 

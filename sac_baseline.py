@@ -56,6 +56,7 @@ PER_TASK = {
     "ant":          ((256, 128, 64),       128, 4096, 5e-3, 5e-4, 5e-4, 640, 20_000),
     "humanoid":     ((512, 256),            64, 2048, 2e-4, 3e-4, 3e-4, 256, 20_000),
     "humanoid_mtu": ((512, 512, 512, 256), 256, 4096, 2e-4, 3e-4, 3e-4, 256, 40_000),
+    "humanoid_imitation": ((512, 256),            64, 2048, 2e-4, 3e-4, 3e-4, 256, 20_000),
 }
 # fmt: on
 # Chosen here, on hopper, ant and humanoid: on a GPU a step of 1,024 environments costs as much as one of 64.

@@ -58,6 +58,7 @@ PER_TASK = {
     "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0, 16, 2048, 2500, 16),
     "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
     "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400, 16),
+    "humanoid_imitation": ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
 }
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
