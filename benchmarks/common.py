@@ -119,7 +119,7 @@ class Case(NamedTuple):
         return {
             "checkpoint": self.label,
             "task": self.env.task.name,
-            "learner": self.saved.script,
+            "learner": " ".join((self.saved.script, *(args[name] for name in ("algorithm", "policy") if name in args))),
             "contact": " ".join((args.get("contact", "soft"), *args.get("penalty", ()))),
             "seed": args["seed"],
             "iteration": self.saved.iteration,

@@ -61,8 +61,7 @@ def measure(case: Case, args: Args) -> None:
     own = feet(env.scene, torch.stack(states).double().numpy(force=True)) if states else reference[:0]
     middle = reference.mean(0)
     plane = np.linalg.svd(reference - middle)[2][:2].T
-    policy = " ".join(str(case.saved.args[name]) for name in ("algorithm", "policy") if name in case.saved.args)
-    for name, points, first in ((REFERENCE, reference, 0), (policy or case.saved.script, own, 1)):
+    for name, points, first in ((REFERENCE, reference, 0), (str(case.about["learner"]), own, 1)):
         about = {"policy": name, "seed": case.saved.args["seed"] if first else ""}
         rows = list[dict[str, object]]()
         for k, (point, flat) in enumerate(zip(points, (points - middle) @ plane, strict=True), first):

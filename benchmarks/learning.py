@@ -119,7 +119,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation", "firm", "orders", "off_policy", "models", "particles", "resampling", "imitation",
+    "ablation", "firm", "orders", "off_policy", "models", "pfpn", "resampling", "imitation",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -143,7 +143,7 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
                       ("cartpole", "hopper", "ant", "humanoid")),
     "models":        ("MBPO and SE-MBPO", ("shac", "mbpo", "se_mbpo"), ("cartpole", "ant")),
     "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"), ("cartpole",)),
-    "particles":     ("PFPN and a Gaussian policy, by PPO, through the simulator's gradient and off-policy",
+    "pfpn":          ("PFPN and a Gaussian policy, by PPO, through the simulator's gradient and off-policy",
                       ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac",
                       "pfpn_gaussian_sac"),
                       ("hopper", "ant", "humanoid")),
@@ -309,7 +309,7 @@ def report(args: Args, name: Name) -> None:
         args.publish("results", markdown(rows, columns), f"{page}.md", everywhere)
         return draw(args, page, learners, tasks)
     rows = table(args, learners, tasks)
-    of_particles = name in ("particles", "resampling", "imitation")
+    of_particles = name in ("pfpn", "resampling", "imitation")
     beside = f"{markdown(ratios(args, tasks))}\n" if of_particles else ""
     page = "pfpn.md" if of_particles else "experiments.md"
     args.publish(name, f"{markdown(rows)}\n{beside}![{title}]({args.link(name)})\n", page)

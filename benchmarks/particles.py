@@ -27,7 +27,7 @@ from common import CommonFlags, Line, Panel, parse, plot
 from tables import ROOT, markdown, read_csv
 from torch import Tensor, nn
 
-from diffsim.training import Count, checkpoint, evaluate, fail
+from diffsim.training import Count, Fraction, checkpoint, evaluate, fail
 from diffsim.training.assess import make_env
 
 sys.path.append(str(ROOT))
@@ -46,6 +46,11 @@ Log = list[dict[str, str]]
 class Args(CommonFlags):
     run: Path | None = None  # directory of a run of pfpn.py, trained with --log-particles, whose particles are drawn
     resample: tuple[Path, ...] = ()  # checkpoints of pfpn.py, or its runs, that are resampled once
+    dead: tuple[Fraction, ...] = (
+        0.05,
+        0.2,
+        0.5,
+    )  # thresholds of a resampling; pfpn.py's default first
     episodes: Count = 256  # before it and after it
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5)  # seeds of the bandit
 
@@ -126,11 +131,12 @@ def measure(args: Args) -> None:
     args.write("bandit_density", densities)
 
 
-def resample(path: Path, args: Args) -> dict[str, object]:
+def resample(path: Path, dead: float, args: Args) -> dict[str, object]:
     """Returns of the policy with its noise before and after a resampling by the weights that were seen before it."""
     path = path / "checkpoint.pt" if path.is_dir() else path
     state = checkpoint.load(path, "pfpn")
-    settings = pfpn.parse(pfpn.Args, ["--evaluate", str(path), "--device", args.device, "--resampling-interval", "1"])
+    flags = ["--device", args.device, "--resampling-interval", "1", "--dead", str(dead)]
+    settings = pfpn.parse(pfpn.Args, ["--evaluate", str(path), *flags])
     if settings.policy != "pfpn":
         fail(f"{path} has a policy without particles to resample: --policy {settings.policy}")
     env = make_env(settings, args.episodes)
@@ -146,7 +152,7 @@ def resample(path: Path, args: Args) -> dict[str, object]:
             found = learner.resampling.end_iteration(learner.actor.head, learner.optimizer)
     error = math.sqrt(sum(float(x.var()) for x in returns) / args.episodes)  # of the difference
     row: dict[str, object] = {"task": settings.env, "algorithm": settings.algorithm, "seed": settings.seed}
-    row |= {"iteration": state["iteration"], "moved": float(found["particles/moved"]) - moved}
+    row |= {"iteration": state["iteration"], "threshold": dead, "moved": float(found["particles/moved"]) - moved}
     row |= {
         "of": learner.resampling.total.numel(),
         "before": returns[0].mean().item(),
@@ -182,8 +188,8 @@ def draw(args: Args) -> None:
 
 def main(args: Args) -> None:
     if args.resample:
-        rows = [resample(path, args) for path in args.resample]
-        found = args.merge("resampling", rows, ("task", "algorithm", "seed"))
+        rows = [resample(path, dead, args) for path, dead in product(args.resample, args.dead)]
+        found = args.merge("resampling", rows, ("task", "algorithm", "seed", "threshold"))
         return args.publish("resampled", markdown(found), "pfpn.md")
     if args.run and not args.draw_only:
         if not (rows := paths(read_csv(args.run / "progress.csv"))):

@@ -61,14 +61,14 @@ def test_a_policy_that_tracks_covers_the_reference(tmp_path: Path, monkeypatch: 
     for seed in (1, 2):
         feet.measure(case(env, seed), args)
     rows = read_csv(tmp_path / "feet.csv")
-    reference, own = ([row for row in rows if row["policy"] == name] for name in (feet.REFERENCE, "ppo pfpn"))
+    reference, own = ([row for row in rows if row["policy"] == name] for name in (feet.REFERENCE, "pfpn ppo pfpn"))
     assert len(reference) == task.period and len(own) == 2 * (2 * task.period + 4)
     assert all(float(row["error"]) < 1e-3 for row in rows)
     at = {row["frame"]: (row["first"], row["second"]) for row in reference}
     assert all((row["first"], row["second"]) == at[row["frame"]] for row in own)
     spread = np.array([[float(x) for x in place] for place in at.values()]).std(0)
     assert spread[0] >= spread[1] > 0.01  # principal components
-    assert "| ppo pfpn | 48 48 | 0.0 0.0 |" in feet.table(rows)
+    assert "| pfpn ppo pfpn | 48 48 | 0.0 0.0 |" in feet.table(rows)
 
 
 def test_other_tasks_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -56,13 +56,12 @@ def test_a_policy_is_resampled_once(tmp_path: Path, capsys: pytest.CaptureFixtur
     """With a threshold just below equal weights about half of the particles are dead, and the policy changes."""
     flags = "--env cartpole --algorithm shac --device cpu --num-envs 4 --horizon 4 --iterations 1 --hidden 8"
     flags += " --critic-hidden 8 --eval-episodes 1 --particles 8 --quiet"
-    for name, more in {"dead": "--dead 0.999", "alive": "--dead 0.001"}.items():
-        run(pfpn, tmp_path / name, *flags.split(), *more.split())
-        particles.main(particles.Args(output=tmp_path / "out", resample=(tmp_path / name,), episodes=8))
-        (row,) = read_csv(tmp_path / "out" / "resampling.csv")
+    run(pfpn, tmp_path / "run", *flags.split())
+    particles.main(particles.Args(output=tmp_path, resample=(tmp_path / "run",), dead=(0.001, 0.999), episodes=8))
+    for row in read_csv(tmp_path / "resampling.csv"):
         moved, before, after = (float(row[key]) for key in ("moved", "before", "after"))
-        assert row["of"] == "8" and (2 <= moved <= 6 if name == "dead" else moved == 0)
-        assert (before != after) == (name == "dead") and 0 < float(row["standard error of the difference"]) < -before
+        assert row["of"] == "8" and (2 <= moved <= 6 if row["threshold"] == "0.999" else moved == 0)
+        assert (before != after) == (moved > 0) and 0 < float(row["standard error of the difference"]) < -before
     run(pfpn, tmp_path / "gaussian", *flags.split(), "--policy", "gaussian")
     args = particles.Args(output=tmp_path, resample=(tmp_path / "gaussian",), episodes=8)
     assert "without particles to resample: --policy gaussian" in refusal(lambda: particles.main(args), capsys)
