@@ -433,9 +433,11 @@ class Search:
         self.set = Samples(*(torch.cat(tensors) for tensors in joined))
         return torch.arange(first, len(self.set.u), device=log_q.device)
 
-    def guided(self) -> Tensor:
-        """(m,) which samples of S come from guides."""
+    def guided(self, initial: bool = False) -> Tensor:
+        """(m,) which samples of S come from guides, or from the initial ones: the first n generators, where in S."""
         guides = [isinstance(generator, LinearGaussian) for generator in self.generators]
+        if initial:
+            guides = [guide and j < len(self.guides) for j, guide in enumerate(guides)]
         return torch.tensor(guides, device=self.system.device)[self.set.source]
 
     def score(self) -> Tensor:
@@ -444,17 +446,20 @@ class Search:
         return torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
 
     def choose(self) -> Tensor:
-        """Line 6, indices: the guiding samples, the newest of the best policy, others by importance under it."""
-        score = torch.where(self.guided(), 3e9, self.score())
-        score[(self.set.source == self.best).nonzero().flatten()[-self.args.samples :]] = 2e9
+        """Line 6, indices: the newest of the best policy, the initial guiding samples, others by importance under it.
+
+        Adapted guides have no place of their own: they would fill S_k and leave the best policy's value to guesswork.
+        """
+        score = torch.where(self.guided(initial=True), 2e9, self.score())
+        score[(self.set.source == self.best).nonzero().flatten()[-self.args.samples :]] = 3e9
         return score.argsort(descending=True, stable=True)[: self.args.active].sort().values
 
     def prune(self) -> None:
-        """Bounds S: the guiding samples, those of the best policy and the best-scored others stay, in that order;
-        generators without samples go."""
+        """Bounds S: the initial guiding samples, those of the best policy and the best-scored others stay, in that
+        order; generators without samples go."""
         if len(self.set.u) <= self.args.stored:
             return
-        score = self.score() + 2e9 * self.guided() + 1e9 * (self.set.source == self.best)
+        score = self.score() + 2e9 * self.guided(initial=True) + 1e9 * (self.set.source == self.best)
         self.set = self.set.pick(score.argsort(descending=True, stable=True)[: self.args.stored].sort().values)
         used = torch.tensor(sorted({*self.set.source.tolist(), self.best}), device=score.device)
         index = torch.full((len(self.generators),), -1, device=used.device)

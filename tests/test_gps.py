@@ -313,6 +313,19 @@ def test_active_set(search: gps.Search) -> None:
     assert {planted, *guiding.tolist(), *own.tolist()} <= chosen and len(chosen) == 16
 
 
+def test_adapted_guides_leave_room_for_the_best_policys_own_samples(search: gps.Search) -> None:
+    """Otherwise nothing in S_k says what it earns, and no proposal looks better than the adapted guides' returns."""
+    adapted = search.guides[0]._replace(u=search.guides[0].u + 0.1)
+    for _ in range(3):
+        search.append(search.measure(*adapted.sample(search.system, search.noise(6)), len(search.generators)), adapted)
+    S, chosen = search.set, search.choose()
+    own = (S.source == search.best).nonzero().flatten()[-4:]
+    assert {*own.tolist(), *(S.source == 0).nonzero().flatten().tolist()} <= set(chosen.tolist())
+    search.prune()  # of 24 + 18 samples 24 stay
+    assert (search.set.source == 0).sum() == 8 and (search.set.source == search.best).sum() >= 4
+    assert search.generators[search.best] is not search.guides[0]
+
+
 def test_densities_of_the_set_are_those_of_its_generators(search: gps.Search) -> None:
     """After all appending and pruning, and each sample was more likely where it came from than it is elsewhere."""
     S = search.set
