@@ -50,7 +50,10 @@ from diffsim.training.evaluation import Evaluation, travels
 from diffsim.training.lbfgs import maximise
 from diffsim.training.normalizer import ObsNormalizer
 
-Variant = Literal["full", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
+Variant = Literal[
+    "full", "feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
+]
+GUIDED = "full", "feedback", "unregularized"  # those with guides in S
 # fmt: off
 COLUMNS = ("horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight", "attitude_weight",
            "hidden", "noise")
@@ -73,7 +76,7 @@ class Args(Flags):
     FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples")
 
     variant: Variant = "full"
-    """the algorithm, or what its Figure 2 compares it with"""
+    """the algorithm; with imitation of the guides' feedback as its line 7 (ours); or one of Figure 2's comparisons"""
     iterations: Count = 80
     """iterations K of the policy search"""
     horizon: Count = 500
@@ -117,13 +120,7 @@ class Args(Flags):
     noise: Positive = 0.1
     """the policy's standard deviation, relative to that of the planned actions over time (per task)"""
     pretraining: Count = 1500
-    """L-BFGS iterations of the first fit to the guiding samples"""
-    pretraining_samples: Natural = 200
-    """trajectories of that fit, with the guides' mean actions; 0: the guiding samples with their own, as the paper"""
-    pretraining_spread: Positive = 3.0
-    """standard deviation of these trajectories' actions, relative to the guides': shows what to do off the path"""
-    gate: Count = 10
-    """fits, each with the states that the last one visited, until one follows the guides; or the best is taken"""
+    """L-BFGS iterations of the fit to the guiding samples"""
     samples: Count = 10
     """trajectories of the policy per iteration"""
     active: Count = 100
@@ -136,6 +133,8 @@ class Args(Flags):
     """w_r at the start"""
     regularizer_bounds: tuple[NonNegative, NonNegative] = (1e-4, 1.0)
     """w_r is changed by factors of ten between these"""
+    near: Positive = 1.0
+    """feedback: distance from the guides, in standard deviations of what is observed, to which it is imitated"""
     step: Positive = 0.1
     """policy-gradient: length of a step along the normalised gradient"""
 
@@ -171,26 +170,25 @@ class Args(Flags):
 class Search:
     """Algorithm 1, line by line, and all that its next iteration depends on."""
 
-    NUMBERS = "best w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
-    LISTS = "guides adapted generators".split()
+    NUMBERS = "w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.system = args, System(env, args.threads or None)
         self.cost = AfterStep(self.system, lambda x, u: -self.reward(x, u))
         self.rng = torch.Generator().manual_seed(args.seed)  # on the CPU: the same numbers for every device
-        self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn; adapted ones are generators only
-        self.adapted: list[LinearGaussian] = []
-        self.generators: list[LinearGaussian | Tensor] = []  # of samples: guides, and policies as their theta
-        self.network, self.best = Policy(args.hidden, self.system), -1  # has theta*; its index among the generators
+        self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn
+        self.adapted: list[LinearGaussian] = []  # the last ones of line 9
+        self.network = Policy(args.hidden, self.system)  # has theta*
         self.w_r = 0.0 if args.variant == "unregularized" else args.initial_regularizer
         self.floor, self.scale = -math.inf, 1.0  # least reward of a step; standard deviation of rewards
         self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
         self.control_steps = self.plan_steps = self.nonfinite = 0
         sizes = (args.horizon + 1, self.system.nx), (args.horizon, self.system.nu), (args.horizon,)
         x, u, finite = (torch.zeros(0, *size, dtype=REAL, device=self.system.device) for size in sizes)
-        self.set = self.measure(x, u, finite.bool())  # S
-        self.lessons = self.set.obs, self.set.u  # what dagger fits
-        self.modules: dict[str, Stateful] = {"policy": self.network, "search": self}
+        self.S = SampleSet(self.system, self.network, self.measure(x, u, finite.bool()))
+        self.lessons: tuple[Tensor, ...] = ()  # what feedback and dagger fit
+        self.student = self.network.theta  # the last of feedback's fits
+        self.modules: dict[str, Stateful] = {"policy": self.network, "samples": self.S, "search": self}
 
     @property
     def policy(self) -> nn.Sequential:
@@ -199,52 +197,67 @@ class Search:
 
     def prepare(self, say: Callable[[str], None]) -> dict[str, float]:
         """Lines 1 to 4, with progress told to say; returns the pretrained policy's metrics."""
-        args, variant = self.args, self.args.variant
-        self.make_guides(say)  # line 1: generate DDP solutions
+        args, policy, before = self.args, self.network, self.system.steps
+        plan = plan_trajectories(self, say)
+        self.plan_return = -plan.cost.min().item()
+        policy.sigma = (args.noise * plan.u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
+        self.guides = make_guides(self, plan, say)  # line 1: generate DDP solutions
+        self.plan_steps = self.system.steps - before
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
         say(f"guiding samples: return {mean:.2f} +- {std:.2f}")
-        lessons = self.wide_samples() if args.pretraining_samples else (guiding.obs, guiding.u)
-        self.network.standardise(*lessons)
-        if variant == "single-example":
-            x, u = torch.stack([guide.x[:-1] for guide in self.guides]), torch.stack([guide.u for guide in self.guides])
-            lessons = self.system.observe(x), u
-        self.network.theta, fit = self.pretrain(*lessons, say)  # line 3: initialise theta*
-        if variant in ("full", "unregularized", "dagger"):  # line 4: build S from the guides and theta*
-            self.append(guiding, *self.guides)
-        self.best = len(self.generators)
-        own = self.draw(self.network.theta, self.best)
-        self.append(own, self.network.theta)
-        self.scale = self.set.reward.std().clamp(min=1e-6).item()
-        self.lessons = lessons if variant == "dagger" else self.lessons
+        policy.standardise(guiding.obs, guiding.u)
+        obs, u = guiding.obs, guiding.u
+        if args.variant == "single-example":
+            obs = self.system.observe(torch.stack([guide.x[:-1] for guide in self.guides]))
+            u = torch.stack([guide.u for guide in self.guides])
+        policy.theta = policy.fit(policy.initial(self.rng), obs, u, args.pretraining)  # line 3: initialise theta*
+        fit = ((u - policy.mean(policy.theta, obs)) / policy.sigma).square().mean().sqrt().item()
+        if args.variant in GUIDED:  # line 4: build S from the guides and theta*
+            self.S.append(guiding, *self.guides)
+            self.S.initial = len(self.guides)
+        self.S.best = len(self.S.generators)
+        own = self.draw(policy.theta, self.S.best)
+        self.S.append(own, policy.theta)
+        self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
+        say(f"pretraining: rms error {fit:.2f} sigma, rollouts return {own.returns.mean():.2f}")
+        if args.variant == "dagger":
+            self.lessons = guiding.obs, guiding.u
+        if args.variant == "feedback":
+            self.student = policy.theta
+            self.learn(guiding)
+            self.learn(own)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides
 
     def iterate(self, iteration: int) -> dict[str, float]:
         """Lines 6 to 17, or what a variant does in their place; returns metrics."""
-        args, policy = self.args, self.network
+        args, policy, S = self.args, self.network, self.S
         if args.variant in ("policy-gradient", "dagger"):
             return policy_gradient(self) if args.variant == "policy-gradient" else dagger(self)
-        active = self.choose()  # line 6: choose S_k
-        theta, metrics = self.optimise(self.set.pick(active))  # line 7: theta_k <- arg max Phi
-        source = len(self.generators)
+        active = S.choose(args.active, args.samples)  # line 6: choose S_k
+        # line 7: theta_k <- arg max Phi
+        theta, metrics = self.imitate() if args.variant == "feedback" else self.optimise(S.samples.pick(active))
+        source = len(S.generators)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
-        active = torch.cat((active, self.append(new, theta)))
-        if iteration <= args.adaptive and args.variant in ("full", "unregularized"):
+        active = torch.cat((active, S.append(new, theta)))
+        if args.variant == "feedback":
+            metrics["gps/near"] = self.learn(new)
+        if iteration <= args.adaptive and args.variant in GUIDED:
             active = torch.cat((active, self.adapt()))  # line 9: generate adaptive guiding samples
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
         if better:  # its samples may have been lucky: confirm it with more
-            active = torch.cat((active, self.append(self.draw(theta, source, args.guiding_samples))))
+            active = torch.cat((active, S.append(self.draw(theta, source, args.guiding_samples))))
             better, values = self.estimate(theta, active)
         metrics |= values | {"gps/accepted": float(better), "gps/regularizer": self.w_r}
         low, high = (0.0, 0.0) if args.variant == "unregularized" else args.regularizer_bounds
         if better:  # line 11
-            policy.theta, self.best = theta, source  # line 12: theta* <- theta_k
+            policy.theta, S.best = theta, source  # line 12: theta* <- theta_k
             self.w_r = max(self.w_r / 10, low)  # line 13: decrease w_r
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
-            self.append(self.draw(policy.theta, self.best))  # line 16: resample from theta*
-        self.prune()
+            S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
+        S.prune(args.stored)  # line 17: the end of the choice; S is bounded
         return metrics | self.metrics(self.draw(theta) if args.variant == "restart" else new)
 
     # Trajectories
@@ -305,167 +318,21 @@ class Search:
             "sim/model_steps": self.plan_steps,
         }
 
-    # Lines 1 and 2: guiding distributions
-
-    def plan(self, say: Callable[[str], None]) -> Plan:
-        """Trajectory optimisation from random action sequences or from a demonstration; the best of its results."""
-        args, system, T = self.args, self.system, self.args.horizon
-
-        def show(iteration: int, costs: Tensor) -> None:
-            if iteration % 10 == 9:
-                say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
-
-        try:
-            if args.demonstration:
-                example = load_demonstration(system, args.demonstration, T)
-                x, u = follow_demonstration(system, *example, args.tracking)
-            else:
-                u = starting_actions(args.restarts, T, system.nu, system.control_dt, self.rng).to(system.device)
-                x, u = best_of_random_starts(system, self.cost, system.start()[0], u, args.guides, args.screening, show)
-        except ValueError as error:
-            fail(error)
-        return ilqr(system, self.cost, x, u, args.ilqr_iterations, show=show)
-
-    def make_guides(self, say: Callable[[str], None]) -> None:
-        """Line 1: DDP solutions and the controllers about them, with the tracking term of Section 6."""
-        args, system, before = self.args, self.system, self.system.steps
-        plan = self.plan(say)
-        self.plan_return = -plan.cost.min().item()
-        self.network.sigma = (args.noise * plan.u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
-        cost = Sum((self.cost, Tracking(system, plan.x, plan.u, args.tracking)))
-        self.guides = maximum_entropy_controllers(system, cost, plan, self.network.sigma, args.spread)
-        self.plan_steps = system.steps - before
-        returns = ", ".join(f"{-cost:.2f} ({note})" for cost, note in zip(plan.cost, plan.note, strict=True))
-        say(f"planned in {self.plan_steps:,} control steps: returns {returns}")
-        for guide in self.guides:
-            if guide.mu > 1e-2:
-                say(f"warning: a guide's Q_uu needed mu = {guide.mu:.1e}; it is far from an optimum")
-        every = args.horizon // 16 or 1
-        error = system.check_jacobians(plan.x[0, :-1:every], plan.u[0, ::every])
-        say(f"Jacobians against central differences: relative error {error.median():.1e}, worst {error.max():.1e}")
-        if not error.median() < 1e-3:
-            fail("the simulator's Jacobians are not those of its steps")
-
-    def follow_guides(self, count: int, spread: float = 1.0) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Of each guide its share of so many trajectories, with its noise times spread; see Dynamics.rollout."""
-        each = -(-count // len(self.guides))
-        self.control_steps += each * len(self.guides) * self.args.horizon
-        wide = [guide._replace(L=spread * guide.L) for guide in self.guides]
-        return [guide.sample(self.system, self.noise(each)) for guide in wide]
-
-    def means(self, guide: LinearGaussian, x: Tensor) -> Tensor:
-        """(m, T, nu) a guide's mean actions on trajectories (m, T + 1, nx)."""
-        return guide.mean(self.system, slice(0, self.args.horizon), x[:, :-1])
-
     def sample_guides(self) -> Samples:
         """Line 2. As far below the worst step as that is below the best is the floor of all rewards to come."""
-        count = self.args.guiding_samples
-        drawn = [self.measure(*ends, i) for i, ends in enumerate(self.follow_guides(count))]
-        samples = Samples(*(torch.stack(parts, 1).flatten(0, 1)[:count] for parts in zip(*drawn, strict=True)))
+        count, n = self.args.guiding_samples, len(self.guides)
+        self.control_steps += count * self.args.horizon
+        shares = [count // n + (i < count % n) for i in range(n)]
+        drawn = [
+            self.measure(*g.sample(self.system, self.noise(k)), i)
+            for i, (g, k) in enumerate(zip(self.guides, shares, strict=True))
+        ]
+        samples = Samples(*(torch.cat(parts) for parts in zip(*drawn, strict=True)))
         worst, top = samples.reward[torch.isfinite(samples.reward)].aminmax()
         self.floor = (2 * worst - top).item()
         samples = samples._replace(reward=samples.reward.clamp(min=self.floor))
         self.guide_return = samples.returns.mean().item(), samples.returns.std(correction=0).item()
         return samples
-
-    # Line 3: pretraining
-
-    def wide_samples(self) -> tuple[Tensor, Tensor]:
-        """Observations (m, T, obs_dim) of trajectories wider than the guides', the guides' mean actions (m, T, nu)
-        there (DART, Laskey et al. 2017): a policy that has seen only a guide's narrow tube does not return to it."""
-        rollouts = self.follow_guides(self.args.pretraining_samples, self.args.pretraining_spread)
-        obs = [self.system.observe(x[:, :-1]) for x, _, _ in rollouts]
-        u = [self.means(guide, x) for guide, (x, _, _) in zip(self.guides, rollouts, strict=True)]
-        return torch.stack(obs, 1).flatten(0, 1), torch.stack(u, 1).flatten(0, 1)
-
-    def pretrain(self, obs: Tensor, u: Tensor, say: Callable[[str], None]) -> tuple[Tensor, float]:
-        """A theta that follows the guides in closed loop, and its error in standard deviations of the policy.
-
-        Until it does, the states that it visited, as far as the lessons go, join them with the guides' mean actions
-        (DAgger, Ross et al. 2011). Otherwise the best theta is taken.
-        """
-        args, policy, lessons, best = self.args, self.network, obs, (-math.inf, Tensor(), math.nan)
-        enough = self.guide_return[0] - 0.1 * abs(self.guide_return[0])
-        # As many steps as the guiding samples have, picked from all: neighbours in time teach little more than one.
-        steps = torch.randperm(u[..., 0].numel(), generator=self.rng)[: args.guiding_samples * args.horizon]
-        obs, u = (tensor.flatten(0, 1)[steps.to(u.device)] for tensor in (obs, u))
-        theta, attempts = policy.initial(self.rng), 1 if args.variant == "single-example" else args.gate
-        for attempt in range(1, attempts + 1):
-            theta = policy.fit(theta, obs, u, args.pretraining)
-            seen = self.draw(theta, count=args.guiding_samples)
-            mean, top = seen.returns.mean().item(), seen.returns.max().item()
-            error = ((u - policy.mean(theta, obs)) / policy.sigma).square().mean().sqrt().item()
-            say(f"pretraining {attempt}: rms error {error:.2f} sigma, rollouts return {mean:.2f}, best {top:.2f}")
-            best = max(best, (mean, theta, error), key=lambda fit: fit[0])
-            if best[0] >= enough:
-                return best[1:]
-            if attempt < attempts:
-                labelled = (self.label(g, lessons[i :: len(self.guides)], seen) for i, g in enumerate(self.guides))
-                obs, u = (torch.cat(column) for column in zip((obs, u), *labelled, strict=True))
-        say("warning: no pretrained policy came within a tenth of the guides' return on average")
-        return best[1:]
-
-    def label(self, guide: LinearGaussian, lessons: Tensor, samples: Samples) -> tuple[Tensor, Tensor]:
-        """Observations (k, obs_dim) and a guide's mean actions there (k, nu) from samples, while they are as near to
-        its path as its lessons (m, T, obs_dim) at that time: beyond, as after a fall, linear gains mean nothing."""
-        mean, std = lessons.mean(0), lessons.std(0).clamp(min=1e-3)
-        distance, most = (((obs - mean) / std).square().mean(-1) for obs in (samples.obs, lessons))
-        near = (distance <= most.amax(0)).cumprod(1).bool()
-        thin = max(1, len(lessons) // len(samples.obs))  # as dense in time as those picked of the lessons
-        return samples.obs[near][::thin], self.means(guide, samples.x)[near][::thin]
-
-    # Lines 4, 6 and 8: the sample set
-
-    def log_density(self, generator: LinearGaussian | Tensor, samples: Samples) -> Tensor:
-        """(m, T) of prefixes."""
-        if isinstance(generator, LinearGaussian):
-            return generator.log_prob(self.system, samples.x, samples.u).cumsum(1)
-        return self.network.log_prob(generator, samples.obs, samples.u).cumsum(1)
-
-    def append(self, samples: Samples, *new: LinearGaussian | Tensor) -> Tensor:
-        """Adds samples to S, and the generators that they are the first of; returns the samples' indices."""
-        for generator in new:
-            self.generators.append(generator)
-            column = self.log_density(generator, self.set).unsqueeze(1)
-            self.set = self.set._replace(log_q=torch.cat((self.set.log_q, column), 1))
-        log_q = torch.stack([self.log_density(generator, samples) for generator in self.generators], 1)
-        first, joined = len(self.set.u), zip(self.set, samples._replace(log_q=log_q), strict=True)
-        self.set = Samples(*(torch.cat(tensors) for tensors in joined))
-        return torch.arange(first, len(self.set.u), device=log_q.device)
-
-    def guided(self, initial: bool = False) -> Tensor:
-        """(m,) which samples of S come from guides, or from the initial ones: the first n generators, where in S."""
-        guides = [isinstance(generator, LinearGaussian) for generator in self.generators]
-        if initial:
-            guides = [guide and j < len(self.guides) for j, guide in enumerate(guides)]
-        return torch.tensor(guides, device=self.system.device)[self.set.source]
-
-    def score(self) -> Tensor:
-        """(m,) sum of a sample's weights under the best policy; ties are broken by its density."""
-        log_w = log_weights(self.network.log_prob(self.network.theta, self.set.obs, self.set.u), self.set.log_mixture)
-        return torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
-
-    def choose(self) -> Tensor:
-        """Line 6, indices: the newest of the best policy, the initial guiding samples, others by importance under it.
-
-        Adapted guides have no place of their own: they would fill S_k and leave the best policy's value to guesswork.
-        """
-        score = torch.where(self.guided(initial=True), 2e9, self.score())
-        score[(self.set.source == self.best).nonzero().flatten()[-self.args.samples :]] = 3e9
-        return score.argsort(descending=True, stable=True)[: self.args.active].sort().values
-
-    def prune(self) -> None:
-        """Bounds S: the initial guiding samples, those of the best policy and the best-scored others stay, in that
-        order; generators without samples go."""
-        if len(self.set.u) <= self.args.stored:
-            return
-        score = self.score() + 2e9 * self.guided(initial=True) + 1e9 * (self.set.source == self.best)
-        self.set = self.set.pick(score.argsort(descending=True, stable=True)[: self.args.stored].sort().values)
-        used = torch.tensor(sorted({*self.set.source.tolist(), self.best}), device=score.device)
-        index = torch.full((len(self.generators),), -1, device=used.device)
-        index[used] = torch.arange(len(used), device=used.device)
-        self.set = self.set._replace(source=index[self.set.source], log_q=self.set.log_q[:, used])
-        self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
 
     # Lines 7, 9 and 10
 
@@ -483,6 +350,32 @@ class Search:
         theta, value = ends[start]
         return theta, {"gps/phi": value, "gps/start": start}
 
+    def learn(self, samples: Samples) -> float:
+        """Adds to the lessons what the guides do at the states of samples, up to --near from them; returns the share.
+
+        Of each state, that of the guides' step which looks most like it: the policy does not see the time, and one
+        that runs late would be told to jump. Further away, as after a fall, linear feedback means nothing.
+        """
+        u, L, distance = nearest_feedback(self, samples.x[:, :-1].flatten(0, 1))
+        near = distance <= self.args.near
+        new = samples.obs.flatten(0, 1)[near], u[near], L[near]
+        self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
+        return near.double().mean().item()
+
+    def imitate(self) -> tuple[Tensor, dict[str, float]]:
+        """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides.
+
+        Their covariance is eta Q_uu^-1, so that an error counts by what it costs under iLQR's value function.
+        """
+        obs, u, L = self.lessons
+
+        def objective(theta: Tensor) -> Tensor:
+            error = (u - self.network.mean(theta, obs)).unsqueeze(-1)
+            return -torch.linalg.solve_triangular(L, error, upper=False).square().mean()
+
+        self.student, value = maximise(objective, self.student, self.args.lbfgs_iterations)
+        return self.student, {"gps/lessons": len(u), "gps/error": math.sqrt(-value)}
+
     def adapt(self) -> Tensor:
         """Line 9: guides of exp(reward / eta) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
         args, system, policy, before = self.args, self.system, self.network, self.system.steps
@@ -499,13 +392,13 @@ class Search:
         for i, guide in enumerate(self.adapted):
             count = args.samples // args.guides + (i < args.samples % args.guides)
             self.control_steps += count * args.horizon
-            samples = self.measure(*guide.sample(system, self.noise(count)), len(self.generators))
-            indices.append(self.append(samples, guide))
+            samples = self.measure(*guide.sample(system, self.noise(count)), len(self.S.generators))
+            indices.append(self.S.append(samples, guide))
         return torch.cat(indices)
 
     def estimate(self, theta: Tensor, active: Tensor) -> tuple[bool, dict[str, float]]:
         """Line 10: whether theta is better than theta* by Eq. 2 on the active set; the values, and theta's weights."""
-        S = self.set.pick(active)
+        S = self.S.samples.pick(active)
         mixture = S.log_mixture
         log_pi = [self.network.log_prob(t, S.obs, S.u) for t in (theta, self.network.theta)]
         values = [phi(log_p, mixture, S.reward, 0.0).item() for log_p in log_pi]
@@ -519,7 +412,7 @@ class Search:
             "gps/best_estimate": values[1],
             "gps/ess": ess.mean().item(),
             "gps/ess_min": ess.min().item(),
-            "gps/guide_share": (weights[self.guided()[active]].sum() / weights.sum()).item(),
+            "gps/guide_share": (weights[self.S.guided()[active]].sum() / weights.sum()).item(),
             "gps/log_weight_spread": (log_w[:, -1].max() - log_w[:, -1].min()).item(),
         }
 
@@ -527,21 +420,77 @@ class Search:
 
     def state_dict(self) -> dict[str, Any]:
         state = {name: getattr(self, name) for name in self.NUMBERS} | {"rng": self.rng.get_state()}
-        for name in self.LISTS:
-            state[name] = [tuple(g) if isinstance(g, LinearGaussian) else (g,) for g in getattr(self, name)]
-        return state | {"set": tuple(self.set), "lessons": self.lessons}
+        guides, adapted = ([tuple(guide) for guide in guides] for guides in (self.guides, self.adapted))
+        return state | {"guides": guides, "adapted": adapted, "lessons": self.lessons, "student": self.student}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        def load(tensors: Iterable[Tensor]) -> tuple[Tensor, ...]:
-            return tuple(tensor.to(self.system.device) for tensor in tensors)
-
         for name in self.NUMBERS:
             setattr(self, name, state[name])
-        for name in self.LISTS:
-            setattr(self, name, [LinearGaussian(*g) if len(g) > 1 else g[0] for g in map(load, state[name])])
-        obs, u = load(state["lessons"])
-        self.set, self.lessons = Samples(*load(state["set"])), (obs, u)
+        device = self.system.device
+        self.guides, self.adapted = ([load(guide, device) for guide in state[name]] for name in ("guides", "adapted"))
+        self.lessons = tuple(tensor.to(device) for tensor in state["lessons"])
+        self.student = state["student"].to(device)
         self.rng.set_state(state["rng"])
+
+
+# Planning: line 1, and the guides' feedback ---------------------------------------------------------------------------
+
+
+def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
+    """Trajectory optimisation from random action sequences or from a demonstration; the best of its results."""
+    args, system, T = search.args, search.system, search.args.horizon
+
+    def show(iteration: int, costs: Tensor) -> None:
+        if iteration % 10 == 9:
+            say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
+
+    try:
+        if args.demonstration:
+            example = load_demonstration(system, args.demonstration, T)
+            x, u = follow_demonstration(system, *example, args.tracking)
+        else:
+            u = starting_actions(args.restarts, T, system.nu, system.control_dt, search.rng).to(system.device)
+            x, u = best_of_random_starts(system, search.cost, system.start()[0], u, args.guides, args.screening, show)
+    except ValueError as error:
+        fail(error)
+    return ilqr(system, search.cost, x, u, args.ilqr_iterations, show=show)
+
+
+def make_guides(search: Search, plan: Plan, say: Callable[[str], None]) -> list[LinearGaussian]:
+    """The controllers about a plan, with the tracking term of Section 6. Checks the Jacobians that they rest on."""
+    args, system = search.args, search.system
+    cost = Sum((search.cost, Tracking(system, plan.x, plan.u, args.tracking)))
+    guides = maximum_entropy_controllers(system, cost, plan, search.network.sigma, args.spread)
+    returns = ", ".join(f"{-cost:.2f} ({note})" for cost, note in zip(plan.cost, plan.note, strict=True))
+    say(f"planned in {system.steps:,} control steps: returns {returns}")
+    for guide in guides:
+        if guide.mu > 1e-2:
+            say(f"warning: a guide's Q_uu needed mu = {guide.mu:.1e}; it is far from an optimum")
+    every = args.horizon // 16 or 1
+    error = system.check_jacobians(plan.x[0, :-1:every], plan.u[0, ::every])
+    say(f"Jacobians against central differences: relative error {error.median():.1e}, worst {error.max():.1e}")
+    if not error.median() < 1e-3:
+        fail("the simulator's Jacobians are not those of its steps")
+    return guides
+
+
+def nearest_feedback(search: Search, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """At states x (m, nx), the guides' mean actions (m, nu) and their L (m, nu, nu) at the step that looks most alike.
+
+    Alike is what the policy observes, in standard deviations: root mean square, returned last (m,). What it does not
+    observe has no feedback: the place along the way may be another cycle's of the gait.
+    """
+    system, policy, T = search.system, search.network, search.args.horizon
+    path, u, K, L = (torch.cat([g[i][:T] for g in search.guides]) for i in range(4))
+    looks, own = (policy.standard(system.observe(states)) for states in (path, x))
+    distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
+    tangent = system.difference(x, path[t]) * system.seen
+    return u[t] + (K[t] @ tangent.unsqueeze(-1)).squeeze(-1), L[t], distance / own.shape[1] ** 0.5
+
+
+def load(guide: Iterable[Tensor], device: torch.device) -> LinearGaussian:
+    """From a checkpoint."""
+    return LinearGaussian(*(tensor.to(device) for tensor in guide))
 
 
 # The policy -----------------------------------------------------------------------------------------------------------
@@ -575,10 +524,14 @@ class Policy(nn.Module):
         draws = [scale * torch.randn(size, generator=rng) for scale, size in zip(scales, self.sizes, strict=True)]
         return torch.cat(draws).to(self.sigma)
 
+    def standard(self, obs: Tensor) -> Tensor:
+        """(..., obs_dim) as the network sees them."""
+        return (obs - self.obs_mean) / self.obs_std
+
     def mean(self, theta: Tensor, obs: Tensor) -> Tensor:
         """(..., nu) of obs (..., obs_dim)."""
         w1, b1, w2, b2 = (w.view(shape) for w, shape in zip(theta.split(self.sizes), self.shapes, strict=True))
-        hidden = F.softplus(F.linear((obs - self.obs_mean) / self.obs_std, w1, b1))
+        hidden = F.softplus(F.linear(self.standard(obs), w1, b1))
         return self.u_mean + self.u_std * F.linear(hidden, w2, b2)
 
     def log_prob(self, theta: Tensor, obs: Tensor, u: Tensor) -> Tensor:
@@ -628,6 +581,77 @@ class Samples(NamedTuple):
         return log_mixture(self.log_q[:, self.source.unique()])
 
 
+class SampleSet:
+    """S: samples, and the distributions that they come from."""
+
+    def __init__(self, system: System, policy: Policy, samples: Samples) -> None:
+        self.system, self.policy, self.samples = system, policy, samples
+        self.generators: list[LinearGaussian | Tensor] = []  # guides, the initial ones first, and policies as theta
+        self.best = -1  # theta*'s index among them
+        self.initial = 0  # initial guides among them
+
+    def log_density(self, generator: LinearGaussian | Tensor, samples: Samples) -> Tensor:
+        """(m, T) of prefixes."""
+        if isinstance(generator, LinearGaussian):
+            return generator.log_prob(self.system, samples.x, samples.u).cumsum(1)
+        return self.policy.log_prob(generator, samples.obs, samples.u).cumsum(1)
+
+    def append(self, samples: Samples, *new: LinearGaussian | Tensor) -> Tensor:
+        """Adds samples, and the generators that they are the first of; returns the samples' indices."""
+        for generator in new:
+            self.generators.append(generator)
+            column = self.log_density(generator, self.samples).unsqueeze(1)
+            self.samples = self.samples._replace(log_q=torch.cat((self.samples.log_q, column), 1))
+        log_q = torch.stack([self.log_density(generator, samples) for generator in self.generators], 1)
+        first, joined = len(self.samples.u), zip(self.samples, samples._replace(log_q=log_q), strict=True)
+        self.samples = Samples(*(torch.cat(tensors) for tensors in joined))
+        return torch.arange(first, len(self.samples.u), device=log_q.device)
+
+    def guided(self) -> Tensor:
+        """(m,) which samples come from guides."""
+        guides = [isinstance(generator, LinearGaussian) for generator in self.generators]
+        return torch.tensor(guides, device=self.system.device)[self.samples.source]
+
+    def score(self) -> Tensor:
+        """(m,) sum of a sample's weights under theta*; ties are broken by its density."""
+        S, policy = self.samples, self.policy
+        log_w = log_weights(policy.log_prob(policy.theta, S.obs, S.u), S.log_mixture)
+        return torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
+
+    def choose(self, active: int, newest: int) -> Tensor:
+        """Line 6, indices: the newest of theta*, the initial guides' samples, others by importance under theta*.
+
+        Adapted guides have no place of their own: they would fill S_k, and without its own samples nothing in S_k says
+        what theta* earns.
+        """
+        score = torch.where(self.samples.source < self.initial, 2e9, self.score())
+        score[(self.samples.source == self.best).nonzero().flatten()[-newest:]] = 3e9
+        return score.argsort(descending=True, stable=True)[:active].sort().values
+
+    def prune(self, stored: int) -> None:
+        """Keeps so many: the initial guides' samples, those of theta*, the best-scored others; drops generators without
+        samples."""
+        if len(self.samples.u) <= stored:
+            return
+        score = self.score() + 2e9 * (self.samples.source < self.initial) + 1e9 * (self.samples.source == self.best)
+        kept = self.samples.pick(score.argsort(descending=True, stable=True)[:stored].sort().values)
+        used = torch.tensor(sorted({*kept.source.tolist(), self.best}), device=score.device)
+        index = torch.full((len(self.generators),), -1, device=used.device)
+        index[used] = torch.arange(len(used), device=used.device)
+        self.samples = kept._replace(source=index[kept.source], log_q=kept.log_q[:, used])
+        self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
+
+    def state_dict(self) -> dict[str, Any]:
+        generators = [tuple(g) if isinstance(g, LinearGaussian) else g for g in self.generators]
+        return dict(samples=tuple(self.samples), generators=generators, best=self.best, initial=self.initial)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        device = self.system.device
+        self.samples = Samples(*(tensor.to(device) for tensor in state["samples"]))
+        self.generators = [g.to(device) if isinstance(g, Tensor) else load(g, device) for g in state["generators"]]
+        self.best, self.initial = state["best"], state["initial"]
+
+
 def log_mixture(log_q: Tensor) -> Tensor:
     """(m, T) log of the mixture of n PREFIX densities, from cumulated log q_j (m, n, T) (Section 3)."""
     return torch.logsumexp(log_q, 1) - math.log(log_q.shape[1])
@@ -664,7 +688,7 @@ def dagger(search: Search) -> dict[str, float]:
     """Ross et al. 2011: the controller's actions at the states that the policy visits join the data."""
     args, policy = search.args, search.network
     new = search.draw(policy.theta)
-    (obs, u), labels = search.lessons, search.means(search.guides[0], new.x)
+    (obs, u), labels = search.lessons, search.guides[0].mean(search.system, slice(0, args.horizon), new.x[:, :-1])
     obs, u = search.lessons = torch.cat((obs, new.obs)), torch.cat((u, labels))
     policy.theta = policy.fit(policy.theta, obs, u, args.lbfgs_iterations)
     return search.metrics(new)

@@ -24,8 +24,8 @@ from diffsim.training.checkpoint import load, restore
 from diffsim.training.lbfgs import maximise
 
 SMALL = (
-    "--env cartpole --horizon 30 --restarts 3 --screening 4 --ilqr-iterations 20 --pretraining 40 --gate 1 --hidden 8 "
-    "--pretraining-samples 8 --guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 4 "
+    "--env cartpole --horizon 30 --restarts 3 --screening 4 --ilqr-iterations 20 --pretraining 40 --hidden 8 "
+    "--guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 4 "
     "--lbfgs-iterations 5 --eval-every 2 --eval-episodes 3 --quiet"
 ).split()
 TINY = [*SMALL, *"--horizon 8 --ilqr-iterations 3 --pretraining 5 --iterations 2 --eval-episodes 1".split()]
@@ -241,7 +241,7 @@ def test_schedule_of_the_regulariser(
         assert metrics["gps/regularizer"] == pytest.approx(seen[-1] if seen else start)
         best = best + 1e-3 if better else best
         torch.testing.assert_close(search.network.theta, best)
-        torch.testing.assert_close(search.generators[search.best], best)
+        torch.testing.assert_close(search.S.generators[search.S.best], best)
         seen.append(search.w_r)
     assert drawn == search.control_steps
     expected = [1e-5, 1e-6, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-2, 1e-2, 1e-3]
@@ -255,86 +255,78 @@ def test_guides_reproduce_the_plan(search: gps.Search) -> None:
     assert abs(mean - plan) < 0.01 * abs(plan) and 0 < std < 0.01 * abs(plan)
 
 
-def test_lessons_are_the_guides_means_about_a_wider_path(search: gps.Search) -> None:
-    search.args.pretraining_samples, guide = 400, search.guides[0]
-
-    def spread(factor: float) -> Tensor:
-        search.args.pretraining_spread = factor
-        obs, u = search.wide_samples()
-        assert obs.shape == (400, 30, 5) and u.shape == (400, 30, 1)
-        torch.testing.assert_close(u[:, 0], guide.u[:1].expand(400, 1))  # without noise at the start, which all share
-        return (u[:, 1] - guide.u[1]).std()
-
-    ratio = spread(0.1) / spread(0.01)  # small: at this plan the motor is in the tail of its tanh
-    torch.testing.assert_close(ratio, torch.tensor(10.0).double(), rtol=0.15, atol=0)
-
-
-def test_labels_are_the_guides_means_until_a_trajectory_leaves_the_lessons(search: gps.Search) -> None:
-    guide, (lessons, _) = search.guides[0], search.wide_samples()  # 8 trajectories
-    samples = search.measure(*guide.sample(search.system, 0.1 * search.noise(2)))
-    samples.obs[1, 12] += 10.0  # the second trajectory leaves at step 12, and what it does later counts no more
-    obs, u = search.label(guide, lessons, samples)
-    x = torch.cat((samples.x[0, :30], samples.x[1, :12]))
-    path, K = (torch.cat((tensor[:30], tensor[:12])) for tensor in (guide.x, guide.K))
-    mean = torch.cat((guide.u, guide.u[:12])) + (K @ (x - path).unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(u, mean[::4])  # as many of its steps as 2 of the 8 lessons
-    torch.testing.assert_close(obs, search.system.observe(x)[::4])
+def test_feedback_is_that_of_the_step_that_looks_most_alike(search: gps.Search) -> None:
+    """Whatever the time; and what is not observed has none: here the place along x of a hopper."""
+    guide, steps = search.guides[0], torch.tensor([3, 20, 11])
+    d = 1e-4 * torch.ones(3, search.system.nd, dtype=torch.float64)
+    u, L, distance = gps.nearest_feedback(search, search.system.retract(guide.x[steps], d))
+    torch.testing.assert_close(u, guide.u[steps] + (guide.K[steps] @ d.unsqueeze(-1)).squeeze(-1))
+    assert torch.equal(L, guide.L[steps]) and (distance < 1e-2).all()
+    hopper = make_search("hopper", "--horizon 2")
+    x = hopper.system.start().expand(3, -1)
+    none = x.new_zeros(2, 3)
+    hopper.guides = [LinearGaussian(x, none, x.new_ones(2, 3, 12), none.diag_embed(), x[0, 0], x[0, 0])]
+    assert hopper.system.seen.tolist() == [0.0] + 11 * [1.0]
+    away = hopper.system.retract(x, torch.eye(12, dtype=torch.float64)[[0, 1, 2]])
+    u, _, distance = gps.nearest_feedback(hopper, away)
+    torch.testing.assert_close(u, torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64)[:, None].expand(-1, 3))
+    assert distance[0] == 0 and (distance[1:] > 0).all()
 
 
-def test_pretraining_learns_from_the_states_that_a_network_visited(
-    search: gps.Search, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sizes, starts, said = [], [], []
-
-    def fit(theta: Tensor, obs: Tensor, u: Tensor, iterations: int) -> Tensor:
-        sizes.append(len(obs))
-        starts.append(theta)
-        return theta + 1.0
-
-    monkeypatch.setattr(search.network, "fit", fit)
-    monkeypatch.setattr(search, "label", lambda guide, lessons, samples: (samples.obs[:, 0], samples.u[:, 0]))
-    search.guide_return, search.args.gate = (0.0, 0.0), 3  # out of reach
-    search.pretrain(*search.wide_samples(), said.append)
-    assert sizes == [8 * 30, 8 * 30 + 8, 8 * 30 + 16]  # each time the first steps of 8 trajectories join
-    assert torch.equal(starts[1], starts[0] + 1.0) and torch.equal(starts[2], starts[1] + 1.0)  # from the last network
-    assert len(said) == 4 and said[-1].startswith("warning")
+def test_lessons_end_where_the_guides_are_far(search: gps.Search) -> None:
+    """And the policy that they teach errs less, in the units of the guides' covariance."""
+    samples = search.measure(*search.guides[0].sample(search.system, 0.1 * search.noise(2)))
+    assert search.learn(samples) == 1.0 and [len(part) for part in search.lessons] == [60, 60, 60]
+    x = samples.x.clone()
+    x[1, 12:, 2:] += 100.0
+    assert search.learn(samples._replace(x=x, obs=search.system.observe(x[:, :-1]))) == 42 / 60
+    obs, u, L = search.lessons
+    assert len(u) == 102
+    search.student = search.network.theta
+    theta, metrics = search.imitate()
+    errors = [
+        torch.linalg.solve(L, (u - search.network.mean(t, obs))[..., None]) for t in (theta, search.network.theta)
+    ]
+    assert metrics["gps/error"] == pytest.approx(errors[0].square().mean().sqrt().item())
+    assert errors[0].norm() < errors[1].norm()
 
 
 def test_active_set(search: gps.Search) -> None:
     """All guiding samples, the newest of the best policy, and a planted sample of high weight."""
     other = search.network.theta + 0.01
-    planted = int(search.append(search.draw(other, len(search.generators)), other)[-1])
-    S = search.set
+    planted = int(search.S.append(search.draw(other, len(search.S.generators)), other)[-1])
+    S = search.S.samples
     log_q = S.log_q.clone()
     log_q[planted] -= 1e3
-    search.set = S._replace(log_q=log_q)
-    chosen = set(search.choose().tolist())
-    guiding, own = (S.source == 0).nonzero().flatten(), (S.source == search.best).nonzero().flatten()[-4:]
+    search.S.samples = S._replace(log_q=log_q)
+    chosen = set(search.S.choose(16, 4).tolist())
+    guiding, own = (S.source == 0).nonzero().flatten(), (S.source == search.S.best).nonzero().flatten()[-4:]
     assert {planted, *guiding.tolist(), *own.tolist()} <= chosen and len(chosen) == 16
 
 
 def test_adapted_guides_leave_room_for_the_best_policys_own_samples(search: gps.Search) -> None:
     """Otherwise nothing in S_k says what it earns, and no proposal looks better than the adapted guides' returns."""
     adapted = search.guides[0]._replace(u=search.guides[0].u + 0.1)
+    S = search.S
     for _ in range(3):
-        search.append(search.measure(*adapted.sample(search.system, search.noise(6)), len(search.generators)), adapted)
-    S, chosen = search.set, search.choose()
-    own = (S.source == search.best).nonzero().flatten()[-4:]
-    assert {*own.tolist(), *(S.source == 0).nonzero().flatten().tolist()} <= set(chosen.tolist())
-    search.prune()  # of 24 + 18 samples 24 stay
-    assert (search.set.source == 0).sum() == 8 and (search.set.source == search.best).sum() >= 4
-    assert search.generators[search.best] is not search.guides[0]
+        S.append(search.measure(*adapted.sample(search.system, search.noise(6)), len(S.generators)), adapted)
+    source, chosen = S.samples.source, set(S.choose(16, 4).tolist())
+    own = (source == S.best).nonzero().flatten()[-4:]
+    assert {*own.tolist(), *(source == 0).nonzero().flatten().tolist()} <= chosen
+    S.prune(24)  # of 24 + 18
+    assert (S.samples.source == 0).sum() == 8 and (S.samples.source == S.best).sum() >= 4
+    torch.testing.assert_close(S.generators[S.best], search.network.theta)
 
 
 def test_densities_of_the_set_are_those_of_its_generators(search: gps.Search) -> None:
     """After all appending and pruning, and each sample was more likely where it came from than it is elsewhere."""
-    S = search.set
+    S = search.S.samples
     assert len(S.u) <= 24
-    for j, generator in enumerate(search.generators):
-        torch.testing.assert_close(S.log_q[:, j], search.log_density(generator, S), rtol=1e-9, atol=1e-9)
+    for j, generator in enumerate(search.S.generators):
+        torch.testing.assert_close(S.log_q[:, j], search.S.log_density(generator, S), rtol=1e-9, atol=1e-9)
     own = S.log_q[torch.arange(len(S.u)), S.source, -1]
     assert (own >= S.log_q[:, :, -1].median(1).values).double().mean() > 0.9
-    torch.testing.assert_close(search.network.theta, search.generators[search.best])
+    torch.testing.assert_close(search.network.theta, search.S.generators[search.S.best])
 
 
 # The script
@@ -354,7 +346,7 @@ def test_rows_and_files_of_a_run(trained: Path, rows: list[dict[str, str]]) -> N
     arguments = json.loads((trained / "args.json").read_text())
     assert arguments["hidden"] == 8 and arguments["action_cost"] == 1e-3
     steps = [int(row["control_steps"]) for row in rows]
-    assert steps[0] == 30 * (8 + 8 + 8 + 4)  # guiding samples, those of pretraining, a network's and the policy's own
+    assert steps[0] == 30 * (8 + 4)  # guiding samples and the policy's own
     # Before a proposal is accepted it is drawn again; a rejection draws the best policy's samples again.
     for drawn, row in zip(np.diff(steps) // 30, rows[1:], strict=True):
         assert drawn in ((4 + 8,) if row["gps_accepted"] == "1.0" else (4 + 4, 4 + 8 + 4))
@@ -408,27 +400,27 @@ def test_an_evaluation_ends_where_the_robot_falls() -> None:
 
 
 @pytest.mark.parametrize(
-    "variant", ["unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
+    "variant", ["feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
 )
 def test_variants(variant: str, tmp_path: Path) -> None:
     modules = run(gps, tmp_path, *TINY, "--variant", variant)["modules"]
-    search = modules["search"]
-    guided = variant in ("unregularized", "dagger")
-    assert any(len(generator) > 1 for generator in search["generators"]) == guided
+    search, S = modules["search"], modules["samples"]
+    guided = variant in ("feedback", "unregularized")
+    assert any(isinstance(generator, tuple) for generator in S["generators"]) == guided == (S["initial"] == 1)
     assert (search["w_r"] == 0) == (variant == "unregularized")
-    assert (len(search["set"][0][:, 0].unique(dim=0)) > 3) == (variant == "restart")
-    assert len(search["lessons"][0]) == (8 + 2 * 4 if variant == "dagger" else 0)
-    moved = not torch.equal(modules["policy"]["theta"], search["generators"][search["best"]][0])
+    assert (len(S["samples"][0][:, 0].unique(dim=0)) > 3) == (variant == "restart")
+    assert len(search["lessons"]) == {"feedback": 3, "dagger": 2}.get(variant, 0)
+    assert variant != "dagger" or len(search["lessons"][0]) == 8 + 2 * 4
+    moved = not torch.equal(modules["policy"]["theta"], S["generators"][S["best"]])
     assert moved == (variant in ("policy-gradient", "dagger"))
 
 
 def test_seeds_and_adaptive_guides(tmp_path: Path) -> None:
-    arguments = [*TINY, *"--guides 2 --adaptive 1 --adaptive-iterations 2 --seed".split()]
-    one, other = (run(gps, tmp_path / str(seed), *arguments, seed) for seed in (1, 2))
-    assert not torch.equal(one["modules"]["policy"]["theta"], other["modules"]["policy"]["theta"])
-    search = one["modules"]["search"]
-    assert len(search["guides"]) == len(search["adapted"]) == 2
-    assert sum(len(generator) > 1 for generator in search["generators"]) == 4
+    arguments = [*TINY, *"--guides 2 --adaptive 1 --adaptive-iterations 2 --stored 60 --seed".split()]
+    one, other = (run(gps, tmp_path / str(seed), *arguments, seed)["modules"] for seed in (1, 2))
+    assert not torch.equal(one["policy"]["theta"], other["policy"]["theta"])
+    assert len(one["search"]["guides"]) == len(one["search"]["adapted"]) == one["samples"]["initial"] == 2
+    assert sum(isinstance(generator, tuple) for generator in one["samples"]["generators"]) == 4
 
 
 def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:

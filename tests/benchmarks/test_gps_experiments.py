@@ -17,8 +17,8 @@ import diffsim
 import gps
 
 SMALL = (
-    "--env cartpole --horizon 12 --restarts 2 --screening 2 --ilqr-iterations 10 --pretraining 20 --gate 1 --hidden 8 "
-    "--pretraining-samples 8 --guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 1 "
+    "--env cartpole --horizon 12 --restarts 2 --screening 2 --ilqr-iterations 10 --pretraining 20 --hidden 8 "
+    "--guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 1 "
     "--lbfgs-iterations 3 --eval-episodes 2 --quiet"
 ).split()
 
