@@ -15,7 +15,7 @@ from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
 
 # isort: split
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -24,31 +24,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers
+from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers, nearest_feedback
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration
 from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.restarts import best_of_random_starts, starting_actions
 from diffsim.planning.system import System
-from diffsim.training import (
-    Count,
-    Finite,
-    Flags,
-    Natural,
-    NonNegative,
-    Positive,
-    Run,
-    distributed,
-    evaluate_checkpoint,
-    parse,
-)
+from diffsim.training import distributed
+from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.checkpoint import Stateful
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
+from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, parse
 from diffsim.training.lbfgs import maximise
 from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.run import Run
 
 Variant = Literal[
     "full", "feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
@@ -129,12 +121,8 @@ class Args(Flags):
     """trajectories kept to choose from"""
     lbfgs_iterations: Count = 60
     """L-BFGS iterations of each of an iteration's two optimisations"""
-    initial_regularizer: NonNegative = 1e-2
-    """w_r at the start"""
-    regularizer_bounds: tuple[NonNegative, NonNegative] = (1e-4, 1.0)
-    """w_r is changed by factors of ten between these"""
-    near: Positive = 1.0
-    """feedback: distance from the guides, in standard deviations of what is observed, to which it is imitated"""
+    regularizer_bounds: tuple[Positive, Positive] = (1e-4, 1.0)
+    """w_r starts at their geometric mean and is changed by factors of ten between them"""
     step: Positive = 0.1
     """policy-gradient: length of a step along the normalised gradient"""
 
@@ -153,7 +141,7 @@ class Args(Flags):
             fail("trains in one process; start it without torchrun")
         if self.env == "cartpole" and self.reward == "target":
             fail("--reward target is of robots that walk or swim; cartpole has --reward native")
-        least = dict(horizon=2, samples=2, guiding_samples=max(2, self.guides), restarts=self.guides)
+        least = dict(horizon=2, guiding_samples=max(2, self.guides), restarts=self.guides, samples=max(2, self.guides))
         least |= dict(active=self.guiding_samples + self.samples, stored=self.active)
         for name, bound in least.items():
             if getattr(self, name) < bound:
@@ -179,7 +167,7 @@ class Search:
         self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn
         self.adapted: list[LinearGaussian] = []  # the last ones of line 9
         self.network = Policy(args.hidden, self.system)  # has theta*
-        self.w_r = 0.0 if args.variant == "unregularized" else args.initial_regularizer
+        self.w_r = 0.0 if args.variant == "unregularized" else math.prod(args.regularizer_bounds) ** 0.5
         self.floor, self.scale = -math.inf, 1.0  # least reward of a step; standard deviation of rewards
         self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
         self.control_steps = self.plan_steps = self.nonfinite = 0
@@ -221,12 +209,11 @@ class Search:
         self.S.append(own, policy.theta)
         self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
         say(f"pretraining: rms error {fit:.2f} sigma, rollouts return {own.returns.mean():.2f}")
+        self.student = policy.theta
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
-        if args.variant == "feedback":
-            self.student = policy.theta
-            self.learn(guiding)
-            self.learn(own)
+        for samples in (guiding, own) if args.variant == "feedback" else ():
+            self.learn(samples)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides
 
@@ -238,11 +225,9 @@ class Search:
         active = S.choose(args.active, args.samples)  # line 6: choose S_k
         # line 7: theta_k <- arg max Phi
         theta, metrics = self.imitate() if args.variant == "feedback" else self.optimise(S.samples.pick(active))
-        source = len(S.generators)
+        source, before = len(S.generators), len(S.samples.u)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
         active = torch.cat((active, S.append(new, theta)))
-        if args.variant == "feedback":
-            metrics["gps/near"] = self.learn(new)
         if iteration <= args.adaptive and args.variant in GUIDED:
             active = torch.cat((active, self.adapt()))  # line 9: generate adaptive guiding samples
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
@@ -257,7 +242,9 @@ class Search:
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
             S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
-        S.prune(args.stored)  # line 17: the end of the choice; S is bounded
+        if args.variant == "feedback":
+            metrics["gps/near"] = self.learn(S.samples.pick(slice(before, None)))
+        S.prune(args.stored)
         return metrics | self.metrics(self.draw(theta) if args.variant == "restart" else new)
 
     # Trajectories
@@ -272,9 +259,8 @@ class Search:
             height, attitude = x[..., 2], 4.0 * x[..., 4:7].square().sum(-1)
         else:
             height, attitude = x[..., 1] + float(system.scene.mj_model.body_pos[1, 2]), x[..., 2].square()
-        cost = cost + (x[..., system.nq] - args.target_velocity).square()
-        cost = cost + args.height_weight * (height - args.target_height).square()
-        return -(cost + args.attitude_weight * attitude)
+        cost = cost + (x[..., system.nq] - args.target_velocity).square() + args.attitude_weight * attitude
+        return -(cost + args.height_weight * (height - args.target_height).square())
 
     def noise(self, count: int, rng: torch.Generator | None = None) -> Tensor:
         """(count, T, nu) standard normal."""
@@ -302,8 +288,7 @@ class Search:
     def draw(self, theta: Tensor, source: int = -1, count: int | None = None) -> Samples:
         """Trajectories, --samples of them; those of the restart variant that join S start at states of the guides."""
         count, start = count or self.args.samples, None
-        self.control_steps += count * self.args.horizon
-        noise = self.noise(count)
+        self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
         if source >= 0 and self.args.variant == "restart":
             x = torch.cat([guide.x[:-1] for guide in self.guides])
             start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
@@ -318,16 +303,17 @@ class Search:
             "sim/model_steps": self.plan_steps,
         }
 
+    def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
+        """So many trajectories of guides in equal shares, numbered from the first one's source on."""
+        self.control_steps += count * self.args.horizon
+        shares = [self.noise(len(range(i, count, len(guides)))) for i in range(len(guides))]
+        drawn = [guide.sample(self.system, noise) for guide, noise in zip(guides, shares, strict=True)]
+        parts = [self.measure(*ends, first + i) for i, ends in enumerate(drawn)]
+        return Samples(*map(torch.cat, zip(*parts, strict=True)))
+
     def sample_guides(self) -> Samples:
         """Line 2. As far below the worst step as that is below the best is the floor of all rewards to come."""
-        count, n = self.args.guiding_samples, len(self.guides)
-        self.control_steps += count * self.args.horizon
-        shares = [count // n + (i < count % n) for i in range(n)]
-        drawn = [
-            self.measure(*g.sample(self.system, self.noise(k)), i)
-            for i, (g, k) in enumerate(zip(self.guides, shares, strict=True))
-        ]
-        samples = Samples(*(torch.cat(parts) for parts in zip(*drawn, strict=True)))
+        samples = self.follow(self.guides, self.args.guiding_samples)
         worst, top = samples.reward[torch.isfinite(samples.reward)].aminmax()
         self.floor = (2 * worst - top).item()
         samples = samples._replace(reward=samples.reward.clamp(min=self.floor))
@@ -351,13 +337,14 @@ class Search:
         return theta, {"gps/phi": value, "gps/start": start}
 
     def learn(self, samples: Samples) -> float:
-        """Adds to the lessons what the guides do at the states of samples, up to --near from them; returns the share.
+        """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share.
 
-        Of each state, that of the guides' step which looks most like it: the policy does not see the time, and one
-        that runs late would be told to jump. Further away, as after a fall, linear feedback means nothing.
+        The guides' step is the one that looks most like the state: the policy does not see the time, and one that runs
+        late would be told to jump. Far away, as after a fall, linear feedback means nothing.
         """
-        u, L, distance = nearest_feedback(self, samples.x[:, :-1].flatten(0, 1))
-        near = distance <= self.args.near
+        policy, x = self.network, samples.x[:, :-1].flatten(0, 1)
+        u, L, distance = nearest_feedback(self.system, self.guides, x, policy.obs_std)
+        near = distance <= 1.0  # standard deviation
         new = samples.obs.flatten(0, 1)[near], u[near], L[near]
         self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
         return near.double().mean().item()
@@ -379,7 +366,7 @@ class Search:
     def adapt(self) -> Tensor:
         """Line 9: guides of exp(reward / eta) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
         args, system, policy, before = self.args, self.system, self.network, self.system.steps
-        guides, theta, indices = self.adapted or self.guides, policy.theta, []
+        guides, theta = self.adapted or self.guides, policy.theta
         x, u = torch.stack([g.x for g in guides]), torch.stack([g.u for g in guides])
         eta = torch.stack([g.eta for g in self.guides]).mean()
         surprisal = Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma, eta.item())
@@ -389,12 +376,7 @@ class Search:
         made = maximum_entropy_controllers(system, cost, plan, policy.sigma, 1.0)
         self.adapted = [g._replace(L=g.L * (eta / g.eta).sqrt(), eta=eta) for g in made]
         self.plan_steps += system.steps - before
-        for i, guide in enumerate(self.adapted):
-            count = args.samples // args.guides + (i < args.samples % args.guides)
-            self.control_steps += count * args.horizon
-            samples = self.measure(*guide.sample(system, self.noise(count)), len(self.S.generators))
-            indices.append(self.S.append(samples, guide))
-        return torch.cat(indices)
+        return self.S.append(self.follow(self.adapted, args.samples, len(self.S.generators)), *self.adapted)
 
     def estimate(self, theta: Tensor, active: Tensor) -> tuple[bool, dict[str, float]]:
         """Line 10: whether theta is better than theta* by Eq. 2 on the active set; the values, and theta's weights."""
@@ -406,14 +388,14 @@ class Search:
             raise FloatingPointError(f"the value estimates are {values}: no active sample has a finite density")
         log_w = log_weights(log_pi[0], mixture)
         weights = torch.softmax(log_w, 0)
+        guided = S.source < self.S.initial
         ess = 1.0 / weights.square().sum(0)
         return values[0] > values[1], {
             "gps/estimate": values[0],
             "gps/best_estimate": values[1],
             "gps/ess": ess.mean().item(),
-            "gps/ess_min": ess.min().item(),
-            "gps/guide_share": (weights[self.S.guided()[active]].sum() / weights.sum()).item(),
-            "gps/log_weight_spread": (log_w[:, -1].max() - log_w[:, -1].min()).item(),
+            "gps/guide_share": (weights[guided].sum() / weights.sum()).item(),
+            "gps/guide_nats": -log_w[guided, -1].mean().item() if self.S.initial else math.nan,
         }
 
     # Checkpoints
@@ -427,13 +409,16 @@ class Search:
         for name in self.NUMBERS:
             setattr(self, name, state[name])
         device = self.system.device
-        self.guides, self.adapted = ([load(guide, device) for guide in state[name]] for name in ("guides", "adapted"))
+        self.guides, self.adapted = (
+            [LinearGaussian(*(tensor.to(device) for tensor in guide)) for guide in state[name]]
+            for name in ("guides", "adapted")
+        )
         self.lessons = tuple(tensor.to(device) for tensor in state["lessons"])
         self.student = state["student"].to(device)
         self.rng.set_state(state["rng"])
 
 
-# Planning: line 1, and the guides' feedback ---------------------------------------------------------------------------
+# Planning: line 1 -----------------------------------------------------------------------------------------------------
 
 
 def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
@@ -472,25 +457,6 @@ def make_guides(search: Search, plan: Plan, say: Callable[[str], None]) -> list[
     if not error.median() < 1e-3:
         fail("the simulator's Jacobians are not those of its steps")
     return guides
-
-
-def nearest_feedback(search: Search, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """At states x (m, nx), the guides' mean actions (m, nu) and their L (m, nu, nu) at the step that looks most alike.
-
-    Alike is what the policy observes, in standard deviations: root mean square, returned last (m,). What it does not
-    observe has no feedback: the place along the way may be another cycle's of the gait.
-    """
-    system, policy, T = search.system, search.network, search.args.horizon
-    path, u, K, L = (torch.cat([g[i][:T] for g in search.guides]) for i in range(4))
-    looks, own = (policy.standard(system.observe(states)) for states in (path, x))
-    distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
-    tangent = system.difference(x, path[t]) * system.seen
-    return u[t] + (K[t] @ tangent.unsqueeze(-1)).squeeze(-1), L[t], distance / own.shape[1] ** 0.5
-
-
-def load(guide: Iterable[Tensor], device: torch.device) -> LinearGaussian:
-    """From a checkpoint."""
-    return LinearGaussian(*(tensor.to(device) for tensor in guide))
 
 
 # The policy -----------------------------------------------------------------------------------------------------------
@@ -607,11 +573,6 @@ class SampleSet:
         self.samples = Samples(*(torch.cat(tensors) for tensors in joined))
         return torch.arange(first, len(self.samples.u), device=log_q.device)
 
-    def guided(self) -> Tensor:
-        """(m,) which samples come from guides."""
-        guides = [isinstance(generator, LinearGaussian) for generator in self.generators]
-        return torch.tensor(guides, device=self.system.device)[self.samples.source]
-
     def score(self) -> Tensor:
         """(m,) sum of a sample's weights under theta*; ties are broken by its density."""
         S, policy = self.samples, self.policy
@@ -621,16 +582,14 @@ class SampleSet:
     def choose(self, active: int, newest: int) -> Tensor:
         """Line 6, indices: the newest of theta*, the initial guides' samples, others by importance under theta*.
 
-        Adapted guides have no place of their own: they would fill S_k, and without its own samples nothing in S_k says
-        what theta* earns.
+        Adapted guides have no place of their own: they would fill S_k, and nothing in it would say what theta* earns.
         """
         score = torch.where(self.samples.source < self.initial, 2e9, self.score())
         score[(self.samples.source == self.best).nonzero().flatten()[-newest:]] = 3e9
         return score.argsort(descending=True, stable=True)[:active].sort().values
 
     def prune(self, stored: int) -> None:
-        """Keeps so many: the initial guides' samples, those of theta*, the best-scored others; drops generators without
-        samples."""
+        """Keeps so many: the initial guides', those of theta*, the best-scored others; drops generators without any."""
         if len(self.samples.u) <= stored:
             return
         score = self.score() + 2e9 * (self.samples.source < self.initial) + 1e9 * (self.samples.source == self.best)
@@ -642,13 +601,14 @@ class SampleSet:
         self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
 
     def state_dict(self) -> dict[str, Any]:
-        generators = [tuple(g) if isinstance(g, LinearGaussian) else g for g in self.generators]
+        generators = [tuple(g) if isinstance(g, LinearGaussian) else (g,) for g in self.generators]
         return dict(samples=tuple(self.samples), generators=generators, best=self.best, initial=self.initial)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         device = self.system.device
         self.samples = Samples(*(tensor.to(device) for tensor in state["samples"]))
-        self.generators = [g.to(device) if isinstance(g, Tensor) else load(g, device) for g in state["generators"]]
+        stored = ([tensor.to(device) for tensor in generator] for generator in state["generators"])
+        self.generators = [LinearGaussian(*tensors) if len(tensors) > 1 else tensors[0] for tensors in stored]
         self.best, self.initial = state["best"], state["initial"]
 
 

@@ -1,13 +1,14 @@
 """Guided policy search: runs its variants on tasks and seeds, and draws and tabulates what came of them.
 
     python benchmarks/gps_experiments.py                  the runs of docs/gps.md; finished ones are kept
-    python benchmarks/gps_experiments.py --env cartpole --seeds 1 --variants full nonguided    a part of them
+    python benchmarks/gps_experiments.py --env hopper --cases full adaptive --seeds 1 2 --train-only    a part of them
     python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
+    python benchmarks/gps_experiments.py --list           a command for each run, to be run side by side
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
     python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
 
 Writes gps_runs.csv (every iteration of every run), gps_generalisation.csv (the policy, the DDP controller
-and that of the nearest state, from perturbed starts and under pushes), gps_paths.csv (where the root went) and
+and that of the nearest step, from perturbed starts and under pushes), gps_paths.csv (where the root went) and
 gps_time.csv (one iteration of iLQR), their tables in gps.md, and the pictures figures/gps_variants.png, gps_paths.png
 and gps_generalisation.png: Figures 2, 1 and 3 of the paper. An interrupted run is resumed.
 """
@@ -16,14 +17,15 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from statistics import mean, median
 from typing import Annotated, Any, get_args
@@ -37,7 +39,7 @@ from tables import ROOT, fill, markdown, read_csv, write_csv
 from torch import Tensor
 
 import diffsim
-from diffsim.planning import REAL, ilqr
+from diffsim.planning import REAL, ilqr, nearest_feedback
 from diffsim.training import checkpoint, fail, load_policy, parse_penalty
 
 sys.path.append(str(ROOT))
@@ -46,25 +48,27 @@ import gps  # noqa: E402
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
-HALF = "--iterations 30 --horizon 160 --ilqr-iterations 100"
-SHORT = "--iterations 30 --horizon 100 --ilqr-iterations 100"
-# What docs/gps.md shows, per task: seeds, variants, flags
-SUITE: dict[str, tuple[tuple[int, ...], tuple[gps.Variant, ...], str]] = {
-    "cartpole": ((1, 2, 3, 4, 5), ("full", "unregularized"), "--iterations 30"),
-    "hopper": ((1,), ("full", "policy-gradient", "single-example"), HALF),
-    "swimmer": ((1,), ("full",), HALF),
-    "walker": ((1,), ("full",), SHORT),
-    "ant": ((1,), ("full",), SHORT),
+# What a run is called, and its flags: Figure 2's variants, adaptive guides of Section 4.2, and wider guides
+CASES: dict[str, str] = {variant: f"--variant {variant}" for variant in get_args(gps.Variant)}
+CASES |= {"adaptive": "--adaptive 40", "wide": "--spread 3", "feedback-wide": "--variant feedback --spread 3"}
+# What docs/gps.md shows, per task: seeds, cases, flags
+SUITE: dict[str, tuple[tuple[int, ...], tuple[str, ...], str]] = {
+    "cartpole": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
+    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
+    "swimmer": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
+    "walker": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
+    "ant": ((1, 2, 3), ("full", "feedback"), "--iterations 80 --horizon 100"),
 }
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
     "gps_guides gps_guides_std gps_fit eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
-    "gps_ess gps_guide_share sim_model_steps"
+    "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
+PLANNED = "full", "feedback"  # cases whose generalisation and samples are compared
 TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (250, 400)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
-COLOURS = {variant: f"C{i}" for i, variant in enumerate(get_args(gps.Variant))}
+COLOURS = {case: f"C{i}" for i, case in enumerate(CASES)}
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 STYLES = {"plan": ("k", 2.0, 3), "guides": ("0.6", 0.8, 1), "policy": ("C0", 0.8, 2)}  # colour, width, order
 AXES = {"cartpole": ("x (m)", "angle (rad)"), "swimmer": ("x (m)", "y (m)"), "ant": ("x (m)", "y (m)")}
@@ -78,21 +82,25 @@ class Args:
     """tasks"""
     seeds: tuple[int, ...] = ()
     """seeds (default: the suite's)"""
-    variants: tuple[gps.Variant, ...] = ()
-    """variants (default: the suite's)"""
+    cases: tuple[str, ...] = ()
+    """variants, adaptive, wide or feedback-wide (default: the suite's)"""
     jobs: int = 1
     """runs at a time, each with one thread"""
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
     count: int = 20
     """perturbed starts and pushes of each size"""
     runs: Path = ROOT / "runs" / "gps"
-    """directory of the runs: {runs}/{env}__{variant}__{seed}"""
+    """directory of the runs: {runs}/{env}__{case}__{seed}"""
     results: Path = OUTPUT / "cpu"
     """directory of the csv files"""
     docs: Path = OUTPUT
     """directory of gps.md, whose tables are filled, and of figures/"""
     update_results: bool = False
     """write to results/cpu and docs/ of this repository"""
+    train_only: bool = False
+    """only train: several such commands may run side by side"""
+    list: bool = False
+    """only print a command for each of the runs"""
     draw_only: bool = False
     """train nothing: collect, draw and tabulate the runs there are"""
     record: Path | None = None
@@ -140,8 +148,8 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
 
 def train(directory: Path, flags: Sequence[str]) -> str:
     """Trains, or resumes, or finds that it is done; returns what there is to say."""
-    path, (env, variant, seed) = directory / "checkpoint.pt", directory.name.split("__")
-    start = ["--env", env, "--variant", variant, "--seed", seed]
+    path, (env, case, seed) = directory / "checkpoint.pt", directory.name.split("__")
+    start = ["--env", env, *CASES[case].split(), "--seed", seed]
     if path.exists():
         state = checkpoint.load(path, "gps")
         if state["iteration"] >= state["args"]["iterations"]:
@@ -153,16 +161,30 @@ def train(directory: Path, flags: Sequence[str]) -> str:
     return f"{directory.name}: {'done' if code == 0 else f'exit code {code}, see {log.name}'}"
 
 
+def jobs(args: Args) -> dict[str, list[str]]:
+    """The flags of each run, by its name."""
+    result = {}
+    for env in args.env:
+        seeds, cases, flags = SUITE.get(env, ((1,), ("full",), "--iterations 30"))
+        for case, seed in product(args.cases or cases, args.seeds or seeds):
+            result[f"{env}__{case}__{seed}"] = [*flags.split(), *args.arguments]
+    return result
+
+
 def train_all(args: Args) -> None:
     args.runs.mkdir(parents=True, exist_ok=True)
-    jobs = []
-    for env in args.env:
-        seeds, variants, flags = SUITE.get(env, ((1,), ("full",), "--iterations 30"))
-        names = [f"{env}__{v}__{seed}" for v in args.variants or variants for seed in args.seeds or seeds]
-        jobs += [(args.runs / name, [*flags.split(), *args.arguments]) for name in names]
     with ThreadPoolExecutor(args.jobs) as pool:
-        for text in pool.map(lambda job: train(*job), jobs):
+        for text in pool.map(lambda job: train(args.runs / job[0], job[1]), jobs(args).items()):
             print(text, flush=True)
+
+
+def commands(args: Args) -> Iterator[str]:
+    """One for each run, of one thread."""
+    for name in jobs(args):
+        env, case, seed = name.split("__")
+        rest = ["--", *args.arguments] if args.arguments else []
+        flags = f"--env {env} --cases {case} --seeds {seed} --runs {args.runs} --train-only".split()
+        yield shlex.join(["python", "benchmarks/gps_experiments.py", *flags, *rest])
 
 
 def time_ilqr(env: str = "hopper", horizon: int = 500, repeats: int = 5) -> list[Row]:
@@ -194,22 +216,12 @@ def load_search(path: Path) -> gps.Search:
 
 
 def controllers(search: gps.Search) -> dict[str, Act]:
-    """The policy's mean; the DDP controller; and the DDP controller of the nearest state (TBDP), in scaled tangents."""
+    """The policy's mean; the DDP controller; and the DDP controller of the step that looks most alike (TBDP)."""
     system, policy, guide = search.system, search.network, search.guides[0]
-    path = guide.x[:-1]
-    scale = system.difference(path, path[:1]).std(0).clamp(min=1e-3)
-    if search.args.env != "cartpole":
-        scale[0] = math.inf  # wherever it is along x
-
-    def nearest(_: int, x: Tensor) -> Tensor:
-        distance = (system.difference(x.unsqueeze(1), path.unsqueeze(0)) / scale).square().sum(-1)
-        t = distance.argmin(1)
-        return guide.u[t] + (guide.K[t] @ system.difference(x, path[t]).unsqueeze(-1)).squeeze(-1)
-
     return {
         "policy": lambda _, x: policy.mean(policy.theta, system.observe(x)),
         "ddp": lambda t, x: guide.mean(system, t, x),
-        "tbdp": nearest,
+        "tbdp": lambda _, x: nearest_feedback(system, [guide], x, policy.obs_std)[0],
     }
 
 
@@ -275,15 +287,17 @@ def collect(args: Args) -> None:
         for row in read_csv(directory / "progress.csv"):
             kept = {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT}
             tables["runs"].append(run | dict(horizon=horizon) | kept)
-        if run["variant"] == "full" and (directory / "checkpoint.pt").is_file():
+        if run["variant"] in PLANNED and (directory / "checkpoint.pt").is_file():
             if not (directory / "generalisation.csv").is_file():
                 search = load_search(directory / "checkpoint.pt")
                 write_csv(directory / "generalisation.csv", generalisation(search, args.count))
                 write_csv(directory / "paths.csv", paths(search))
             for name in ("generalisation", "paths"):
                 tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
-    first: dict[str, str] = {}  # one seed a task is drawn, every fourth step
-    drawn = [row for row in tables["paths"] if row["seed"] == first.setdefault(row["env"], row["seed"])]
+    first: dict[str, tuple[str, ...]] = {}  # one run a task is drawn, every fourth step
+    drawn = [
+        r for r in tables["paths"] if (r["variant"], r["seed"]) == first.setdefault(r["env"], (r["variant"], r["seed"]))
+    ]
     tables["paths"] = [row | {k: f"{float(row[k]):.4g}" for k in "xy"} for row in drawn if int(row["step"]) % 4 == 0]
     for name, rows in tables.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
@@ -317,18 +331,40 @@ def summarise(run: tuple[str, ...], rows: list[dict[str, str]]) -> Row:
 def tabulate(args: Args) -> dict[str, str]:
     """The tables of docs/gps.md, by the names of their places."""
     runs, kept = grouped(read_csv(args.table("runs")), *RUN), []
-    for (env, kind), rows in grouped(read_csv(args.table("generalisation")), "env", "kind").items():
+    for (env, variant, kind), rows in grouped(read_csv(args.table("generalisation")), "env", "variant", "kind").items():
         cells = dict.fromkeys(map(str, sorted({*STARTS, *PUSHES})), "")
         for (size,), own in grouped(rows, "size").items():
             shares = (mean(float(row["kept"]) for row in own if row["controller"] == name) for name in CONTROLLERS)
             cells[size] = " / ".join(f"{share:.0%}" for share in shares)
-        kept.append({"task": env, "perturbed": kind} | cells)
+        kept.append({"task": env, "variant": variant, "perturbed": kind} | cells)
     return {
         "runs": markdown([summarise(run, rows) for run, rows in runs.items()]),
+        "diagnosis": markdown(diagnose(runs)),
         "generalisation": markdown(kept),
         "samples": markdown(compare(args)),
         "time": markdown(read_csv(args.table("time"))),
     }
+
+
+def diagnose(runs: dict[tuple[str, ...], list[dict[str, str]]]) -> list[Row]:
+    """Why a search does or does not learn: per task, T and case, means over the last half of the iterations and seeds.
+
+    Overestimate: of the best policy's value on the active set, above the mean return of its evaluation at the end.
+    """
+    table, cases = [], dict[tuple[str, ...], list[list[dict[str, str]]]]()
+    for (env, case, _), rows in runs.items():
+        cases.setdefault((env, rows[0]["horizon"], case), []).append(rows)
+    for (env, horizon, case), seeds in cases.items():
+        late = [row for rows in seeds for row in rows[len(rows) // 2 :]]
+        ends = [number(rows[-1]["eval_objective"]) for rows in seeds]
+        over = [number(rows[-1].get("gps_best_estimate", "")) - end for rows, end in zip(seeds, ends, strict=True)]
+        cells = {"nats": "gps_guide_nats", "guide share": "gps_guide_share", "ESS": "gps_ess", "near": "gps_near"}
+        row = {"task": env, "T": horizon, "case": case, "seeds": len(seeds)}
+        row["pretrained"] = f"{mean(number(rows[0]['gps_objective']) for rows in seeds):.1f}"
+        row |= {"end": f"{mean(ends):.1f}", "worst end": f"{min(ends):.1f}", "overestimate": f"{mean(over):.1f}"}
+        row["accepted"] = f"{mean(sum(number(row['gps_accepted']) == 1 for row in rows) for rows in seeds):.1f}"
+        table.append(row | {k: f"{mean(number(row.get(name, '')) for row in late):.3g}" for k, name in cells.items()})
+    return table
 
 
 def compare(args: Args) -> list[Row]:
@@ -338,13 +374,14 @@ def compare(args: Args) -> list[Row]:
     """
     runs, table = grouped(read_csv(args.table("runs")), *RUN), []
     for env, targets in TARGETS.items():
-        learners = {"gps": [rows for (task, variant, _), rows in runs.items() if (task, variant) == (env, "full")]}
+        own = {case: [rows for (e, c, _), rows in runs.items() if (e, c) == (env, case)] for case in PLANNED}
+        learners = {f"gps, {case}": seeds for case, seeds in own.items() if seeds}
+        if not learners:
+            continue
+        first = next(iter(learners.values()))
+        T, planning = float(first[0][0]["horizon"]), median(float(rows[0]["sim_model_steps"]) for rows in first)
         for name in ("shac", "ppo_baseline"):
             learners[name] = list(grouped(read_csv(args.results / f"{name}_{env}.csv"), "seed").values())
-        if not learners["gps"]:
-            continue
-        T = float(learners["gps"][0][0]["horizon"])
-        planning = median(float(rows[0]["sim_model_steps"]) for rows in learners["gps"])
         for target in targets:
             cells = {}
             for name, seeds in learners.items():
@@ -392,23 +429,27 @@ def draw_paths(ax: plt.Axes, env: str, rows: list[dict[str, str]]) -> None:
     ax.set(title=env, **dict(zip(("xlabel", "ylabel"), AXES.get(env, ("x (m)", "height (m)")), strict=True)))
 
 
-def draw_kept(ax: plt.Axes, env: str, kind: str, rows: list[dict[str, str]]) -> None:
+def draw_kept(ax: plt.Axes, title: str, kind: str, rows: list[dict[str, str]]) -> None:
     for name, colour in CONTROLLERS.items():
         sizes = grouped((row for row in rows if row["controller"] == name), "size")
         kept = {float(size): 100 * mean(float(row["kept"]) for row in own) for (size,), own in sizes.items()}
         ax.plot(list(kept), list(kept.values()), "o-", color=colour, label=name)
     unit = "perturbation of the start" if kind == "start" else "push (m/s)"
-    ax.set(title=env, xlabel=unit, ylabel="kept (%)", ylim=(-5, 105))
+    ax.set(title=title, xlabel=unit, ylabel="kept (%)", ylim=(-5, 105))
 
 
 def draw(args: Args) -> None:
     runs, tracks = grouped(read_csv(args.table("runs")), *RUN), grouped(read_csv(args.table("paths")), "env")
-    groups = grouped(read_csv(args.table("generalisation")), "env", "kind")
+    groups = grouped(read_csv(args.table("generalisation")), "env", "variant", "kind")
     pictures: dict[str, list[list[Callable[[plt.Axes], None]]]] = {
         "variants": [[partial(draw_variants, env=env, runs=runs) for env in sorted({env for env, _, _ in runs})]],
         "paths": [[partial(draw_paths, env=env, rows=rows) for (env,), rows in tracks.items()]],
         "generalisation": [
-            [partial(draw_kept, env=env, kind=kind, rows=rows) for (env, k), rows in groups.items() if k == kind]
+            [
+                partial(draw_kept, title=f"{env}, {variant}", kind=kind, rows=rows)
+                for (env, variant, k), rows in groups.items()
+                if k == kind
+            ]
             for kind in ("start", "push")
         ],
     }
@@ -435,11 +476,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.record:
         record(args.record, args.actor, args.steps)
         return
+    for case in args.cases:
+        if case not in CASES:
+            fail(f"unknown case {case!r}: choose from {', '.join(CASES)}")
     for env in args.env:
         if env not in diffsim.TASKS:
             fail(f"unknown task {env!r}: choose from {', '.join(diffsim.TASKS)}")
+    if args.list:
+        print("\n".join(commands(args)))
+        return
     if not args.draw_only:
         train_all(args)
+    if args.train_only:
+        return
+    if not args.draw_only:
         write_csv(args.table("time"), time_ilqr())
     collect(args)
     draw(args)

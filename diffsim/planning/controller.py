@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from diffsim.planning.dynamics import REAL, Dynamics
 from diffsim.planning.ilqr import Cost, Plan, backward_pass, step_jacobian, symmetric
+from diffsim.planning.system import System
 
 
 def gaussian_log_prob(u: Tensor, mean: Tensor, sigma: Tensor) -> Tensor:
@@ -47,6 +49,27 @@ class LinearGaussian(NamedTuple):
             return self.mean(system, t, x) + (self.L[t] @ noise[:, t].unsqueeze(-1)).squeeze(-1)
 
         return system.rollout(self.x[0].expand(len(noise), -1), noise.shape[1], act)
+
+
+def nearest_feedback(
+    system: System, guides: Sequence[LinearGaussian], x: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What controllers do where they look most like states, whatever the time.
+
+    Coordinates that are not observed get no feedback: a place along the way may be in another cycle of a gait.
+
+    Args:
+        x: (m, nx) states.
+        scale: (obs_dim,) in which differences of observations are measured.
+
+    Returns:
+        Mean actions (m, nu); L (m, nu, nu); root mean square distance (m,) of the observations, in their scale.
+    """
+    path, u, K, L = (torch.cat([guide[i][: len(guide.u)] for guide in guides]) for i in range(4))
+    looks, own = (system.observe(states) / scale for states in (path, x))
+    distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
+    tangent = system.difference(x, path[t]) * system.seen
+    return u[t] + (K[t] @ tangent.unsqueeze(-1)).squeeze(-1), L[t], distance / own.shape[1] ** 0.5
 
 
 @torch.no_grad()

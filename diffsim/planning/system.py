@@ -20,7 +20,7 @@ class System(Dynamics):
 
     Attributes:
         observed: (obs_dim,) 1 where an observation is of the state, 0 where it is of the action before.
-        seen: (nd,) 1 where an observation changes with a tangent coordinate of the state, 0 where not: where it is along x.
+        seen: (nd,) 1 where an observation changes with a tangent coordinate of the state, 0 where not: its x.
     """
 
     def __init__(self, env: DiffEnv, threads: int | None = None) -> None:

@@ -47,12 +47,23 @@ def test_tables_and_pictures(runs: Path, tmp_path: Path) -> None:
     assert len(list((docs / "figures").glob("gps_*.png"))) == 3
 
 
-def test_nearest_controller_acts_by_the_nearest_state(runs: Path) -> None:
+def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -> None:
     search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
     guide, act = search.guides[0], experiments.controllers(search)
     torch.testing.assert_close(act["tbdp"](0, guide.x[8:9]), guide.u[8:9])
     torch.testing.assert_close(act["ddp"](8, guide.x[8:9]), guide.u[8:9])
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
+
+
+def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str]) -> None:
+    options = "--env hopper --cases full adaptive --seeds 1 2 --runs there".split()
+    experiments.main([*options, "--list", "--", "--horizon", "160"])
+    lines = capsys.readouterr().out.splitlines()
+    part = "--env hopper --cases adaptive --seeds 2 --runs there --train-only -- --horizon 160"
+    assert len(lines) == 4 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
+    assert experiments.CASES["adaptive"] == "--adaptive 40"
+    for flags in experiments.CASES.values():
+        gps.parse(gps.Args, ["--env", "hopper", *flags.split()])
 
 
 def test_a_finished_run_is_kept(runs: Path) -> None:

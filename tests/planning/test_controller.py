@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from systems import Linear, normal
+from systems import Linear, normal, task_system
 
-from diffsim.planning import gaussian_log_prob, ilqr, maximum_entropy_controllers
+from diffsim.planning import (
+    LinearGaussian,
+    gaussian_log_prob,
+    ilqr,
+    maximum_entropy_controllers,
+    nearest_feedback,
+)
 
 
 def test_the_maximum_entropy_controller(rng: np.random.Generator) -> None:
@@ -39,3 +45,30 @@ def test_log_density_of_independent_normals(rng: np.random.Generator) -> None:
     u, mean, sigma = normal(rng, 4, 5, 2), normal(rng, 4, 5, 2), torch.tensor([0.3, 2.0]).double()
     expected = torch.distributions.Normal(mean, sigma).log_prob(u).sum(-1)
     torch.testing.assert_close(gaussian_log_prob(u, mean, sigma), expected)
+
+
+def test_feedback_is_that_of_the_step_that_looks_most_alike(rng: np.random.Generator) -> None:
+    """Of any guide, whatever the time; where a hopper is along x, which it does not observe, has none."""
+    system = task_system("hopper")
+    assert system.seen.tolist() == [0.0] + 11 * [1.0]
+    guides = []
+    for _ in range(2):
+        x, u, K = 0.1 * normal(rng, 6, 12), normal(rng, 5, 3), normal(rng, 5, 3, 12)
+        guides.append(LinearGaussian(x, u, K, normal(rng, 5, 3, 3), x[0, 0], x[0, 0]))
+    d = 1e-3 * normal(rng, 4, 12)
+    d[:, 0] = 10.0
+    (i, t), scale = ((0, 1, 1, 0), (4, 0, 3, 2)), torch.full((system.observed.shape[0],), 2.0).double()
+    x, mean, L = (
+        torch.stack([part(guides[j], k, d[row]) for row, (j, k) in enumerate(zip(i, t, strict=True))])
+        for part in (
+            lambda g, k, d: g.x[k] + d,
+            lambda g, k, d: g.u[k] + g.K[k, :, 1:] @ d[1:],
+            lambda g, k, _: g.L[k],
+        )
+    )
+    u, factor, distance = nearest_feedback(system, guides, x, scale)
+    torch.testing.assert_close(u, mean)
+    assert torch.equal(factor, L)
+    at = torch.stack([guides[j].x[k] for j, k in zip(i, t, strict=True)])
+    expected = ((system.observe(x) - system.observe(at)) / 2).square().mean(1).sqrt()
+    torch.testing.assert_close(distance, expected)
