@@ -193,7 +193,6 @@ class Search:
         self.plan_steps = self.system.steps - before
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
-        say(f"guiding samples: return {mean:.2f} +- {std:.2f}")
         policy.standardise(guiding.obs, guiding.u)
         obs, u = guiding.obs, guiding.u
         if args.variant == "single-example":
@@ -208,7 +207,7 @@ class Search:
         own = self.draw(policy.theta, self.S.best)
         self.S.append(own, policy.theta)
         self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
-        say(f"pretraining: rms error {fit:.2f} sigma, rollouts return {own.returns.mean():.2f}")
+        say(f"return of guides {mean:.2f} +- {std:.2f}, of the pretrained policy {own.returns.mean():.2f}")
         self.student = policy.theta
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
@@ -307,8 +306,7 @@ class Search:
         """So many trajectories of guides in equal shares, numbered from the first one's source on."""
         self.control_steps += count * self.args.horizon
         shares = [self.noise(len(range(i, count, len(guides)))) for i in range(len(guides))]
-        drawn = [guide.sample(self.system, noise) for guide, noise in zip(guides, shares, strict=True)]
-        parts = [self.measure(*ends, first + i) for i, ends in enumerate(drawn)]
+        parts = [self.measure(*g.sample(self.system, shares[i]), first + i) for i, g in enumerate(guides)]
         return Samples(*map(torch.cat, zip(*parts, strict=True)))
 
     def sample_guides(self) -> Samples:
@@ -339,13 +337,13 @@ class Search:
     def learn(self, samples: Samples) -> float:
         """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share.
 
-        The guides' step is the one that looks most like the state: the policy does not see the time, and one that runs
-        late would be told to jump. Far away, as after a fall, linear feedback means nothing.
+        By the step that looks most like a state: the policy does not see the time, and would be told to jump where it
+        runs late. Far away, as after a fall, linear feedback means nothing.
         """
-        policy, x = self.network, samples.x[:, :-1].flatten(0, 1)
-        u, L, distance = nearest_feedback(self.system, self.guides, x, policy.obs_std)
+        x = samples.x[:, :-1].flatten(0, 1)
+        u, L, distance = nearest_feedback(self.system, self.guides, x, self.network.obs_std)
         near = distance <= 1.0  # standard deviation
-        new = samples.obs.flatten(0, 1)[near], u[near], L[near]
+        new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
         self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
         return near.double().mean().item()
 
@@ -354,11 +352,10 @@ class Search:
 
         Their covariance is eta Q_uu^-1, so that an error counts by what it costs under iLQR's value function.
         """
-        obs, u, L = self.lessons
+        obs, u, inverse = self.lessons
 
         def objective(theta: Tensor) -> Tensor:
-            error = (u - self.network.mean(theta, obs)).unsqueeze(-1)
-            return -torch.linalg.solve_triangular(L, error, upper=False).square().mean()
+            return -(inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)).square().mean()
 
         self.student, value = maximise(objective, self.student, self.args.lbfgs_iterations)
         return self.student, {"gps/lessons": len(u), "gps/error": math.sqrt(-value)}
@@ -372,9 +369,8 @@ class Search:
         surprisal = Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma, eta.item())
         cost = Sum((self.cost, surprisal))
         plan = ilqr(system, cost, x, u, args.adaptive_iterations, mu=1e-3)
-        # of exp((r + eta log pi) / eta): the temperature is not chosen anew
         made = maximum_entropy_controllers(system, cost, plan, policy.sigma, 1.0)
-        self.adapted = [g._replace(L=g.L * (eta / g.eta).sqrt(), eta=eta) for g in made]
+        self.adapted = [g._replace(L=g.L * (eta / g.eta).sqrt(), eta=eta) for g in made]  # not a temperature of its own
         self.plan_steps += system.steps - before
         return self.S.append(self.follow(self.adapted, args.samples, len(self.S.generators)), *self.adapted)
 

@@ -180,10 +180,11 @@ def train_all(args: Args) -> None:
 
 def commands(args: Args) -> Iterator[str]:
     """One for each run, of one thread."""
+    runs = args.runs.relative_to(ROOT) if args.runs.is_relative_to(ROOT) else args.runs
+    rest = ["--", *args.arguments] if args.arguments else []
     for name in jobs(args):
         env, case, seed = name.split("__")
-        rest = ["--", *args.arguments] if args.arguments else []
-        flags = f"--env {env} --cases {case} --seeds {seed} --runs {args.runs} --train-only".split()
+        flags = f"--env {env} --cases {case} --seeds {seed} --runs {runs} --train-only".split()
         yield shlex.join(["python", "benchmarks/gps_experiments.py", *flags, *rest])
 
 

@@ -56,7 +56,8 @@ def nearest_feedback(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What controllers do where they look most like states, whatever the time.
 
-    Coordinates that are not observed get no feedback: a place along the way may be in another cycle of a gait.
+    Coordinates that are not observed, as the place along x, do not count for the likeness but for the feedback, which
+    lets a late policy catch up.
 
     Args:
         x: (m, nx) states.
@@ -68,7 +69,7 @@ def nearest_feedback(
     path, u, K, L = (torch.cat([guide[i][: len(guide.u)] for guide in guides]) for i in range(4))
     looks, own = (system.observe(states) / scale for states in (path, x))
     distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
-    tangent = system.difference(x, path[t]) * system.seen
+    tangent = system.difference(x, path[t])
     return u[t] + (K[t] @ tangent.unsqueeze(-1)).squeeze(-1), L[t], distance / own.shape[1] ** 0.5
 
 

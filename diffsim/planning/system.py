@@ -20,7 +20,6 @@ class System(Dynamics):
 
     Attributes:
         observed: (obs_dim,) 1 where an observation is of the state, 0 where it is of the action before.
-        seen: (nd,) 1 where an observation changes with a tangent coordinate of the state, 0 where not: its x.
     """
 
     def __init__(self, env: DiffEnv, threads: int | None = None) -> None:
@@ -32,9 +31,6 @@ class System(Dynamics):
             self.task.observe(qpos, qvel, action.unsqueeze(0)) for action in (self._no_action, self._no_action + 1)
         )
         self.observed = (still == moved)[0].to(REAL)
-        start = self.start().expand(self.nd, -1)
-        aside = self.retract(start, 1e-2 * torch.eye(self.nd, dtype=REAL, device=self.device))
-        self.seen = (self.observe(aside) != self.observe(start)).any(1).to(REAL)
 
     def start(self) -> Tensor:
         """(1, nx) the task's unperturbed start."""

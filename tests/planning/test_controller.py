@@ -48,9 +48,8 @@ def test_log_density_of_independent_normals(rng: np.random.Generator) -> None:
 
 
 def test_feedback_is_that_of_the_step_that_looks_most_alike(rng: np.random.Generator) -> None:
-    """Of any guide, whatever the time; where a hopper is along x, which it does not observe, has none."""
+    """Of any guide, whatever the time, and wherever a hopper is along x, which it does not observe."""
     system = task_system("hopper")
-    assert system.seen.tolist() == [0.0] + 11 * [1.0]
     guides = []
     for _ in range(2):
         x, u, K = 0.1 * normal(rng, 6, 12), normal(rng, 5, 3), normal(rng, 5, 3, 12)
@@ -62,7 +61,7 @@ def test_feedback_is_that_of_the_step_that_looks_most_alike(rng: np.random.Gener
         torch.stack([part(guides[j], k, d[row]) for row, (j, k) in enumerate(zip(i, t, strict=True))])
         for part in (
             lambda g, k, d: g.x[k] + d,
-            lambda g, k, d: g.u[k] + g.K[k, :, 1:] @ d[1:],
+            lambda g, k, d: g.u[k] + g.K[k] @ d,
             lambda g, k, _: g.L[k],
         )
     )
