@@ -31,16 +31,25 @@ from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.restarts import best_of_random_starts, starting_actions
 from diffsim.planning.system import System
-from diffsim.training import distributed
-from diffsim.training.assess import evaluate_checkpoint
+from diffsim.tasks import TASKS
+from diffsim.training import (
+    Count,
+    Finite,
+    Flags,
+    Natural,
+    NonNegative,
+    Positive,
+    Run,
+    distributed,
+    evaluate_checkpoint,
+    parse,
+)
 from diffsim.training.checkpoint import Stateful
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
-from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, parse
 from diffsim.training.lbfgs import maximise
 from diffsim.training.normalizer import ObsNormalizer
-from diffsim.training.run import Run
 
 Variant = Literal[
     "full", "feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
@@ -137,8 +146,11 @@ class Args(Flags):
         return dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
 
     def check(self) -> None:
+        super().check()
         if distributed.size() > 1:
             fail("trains in one process; start it without torchrun")
+        if TASKS[self.env].timed:
+            fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
         if self.env == "cartpole" and self.reward == "target":
             fail("--reward target is of robots that walk or swim; cartpole has --reward native")
         least = dict(horizon=2, guiding_samples=max(2, self.guides), restarts=self.guides, samples=max(2, self.guides))

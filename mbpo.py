@@ -19,7 +19,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from diffsim.planning import Dynamics
+from diffsim.tasks import TASKS
 from diffsim.training import (
     ClippedAdam,
     Count,
@@ -36,8 +37,10 @@ from diffsim.training import (
     ObsNormalizer,
     ParallelFlags,
     Positive,
+    ReplayBuffer,
     Run,
     Stateful,
+    Transition,
     Widths,
     distributed,
     episode_metrics,
@@ -51,7 +54,7 @@ from diffsim.training import (
 # fmt: off
 COLUMNS = ("hidden", "model_hidden", "rollout_lengths", "num_envs", "actor_lr", "temperature_lr", "iterations")
 PER_TASK = {
-    "cartpole":     ((64, 64),             (128, 128),           (1, 5),  16, 1e-3, 1e-3,   200),
+    "cartpole":     ((64, 64),             (128, 128),           (1, 5),  16, 1e-3, 1e-3,   600),
     "hopper":       ((256, 128, 64),       (200, 200, 200, 200), (1, 15), 64, 5e-4, 5e-4, 2_000),
     "half_cheetah": ((256, 128, 64),       (200, 200, 200, 200), (1, 1),  64, 5e-4, 5e-4, 2_000),
     "ant":          ((256, 128, 64),       (200, 200, 200, 200), (1, 25), 64, 5e-4, 5e-4, 2_000),
@@ -143,6 +146,8 @@ class Args(ParallelFlags):
             fail(f"--rollout-lengths {self.rollout_lengths[0]} {self.rollout_lengths[1]} are the wrong way round")
         if self.buffer_size < (rows := self.num_envs * (1 + self.sample_enhance)):
             fail(f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a control step")
+        if self.sample_enhance and TASKS[self.env].timed:
+            fail(f"--sample-enhance takes Jacobians of states that do not hold the time, on which {self.env} depends")
         if self.sample_enhance and (self.contact == "firm" or self.randomise):
             fail("--sample-enhance takes Jacobians of one robot: neither --contact firm nor --randomise goes with it")
 
@@ -232,50 +237,7 @@ def gaussian_nll(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
     return 0.5 * ((target - mean).square() * (-log_var).exp() + log_var + math.log(2 * math.pi))
 
 
-# Buffers --------------------------------------------------------------------------------------------------------------
-
-
-class Transition(NamedTuple):
-    """What a learner needs of control steps: (B, ...)."""
-
-    obs: Tensor
-    action: Tensor
-    reward: Tensor
-    next_obs: Tensor  # before any reset
-    terminated: Tensor  # 1 where the episode failed, 0 where it went on or its time ran out
-
-
-class ReplayBuffer(nn.Module):
-    """The last transitions, on the device; adding and sampling wait for nothing, so both can be captured."""
-
-    rows: Tensor
-    count: Tensor
-
-    def __init__(self, size: int, obs_dim: int, action_dim: int) -> None:
-        super().__init__()
-        self.size, self.widths = size, (obs_dim, action_dim, 1, obs_dim, 1)
-        self.register_buffer("rows", torch.zeros(size, sum(self.widths)), persistent=False)
-        self.register_buffer("count", torch.zeros((), dtype=torch.int64))  # of transitions ever added
-
-    def add(self, transitions: Transition) -> None:
-        columns = [tensor.flatten(1) if tensor.dim() > 1 else tensor.unsqueeze(1) for tensor in transitions]
-        place = (self.count + torch.arange(len(columns[0]), device=self.count.device)) % self.size
-        self.rows.index_copy_(0, place, torch.cat(columns, 1))
-        self.count += len(columns[0])
-
-    def sample(self, number: int) -> Transition:
-        """Drawn uniformly, with repetition."""
-        filled = self.count.clamp(max=self.size)
-        place = (torch.rand(number, device=self.count.device, dtype=torch.float64) * filled).long()
-        obs, action, reward, next_obs, terminated = self.rows[place].split(self.widths, 1)
-        return Transition(obs, action, reward.squeeze(1), next_obs, terminated.squeeze(1))
-
-    def get_extra_state(self) -> Tensor:
-        """The rows that are filled: a checkpoint holds no others."""
-        return self.rows[: min(int(self.count), self.size)]
-
-    def set_extra_state(self, rows: Tensor) -> None:
-        self.rows[: len(rows)] = rows
+# Sample enhancement ---------------------------------------------------------------------------------------------------
 
 
 def enhance(dynamics: Dynamics, x: Tensor, action: Tensor, samples: int, scale: float) -> tuple[Tensor, ...]:

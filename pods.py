@@ -110,6 +110,8 @@ class Args(Flags):
         task = TASKS[self.env]
         if distributed.size() > 1:
             fail("one process alone: sequences are not shared among ranks")
+        if task.timed:
+            fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
         if self.early_termination and task.min_height is not None:
             fail(f"{self.env} ends episodes early, and all sequences have one length: give --no-early-termination")
         if task.episode_length % self.horizon:

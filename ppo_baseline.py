@@ -55,6 +55,7 @@ PER_TASK = {
     "ant":          ((128, 64, 32),  2048,  32, 16384, 5, 0.01,  5000),
     "humanoid":     ((256, 128, 64), 1024,  32,  8192, 5, 0.0,   5000),
     "humanoid_mtu": ((512, 512, 256), 1024, 32,  8192, 6, 0.0,  20000),
+    "humanoid_imitation": ((256, 128, 64), 1024, 32, 8192, 5, 0.0, 5000),
 }
 # fmt: on
 CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more of each
@@ -90,7 +91,7 @@ class Args(ParallelFlags):
     """passes over a rollout's samples (per task)"""
     minibatch_size: Count = 8192
     """samples of a minibatch (per task; on a CPU at most 2048)"""
-    clip: Positive = 0.2
+    clip_coef: Positive = 0.2
     """the probability ratio counts only within 1 - clip and 1 + clip"""
     value_coef: NonNegative = 2.0
     """weight of the value's squared error, in units of its standard deviation"""
@@ -119,7 +120,7 @@ class Args(ParallelFlags):
         if least > largest:
             fail(f"--lr-bounds {least} {largest} are the wrong way round")
         if self.symmetric and TASKS[self.env].mirror is Task.mirror:
-            fail(f"--symmetric: the robot of task {self.env!r} has no left and right")
+            fail(f"--symmetric: task {self.env!r} has no mirror image")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -237,7 +238,7 @@ class PPO:
                 mean, value = policy(b.obs)
                 kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
                 adapt(self.optimizer.lr, distributed.average(kl), args.target_kl, args.lr_bounds)
-                policy_loss = clipped_loss(log_ratio(b, mean, policy.log_std, old_log_std), b.advantage, args.clip)
+                policy_loss = clipped_loss(log_ratio(b, mean, policy.log_std, old_log_std), b.advantage, args.clip_coef)
                 value_loss = (value - b.target).square().mean()
                 bound_loss = (mean.abs() - 1.1).clamp(min=0).square().sum(-1).mean()
                 loss = policy_loss + args.value_coef * value_loss + args.bound_coef * bound_loss

@@ -18,7 +18,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -33,8 +33,10 @@ from diffsim.training import (
     ObsNormalizer,
     ParallelFlags,
     Positive,
+    ReplayBuffer,
     Run,
     Stateful,
+    Transition,
     Widths,
     distributed,
     episode_metrics,
@@ -180,52 +182,6 @@ class Temperature(nn.Module):
     def __init__(self, args: Args) -> None:
         super().__init__()
         self.log = nn.Parameter(torch.full((), math.log(args.initial_temperature)))
-
-
-# The replay buffer ----------------------------------------------------------------------------------------------------
-
-
-class Transition(NamedTuple):
-    """What a learner needs of control steps: (B, ...)."""
-
-    obs: Tensor
-    action: Tensor
-    reward: Tensor
-    next_obs: Tensor  # before any reset
-    terminated: Tensor  # 1 where the episode failed, 0 where it went on or its time ran out
-
-
-class ReplayBuffer(nn.Module):
-    """The last transitions, on the device; adding and sampling wait for nothing, so both can be captured."""
-
-    rows: Tensor
-    count: Tensor
-
-    def __init__(self, size: int, obs_dim: int, action_dim: int) -> None:
-        super().__init__()
-        self.size, self.widths = size, (obs_dim, action_dim, 1, obs_dim, 1)
-        self.register_buffer("rows", torch.zeros(size, sum(self.widths)), persistent=False)
-        self.register_buffer("count", torch.zeros((), dtype=torch.int64))  # of transitions ever added
-
-    def add(self, transitions: Transition) -> None:
-        columns = [tensor.flatten(1) if tensor.dim() > 1 else tensor.unsqueeze(1) for tensor in transitions]
-        place = (self.count + torch.arange(len(columns[0]), device=self.count.device)) % self.size
-        self.rows.index_copy_(0, place, torch.cat(columns, 1))
-        self.count += len(columns[0])
-
-    def sample(self, number: int) -> Transition:
-        """Drawn uniformly, with repetition."""
-        filled = self.count.clamp(max=self.size)
-        place = (torch.rand(number, device=self.count.device, dtype=torch.float64) * filled).long()
-        obs, action, reward, next_obs, terminated = self.rows[place].split(self.widths, 1)
-        return Transition(obs, action, reward.squeeze(1), next_obs, terminated.squeeze(1))
-
-    def get_extra_state(self) -> Tensor:
-        """The rows that are filled: a checkpoint holds no others."""
-        return self.rows[: min(int(self.count), self.size)]
-
-    def set_extra_state(self, rows: Tensor) -> None:
-        self.rows[: len(rows)] = rows
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------

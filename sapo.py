@@ -142,7 +142,7 @@ class Args(ParallelFlags):
     def check(self) -> None:
         super().check()
         if self.symmetric and TASKS[self.env].mirror is Task.mirror:
-            fail(f"--symmetric: the robot of task {self.env!r} has no left and right")
+            fail(f"--symmetric: task {self.env!r} has no mirror image")
         if (self.num_envs // distributed.size()) % self.population:
             fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")
         if self.start_from and not (self.resume or self.evaluate):

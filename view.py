@@ -214,7 +214,7 @@ class Window:
             mujoco.mj_applyFT(model, data, push, turn, data.xipos[body], body, force)
         mujoco.mj_solveM(model, data, acceleration, force[None])
         env.set_state(env.qpos, env.qvel + torch.as_tensor(acceleration * env.control_dt, dtype=env.dtype))
-        self.obs = env.task.observe(env.qpos, env.qvel, self.action)
+        self.obs = env.observe(env.qpos, env.qvel, self.action)
 
     def step(self) -> None:
         self.action = self.policy(self.obs)

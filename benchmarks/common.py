@@ -19,9 +19,10 @@ import torch
 import tyro
 from tables import ROOT, Row
 
-from diffsim import startup
+import diffsim
+from diffsim import DiffEnv, startup
 from diffsim.simulator import check_device
-from diffsim.training import fail, parse_command_line
+from diffsim.training import SavedPolicy, fail, load_policy, make_policy_env, parse_command_line
 from diffsim.training.distributed import choose_device
 from diffsim.training.flags import check_ranges
 
@@ -83,6 +84,39 @@ class CommonFlags:
         name = name if everywhere or self.directory.name == "cpu" else f"{name}_{self.directory.name}"
         if self.update_results and f"<!-- {name} -->" in (DOCS / page).read_text():
             tables.fill(DOCS / page, name, text)
+
+
+class Case(NamedTuple):
+    """A policy with the task on which it was trained."""
+
+    label: str
+    path: Path
+    saved: SavedPolicy
+    env: DiffEnv
+
+    @property
+    def about(self) -> dict[str, object]:
+        """The csv's columns that say which policy it is."""
+        args = self.saved.args
+        return {
+            "checkpoint": self.label,
+            "task": self.env.task.name,
+            "learner": self.saved.script,
+            "contact": " ".join((args.get("contact", "soft"), *args.get("penalty", ()))),
+            "seed": args["seed"],
+            "iteration": self.saved.iteration,
+        }
+
+
+def load_case(path: Path, num_envs: int, device: str) -> Case:
+    """The policy of a checkpoint or of a run's; one of another task than ours ends the benchmark with one line."""
+    path = (path / "checkpoint.pt" if path.is_dir() else path).resolve()
+    saved = load_policy(path)
+    name = saved.args["env"]
+    if name not in diffsim.TASKS:
+        fail(f"{path} was trained on {name!r}, which is no task; choose from {', '.join(diffsim.TASKS)}")
+    run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
+    return Case(f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device))
 
 
 def machine(device: str) -> str:
@@ -160,6 +194,7 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
     axes = figure.subplots(len(grid), len(grid[0]), squeeze=False)
     legend: dict[str, Line2D] = {}
     for axis, panel in zip(axes.flat, chain(*grid), strict=True):
+        axis.set_visible(bool(panel.lines))
         for line in panel.lines:
             (drawn,) = axis.plot(line.x, line.y, line.style, linewidth=line.width, markersize=4)
             legend |= {line.label: drawn} if line.label else {}
@@ -173,7 +208,8 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     columns = max(1, round(len(grid[0]) * size[0] / 1.8))
-    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
+    if legend:
+        figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     print(path)

@@ -16,7 +16,6 @@ from typing import Annotated
 
 import common
 import torch
-import transfer
 import tyro
 from common import Line, Panel, parse, plot
 from tables import markdown
@@ -94,7 +93,7 @@ def agreement(gradients: Tensor) -> float:
 
 def measure(path: Path, args: Args) -> None:
     """Rows of one policy, each in the csv as soon as it is measured."""
-    case = transfer.load(path, transfer.Args(episodes=1))
+    case = common.load_case(path, 1, "cpu")
     task = case.env.task.name
     if "contact" not in case.env.scene.features:
         fail(f"{path} was trained on {task}, which has no ground")

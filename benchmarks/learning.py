@@ -21,6 +21,7 @@ from itertools import product
 from statistics import mean, median, pstdev
 from typing import Literal
 
+import common
 import numpy as np
 from common import TASKS, Line, Panel, TaskName, plot
 from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, parse, passing, seed, summary
@@ -53,6 +54,8 @@ FIRM = ("--contact", "firm")
 SHAC_FIRM = ("shac", *FIRM, "--num-envs", "256")
 PPO_MANY_FIRM = (PPO, *FIRM, *PPO_MANY[3:-2], "--iterations", "1200")
 SAC = "sac_baseline"
+PFPN_PPO = ("pfpn", "--algorithm", "ppo")
+PFPN_SHAC = ("pfpn", "--algorithm", "shac")
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
@@ -89,6 +92,13 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "redq":               (SAC, "--critics", "10", "--critic-subset", "2", "--updates-per-step", "20"),
     "mbpo":               ("mbpo",),
     "se_mbpo":            ("mbpo", "--sample-enhance", "4"),
+    "pfpn_ppo":           PFPN_PPO,
+    "pfpn_shac":          PFPN_SHAC,
+    "pfpn_sac":           ("pfpn", "--algorithm", "sac"),
+    "pfpn_gaussian_ppo":  (*PFPN_PPO, "--policy", "gaussian"),
+    "pfpn_gaussian_shac": (*PFPN_SHAC, "--policy", "gaussian"),
+    **{f"pfpn_{how}":     (*PFPN_PPO, "--resampling", how) for how in ("uniform", "none")},
+    **{f"pfpn_{n}":       (*PFPN_PPO, "--particles", str(n)) for n in (5, 10, 100)},
     "sapo":               SAPO,
     "ppo_many":           PPO_MANY,
     "ppo_many_symmetric": (*PPO_MANY, "--symmetric"),
@@ -106,7 +116,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation", "firm", "orders",
+    "ablation", "firm", "orders", "off_policy", "models", "particles", "resampling",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -125,8 +135,16 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "firm":          ("Learning through firm contact", ("shac_firm", "shac_firm_sudden", "shac_firm_fixed",
                       "shac_firm_wide", "shac_firm_h16", "sapo_firm", "ppo_firm", "ppo_firm_sudden"),
                       ("hopper", "half_cheetah", "ant", "humanoid")),
-    "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"),
-                      ("cartpole", "half_cheetah", "ant")),
+    "off_policy":    ("Figures 4 and 10: off-policy, model-based and sequence learners",
+                      ("shac", PPO, SAC, "sac_large", "redq", "mbpo", "se_mbpo", "pods"),
+                      ("cartpole", "hopper", "ant", "humanoid")),
+    "models":        ("MBPO and SE-MBPO", ("shac", "mbpo", "se_mbpo"), ("cartpole", "ant")),
+    "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"), ("cartpole",)),
+    "particles":     ("PFPN and a Gaussian policy, by PPO, through the simulator's gradient and off-policy",
+                      ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac"),
+                      ("hopper", "ant", "humanoid")),
+    "resampling":    ("PFPN by PPO: its 35 particles, others, and other ways to resample them", ("pfpn_ppo",
+                      "pfpn_uniform", "pfpn_none", "pfpn_5", "pfpn_10", "pfpn_100"), ("hopper", "ant", "humanoid")),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
 }
 # fmt: on
@@ -178,9 +196,13 @@ def collect(args: Args, learner: str, env: TaskName) -> None:
 
 
 def curves(args: Args, learner: str, env: str) -> list[Curve]:
-    """Of each seed, from the csv file."""
+    """Of each seed, from the csv file; where this machine has none, from another one's, without the seconds."""
     seeds: dict[str, list[dict[str, str]]] = {}
-    for row in args.read(f"{learner}_{env}"):
+    rows = args.read(name := f"{learner}_{env}")
+    if not rows and args.directory.parent == common.RESULTS:
+        paths = sorted(common.RESULTS.glob(f"*/{name}.csv"))
+        rows = [row | {"seconds": ""} for path in paths[:1] for row in read_csv(path)]
+    for row in rows:
         seeds.setdefault(row["seed"], []).append(row)
     return [curve(rows) for rows in seeds.values()]
 
@@ -224,12 +246,12 @@ def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[TaskNam
             for k, learner in enumerate(learners):
                 runs = curves(args, learner, env)
                 if runs := timed(runs) if x == "seconds" else runs:
-                    common = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
-                    middle = np.median([np.interp(common, run[x], run["return"]) for run in runs], axis=0)
+                    shared = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
+                    middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
                     lines += [Line(run[x], run["return"], f"C{k}-", width=0.5) for run in runs]
-                    lines.append(Line(common, middle, f"C{k}-", learner, width=2))
-                    begins.append(common[0])
-                    ends.append(common[-1])
+                    lines.append(Line(shared, middle, f"C{k}-", learner, width=2))
+                    begins.append(shared[0])
+                    ends.append(shared[-1])
             for learner in (learner for learner in learners if ends and learner in published):
                 value, style = [published[learner]] * 2, f"C{learners.index(learner)}--"
                 lines.append(Line((min(begins), max(ends)), value, style, f"{learner}, published", 0.8))

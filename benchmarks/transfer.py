@@ -26,14 +26,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import common
 import numpy as np
 import torch
 import tyro
 import worlds
-from common import Line, Panel, parse, plot
+from common import Case, Line, Panel, load_case, parse, plot
 from tables import Row, digits, markdown
 from torch import Tensor
 from worlds import Array, Flags, World
@@ -41,7 +41,7 @@ from worlds import Array, Flags, World
 import diffsim
 from diffsim import DiffEnv, Integration, Scene, Simulator, render
 from diffsim.tasks import Task
-from diffsim.training import Count, Positive, SavedPolicy, fail, load_policy, make_policy_env
+from diffsim.training import Count, Positive, fail
 from diffsim.training.evaluation import FINER, SEED, travels
 
 KEY = ("checkpoint", "task", "learner", "contact", "seed", "condition")
@@ -64,28 +64,15 @@ class Args(common.CommonFlags):
     curves: bool = False  # draw that episode's speed and penetration against time
 
 
-class Case(NamedTuple):
-    """A policy with the task on which it was trained."""
-
-    label: str
-    saved: SavedPolicy
-    env: DiffEnv
-
-
 def load(path: Path, args: Args) -> Case:
     """The policy of a checkpoint or of a run's; what cannot be compared ends the benchmark with one line."""
-    path = (path / "checkpoint.pt" if path.is_dir() else path).resolve()
-    saved = load_policy(path)
-    name = saved.args["env"]
-    if name not in diffsim.TASKS:
-        fail(f"{path} was trained on {name!r}, which is no task; choose from {', '.join(diffsim.TASKS)}")
-    env = make_policy_env(saved, args.episodes, device=args.device)
-    if "muscle" in env.scene.features:
-        fail(f"{path} was trained on {name}, whose muscles are not simulated in MuJoCo here")
+    case = load_case(path, args.episodes, args.device)
+    name = case.env.task.name
+    if "muscle" in case.env.scene.features:
+        fail(f"{case.path} was trained on {name}, whose muscles are not simulated in MuJoCo here")
     if name not in worlds.OBSERVED:
-        fail(f"{path} was trained on {name}, whose observation worlds.py does not compute")
-    run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
-    return Case(f"{run.parent.name}/{run.name}", saved, env)
+        fail(f"{case.path} was trained on {name}, whose observation worlds.py does not compute")
+    return case
 
 
 # Motions --------------------------------------------------------------------------------------------------------------
@@ -192,16 +179,7 @@ def compare(case: Case, args: Args) -> dict[str, Motion]:
     qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
     task, motions, own = type(env.task)(dtype=torch.float64), dict[str, Motion](), math.nan
     integration = env.sim.integration
-    about = {
-        "checkpoint": case.label,
-        "task": task.name,
-        "learner": saved.script,
-        "contact": " ".join((saved.args.get("contact", "soft"), *saved.args.get("penalty", ()))),
-        "seed": saved.args["seed"],
-        "iteration": saved.iteration,
-        "integrator": integration.integrator,
-        "substeps": integration.substeps,
-    }
+    about = case.about | {"integrator": integration.integrator, "substeps": integration.substeps}
     for name, world in conditions(case, args):
         began = time.perf_counter()
         motions[name] = act(world, task, saved.network, qpos, qvel, env.scene.nu, args.steps)

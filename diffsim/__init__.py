@@ -7,12 +7,14 @@ from diffsim import startup  # first: it starts Warp and MuJoCo, and Ctrl-C may 
 # isort: split
 from collections.abc import Mapping
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode
 
+from diffsim.clip import Clip, read_clip
 from diffsim.env import DiffEnv
 from diffsim.integration import Integration
 from diffsim.mjcf import load_scene
@@ -20,10 +22,11 @@ from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.scene import Scene, SceneError
 from diffsim.screen import RenderMode
 from diffsim.simulator import Simulator, check_device
-from diffsim.tasks import TASKS, Accuracy, Contact
+from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation
 
 __all__ = [
     "TASKS",
+    "Clip",
     "DiffEnv",
     "Integration",
     "NumpyEnv",
@@ -33,6 +36,7 @@ __all__ = [
     "Simulator",
     "load_scene",
     "make",
+    "read_clip",
 ]
 
 
@@ -55,6 +59,8 @@ def make(
     max_episode_steps: int | None = None,
     render_mode: RenderMode | None = None,
     factors: bool = False,
+    forces: bool = False,
+    clip: Clip | Path | str | None = None,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -67,6 +73,8 @@ def make(
             integrated; docs/transfer.md has what each costs and how much of a policy's speed is true.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         factors: let constants differ between environments: `env.sim.factors`, see Simulator.
+        forces: let external forces act on the bodies: `env.sim.forces`, see Simulator.
+        clip: the motion that humanoid_imitation tracks, or its .npz file, see read_clip; default the shipped run.
 
     Raises:
         ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
@@ -75,7 +83,13 @@ def make(
         raise ValueError(f"unknown task {name!r}; choose from {', '.join(TASKS)}")
     device = check_device(device)
     startup.check_kernel_cache()
-    task = TASKS[name](device, dtype)
+    kind = TASKS[name]
+    if clip is None:
+        task = kind(device, dtype)
+    elif issubclass(kind, HumanoidImitation):
+        task = kind(device, dtype, clip if isinstance(clip, Clip) else read_clip(clip))
+    else:
+        raise ValueError(f"task {name!r} tracks no clip; {HumanoidImitation.name} does")
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
     return DiffEnv(
         task,
@@ -92,6 +106,7 @@ def make(
         max_episode_steps=max_episode_steps,
         render_mode=render_mode,
         factors=factors,
+        forces=forces,
     )
 
 

@@ -44,7 +44,7 @@ class DiffEnv(VectorEnv):
         task: task on the simulator's device and dtype.
         scene: its robot.
         integration: default the task's "default".
-        num_envs, horizon, threads, factors: see Simulator; env.sim.factors has the factors.
+        num_envs, horizon, threads, factors, forces: see Simulator; env.sim has the factors and the forces.
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
@@ -54,6 +54,7 @@ class DiffEnv(VectorEnv):
     Attributes:
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.
         episode_step: (N,) int64 control steps since each environment's start.
+        first_step: (N,) int64 at which step of a timed task each episode started; 0 of others.
         generator: the torch.Generator of the start states.
     """
 
@@ -79,6 +80,7 @@ class DiffEnv(VectorEnv):
         max_episode_steps: int | None = None,
         render_mode: RenderMode | None = None,
         factors: bool = False,
+        forces: bool = False,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
@@ -100,6 +102,7 @@ class DiffEnv(VectorEnv):
             dtype,
             threads,
             factors=factors,
+            forces=forces,
         )
         self.device, self.dtype = self.sim.device, dtype
         real = np.float32 if dtype == torch.float32 else np.float64
@@ -115,6 +118,7 @@ class DiffEnv(VectorEnv):
 
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
+        self.first_step = torch.zeros_like(self.episode_step)
         self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
         self._restart()
         self.render_mode = render_mode
@@ -163,10 +167,12 @@ class DiffEnv(VectorEnv):
         _, reward, terminated, truncated, info = self.advance(action)
         if self._time == self.horizon:
             self._draw_starts()
-        row, starts = info["_final_obs"].unsqueeze(1), (start[self._time] for start in self._starts)
+        row, (first, *starts) = info["_final_obs"].unsqueeze(1), (start[self._time] for start in self._starts)
         self.qpos, self.qvel, self._obs = (
             torch.where(row, start, end) for start, end in zip(starts, (self.qpos, self.qvel, self._obs), strict=True)
         )
+        if self.task.timed:
+            self.first_step.copy_(torch.where(info["_final_obs"], first, self.first_step))
         self._time += 1
         self.episode_step.masked_fill_(info["_final_obs"], 0)
         self._episode_return.masked_fill_(info["_final_obs"], 0.0)
@@ -179,7 +185,7 @@ class DiffEnv(VectorEnv):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
             raise ActionError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
-        start = (self.qpos, self.qvel, action, self.sim.factors)
+        start = (self.qpos, self.qvel, action, self.sim.factors, self.sim.forces)
         recorded = torch.is_grad_enabled() and any(part.requires_grad for part in start)
         if recorded and self._recorded == self.horizon:
             raise RuntimeError(
@@ -189,7 +195,7 @@ class DiffEnv(VectorEnv):
         self._recorded += recorded
         self.qpos, self.qvel = self.sim.step(self.qpos, self.qvel, action)
         nonfinite = self.sim.nonfinite.clone()
-        self._obs = obs = self.task.observe(self.qpos, self.qvel, action)
+        self._obs = obs = self.observe(self.qpos, self.qvel, action, elapsed=1)
         reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)
         with torch.no_grad():
             self.episode_step += 1
@@ -213,7 +219,8 @@ class DiffEnv(VectorEnv):
         Returns:
             obs (N, obs_dim) of all environments.
         """
-        starts = self._start_states(rand)
+        first, *starts = self._start_states(rand)
+        self.first_step.index_copy_(0, rows, first)
         self.qpos, self.qvel, self._obs = (
             whole.index_copy(0, rows, part)
             for whole, part in zip((self.qpos, self.qvel, self._obs), starts, strict=True)
@@ -288,11 +295,17 @@ class DiffEnv(VectorEnv):
             if not bool(torch.isfinite(value.detach()).all()):
                 raise ValueError(f"{name} holds numbers that are not finite")
         self.qpos, self.qvel = qpos, qvel
-        self._obs = self.task.observe(qpos, qvel, self._no_action)
+        self._obs = self.observe(qpos, qvel, self._no_action)
         return self._obs
 
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor, elapsed: int = 0) -> Tensor:
+        """What the task observes (N, obs_dim) of states on the episodes' clocks, `elapsed` control steps from now."""
+        if not self.task.timed:
+            return self.task.observe(qpos, qvel, action)
+        return self.task.observe_at(qpos, qvel, action, self.first_step + self.episode_step + elapsed)
+
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the simulator's factors that continues the episodes exactly, as of the start of a window."""
+        """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
         return {
             "task": self.task.name,
             "qpos": self.qpos.detach().clone(),
@@ -301,6 +314,7 @@ class DiffEnv(VectorEnv):
             "episode_step": self.episode_step.clone(),
             "episode_return": self._episode_return.clone(),
             "generator": self.generator.get_state(),
+            **({"first_step": self.first_step.clone()} if self.task.timed else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -319,6 +333,7 @@ class DiffEnv(VectorEnv):
         self.qpos, self.qvel = state["qpos"].to(self.device), state["qvel"].to(self.device)
         self._obs = state["obs"].to(self.device)
         self.episode_step.copy_(state["episode_step"])
+        self.first_step.copy_(state.get("first_step", self.first_step))
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
         self._time = self.horizon
@@ -328,8 +343,8 @@ class DiffEnv(VectorEnv):
         self._episode_return.zero_()
         self._recorded = 0  # differentiable steps since the window began
         self.sim.rewind()
-        qpos, qvel, obs = self._draw(1)
-        self.qpos, self.qvel, self._obs = qpos[0], qvel[0], obs[0]
+        first, self.qpos, self.qvel, self._obs = (start[0] for start in self._draw(1))
+        self.first_step.copy_(first)
         self._draw_starts()
         self._show()
 
@@ -337,7 +352,7 @@ class DiffEnv(VectorEnv):
         # Start states of a whole window at once: one batch of small operations instead of one per step.
         self._starts, self._time = self._draw(self.horizon), 0
 
-    def _draw(self, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _draw(self, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self._start_states(self._uniform(steps, self.num_envs))
 
     def _uniform(self, *size: int) -> Tensor:
@@ -345,12 +360,13 @@ class DiffEnv(VectorEnv):
         return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
 
     @torch.no_grad()
-    def _start_states(self, rand: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """qpos, qvel and obs (..., each) of rand (..., num_random)."""
+    def _start_states(self, rand: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The first step (...), qpos, qvel and obs (..., each) of rand (..., num_random)."""
         if not self.stochastic_init:
             rand = torch.full_like(rand, 0.5)
-        qpos, qvel = self.task.reset(rand)
-        return qpos, qvel, self.task.observe(qpos, qvel, self._no_action[0].expand(*rand.shape[:-1], -1))
+        first, (qpos, qvel) = self.task.first_step(rand), self.task.reset(rand)
+        action = self._no_action[0].expand(*rand.shape[:-1], -1)
+        return first, qpos, qvel, self.task.observe_at(qpos, qvel, action, first)
 
     def _show(self) -> None:
         if self.render_mode == "human":

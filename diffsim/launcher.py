@@ -38,7 +38,7 @@ class Launcher:
     On a CPU some threads take a share of the environments each; on a GPU a launch goes to torch's current stream.
 
     Args:
-        scene, num_envs, integration, device, dtype, threads, division, factors: see Simulator.
+        scene, num_envs, integration, device, dtype, threads, division, factors, forces: see Simulator.
 
     Attributes:
         spec: what the kernels were generated for.
@@ -56,6 +56,7 @@ class Launcher:
         threads: int | None,
         division: Division | None,
         factors: bool,
+        forces: bool,
     ) -> None:
         real, cuda = WARP_DTYPE[dtype], device.type == "cuda"
         if division is None:
@@ -63,7 +64,7 @@ class Launcher:
         elif division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         self.scene, self.num_envs, self.device, self.dtype = scene, num_envs, device, dtype
-        self.spec = kernel_spec(scene, division, real, integration.integrator == "implicit", cuda, factors)
+        self.spec = kernel_spec(scene, division, real, integration.integrator == "implicit", cuda, factors, forces)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self.seconds = {"forward": 0.0, "backward": 0.0}
         self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}

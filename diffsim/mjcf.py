@@ -112,6 +112,8 @@ class _Reader:
             **columns,
             **self._actuators(),
             **self._contacts(float(mass.sum())),
+            body_link=np.array([link for link, _, _ in self.body], np.int32),
+            body_com=np.array([p + r @ com for (_, r, p), com in zip(self.body, m.body_ipos, strict=True)]),
         )
 
     def _add_link(self, parent: int, joint: int = -1, ball: int = -1, **values: Any) -> int:

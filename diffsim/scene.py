@@ -61,6 +61,8 @@ class Scene:
         hill: (nu, 9) numbers of the Hill-type model (kernels/hill.py), NaN where not a <muscle>.
         muscle_model: "linear" (the paper's: force = maximum force times activation) or "hill".
         contact_link, contact_position, contact_radius: (nc,), (nc, 3), (nc,) spheres that may touch the ground.
+        body_link, body_com: (nbody,), (nbody, 3) of each body of the MJCF the link that it is part of, -1 for what a
+            floating scene's world holds, and its centre of mass in that link's frame.
         k_n, k_d, k_t, mu: stiffness, damping and friction of contact (Eq. 3).
         density, viscosity: of the fluid around the robot, kg/m^3 and kg/(m s).
         approximations: what the file asks for and is simulated only roughly, a sentence each.
@@ -101,6 +103,8 @@ class Scene:
     contact_link: Index
     contact_position: Array
     contact_radius: Array
+    body_link: Index
+    body_com: Array
     gravity: Array
     ground_height: float
     k_n: float
@@ -128,6 +132,10 @@ class Scene:
     @property
     def ncontact(self) -> int:
         return len(self.contact_radius)
+
+    @property
+    def nbody(self) -> int:
+        return len(self.body_link)
 
     @property
     def nball(self) -> int:

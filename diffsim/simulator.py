@@ -31,6 +31,7 @@ class Simulator:
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
         division: of an environment among GPU threads, from kernels.lanes.divide; default as measured to be fastest.
         factors: let constants of the scene differ between environments, see the attribute.
+        forces: let external forces act on the bodies, see the attribute.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
@@ -40,6 +41,10 @@ class Simulator:
             constants of contact and of all limits, mass and inertia of all links (not armature), force of all motors
             and muscles (not the passive one of a Hill-type muscle). Change it in place or assign another tensor; a
             step uses those of its call and is differentiable in them. (N, 0) without the argument.
+        forces: (N, nbody, 6) external force (N) and torque (N m) on each body, in world axes at its centre of mass, at
+            first zero: MuJoCo's xfrc_applied, with the rows of scene.mj_model's bodies. What acts on the world or on a
+            body that is fixed to it has no effect. Constant over a control step; to be changed like factors, and a
+            step is differentiable in them too. (N, 0, 6) without the argument.
         nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s. Their
             state is returned as it was before that step, its gradient is zero; other environments are not touched.
         nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
@@ -58,6 +63,7 @@ class Simulator:
         threads: int | None = None,
         division: Division | None = None,
         factors: bool = False,
+        forces: bool = False,
     ) -> None:
         if not isinstance(scene, Scene):
             raise ValueError(f"scene is a {type(scene).__name__}, must be a Scene: load_scene reads one from a file")
@@ -70,17 +76,18 @@ class Simulator:
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
         self.device = check_device(device)
-        width = len(FACTORS) if factors else 0
-        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width)
+        width, bodies = len(FACTORS) if factors else 0, scene.nbody if forces else 0
+        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width + 6 * bodies)
         check_memory("states and actions", num_envs, numbers * dtype.itemsize, self.device)
         self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
         self.integration, self.control_dt, self.horizon = integration, control_dt, horizon
-        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, division, factors)
+        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, division, factors, forces)
         stepper = ExtrapolatedStepper if integration.integrator == "extrapolated" else Stepper
         self._stepper = stepper(launcher, integration, control_dt, horizon)
         self.seconds, self.nonfinite_gradients = launcher.seconds, launcher.nonfinite_gradients
         self._factors = torch.ones(num_envs, width, dtype=dtype, device=self.device)
+        self._forces = torch.zeros(num_envs, bodies, 6, dtype=dtype, device=self.device)
 
     @property
     def nonfinite(self) -> torch.Tensor:
@@ -96,8 +103,18 @@ class Simulator:
         check_factors(value)
         self._factors = value
 
+    @property
+    def forces(self) -> torch.Tensor:
+        return self._forces
+
+    @forces.setter
+    def forces(self, value: torch.Tensor) -> None:
+        self.check_tensor("forces", value, *self._forces.shape[1:])
+        self.check_forces(value)
+        self._forces = value
+
     def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        """Advance all environments by one control step, differentiable in all three arguments and in `factors`.
+        """Advance all environments by one control step, differentiable in its arguments, `factors` and `forces`.
 
         Args:
             qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, normalised here.
@@ -109,14 +126,17 @@ class Simulator:
             qpos, qvel after the step, of the same shapes.
 
         Raises:
-            ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors that were changed in place
-                to what is negative or not finite.
+            ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors or forces that were changed
+                in place to what is not allowed.
         """
         for name, value, width in (("qpos", qpos, self.nq), ("qvel", qvel, self.nv), ("ctrl", ctrl, self.nu)):
             self.check_tensor(name, value, width)
-        if self._factors.shape[1] and self.device.type == "cpu":  # a GPU's would have to be waited for
-            check_factors(self._factors)
-        return self._stepper.step(qpos, qvel, ctrl, self._factors)
+        if self.device.type == "cpu":  # a GPU's would have to be waited for
+            if self._factors.shape[1]:
+                check_factors(self._factors)
+            if self._forces.shape[1]:
+                self.check_forces(self._forces)
+        return self._stepper.step(qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
 
     def rewind(self) -> None:
         """Let the next differentiable step use the first checkpoint: the start of a new window."""
@@ -128,17 +148,29 @@ class Simulator:
             "another one, and load the environment's state_dict() into it"
         )
 
-    def check_tensor(self, name: str, value: torch.Tensor, width: int) -> None:
-        """Raise ValueError unless value is a (num_envs, width) tensor of the simulator's dtype on its device."""
+    def check_tensor(self, name: str, value: torch.Tensor, *size: int) -> None:
+        """Raise ValueError unless value is a (num_envs, *size) tensor of the simulator's dtype on its device."""
         if not isinstance(value, torch.Tensor):
             raise ValueError(f"{name} is a {type(value).__name__}, must be a torch.Tensor")
-        wanted = (self.num_envs, width)
+        wanted, bodies = (self.num_envs, *size), "bodies, " * (len(size) - 1)
         if tuple(value.shape) != wanted:
-            raise ValueError(f"{name} has shape {tuple(value.shape)}, must be {wanted} (environments, numbers each)")
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, must be {wanted} (environments, {bodies}numbers each)"
+            )
         if value.dtype != self.dtype:
             raise ValueError(f"{name} has dtype {value.dtype}, must be {self.dtype}")
         if value.device != self.device:
             raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
+
+    def check_forces(self, forces: torch.Tensor) -> None:
+        """Raise ValueError unless all (N, nbody or 0, 6) are finite."""
+        if not bool(torch.isfinite(forces).all()):
+            env, body, column = (~torch.isfinite(forces)).nonzero()[0].tolist()
+            name = self.scene.mj_model.body(body).name or f"number {body}"
+            raise ValueError(
+                f"{'force' if column < 3 else 'torque'} {'xyz'[column % 3]} on body {name} is "
+                f"{forces[env, body, column].item()} in environment {env}; forces must be finite"
+            )
 
 
 def check_factors(factors: torch.Tensor) -> None:

@@ -10,7 +10,6 @@ import warp as wp
 
 from diffsim.integration import Integration
 from diffsim.launcher import Launcher, check_memory
-from diffsim.scene import FACTORS
 
 State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 
@@ -23,7 +22,7 @@ class Checkpoint(NamedTuple):
 
 
 class ControlStep(torch.autograd.Function):
-    """qpos, qvel, ctrl, factors -> qpos and qvel side by side. The stepper's checkpoint holds what backward needs."""
+    """qpos, qvel, ctrl, factors, forces -> qpos and qvel side by side. The stepper's checkpoint serves backward."""
 
     @staticmethod
     def forward(ctx: Any, stepper: Stepper, *start: torch.Tensor) -> torch.Tensor:
@@ -58,8 +57,8 @@ class Stepper:
         self._launcher, self._horizon, self._substeps = launcher, horizon, integration.substeps
         self._scalars = [h, spec.dtype(integration.theta), integration.substeps]
         # One buffer for all that a step starts from, side by side: torch copies it in one operation, the kernels see
-        # parts, and each slot keeps the factors of its step.
-        self._widths = (spec.nq, spec.nv, spec.nu, len(FACTORS) if spec.varied else 0)
+        # parts, and each slot keeps the factors and forces of its step.
+        self._widths = (spec.nq, spec.nv, spec.nu, spec.nfactors, 6 * spec.forced)
         self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
         self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
         self._nonfinite = tensor(slots, n, of=torch.bool)
@@ -90,14 +89,14 @@ class Stepper:
         return Checkpoint(slot, self._version[slot])
 
     def forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
-        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl, factors)."""
+        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl, factors, forces)."""
         torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
         self._last = slot
         self._launcher.launch("forward", self._command("forward", slot))
         return self._end.clone()
 
     def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The adjoints of qpos, qvel, ctrl and factors from that of the state (N, nq + nv) after the step.
+        """The adjoints of qpos, qvel, ctrl, factors and forces from that of the state (N, nq + nv) after the step.
 
         Raises:
             RuntimeError: the checkpoint serves another step by now.
@@ -141,9 +140,9 @@ class Stepper:
         return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
 
     def _parts(self, buffer: torch.Tensor, count: int) -> list[Any]:
-        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl with the factors behind it."""
-        nq, nv, nu, nfactors = self._widths
-        return [wp.from_torch(part) for part in buffer.split((nq, nv, nu + nfactors)[:count], dim=1)]
+        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl with factors and forces behind it."""
+        nq, nv, *rest = self._widths
+        return [wp.from_torch(part) for part in buffer.split((nq, nv, sum(rest))[:count], dim=1)]
 
 
 class ExtrapolatedStepper:

@@ -190,7 +190,15 @@ def contacts(scene: Scene, qpos: Array, qvel: Array) -> tuple[Array, Array]:
     return depths, np.array([link.point(lowest)[0] for link, lowest, _ in points]).reshape(-1, 3)
 
 
-def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float = 0.0, theta: float = 0.0) -> Array:
+def acceleration(
+    scene: Scene,
+    qpos: Array,
+    qvel: Array,
+    ctrl: Array,
+    h: float = 0.0,
+    theta: float = 0.0,
+    forces: Array | None = None,
+) -> Array:
     """qacc of mass @ qacc = forces - bias. The implicit step has forces that are linear in it: f - resistance * a.
 
     h is the substep of the implicit integrator, 0 for the explicit one; theta how far ahead stiffness is evaluated.
@@ -200,6 +208,8 @@ def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float =
     force, resistance = joint_forces(scene, qpos, qvel, ctrl, h, theta)
     mass, force = mass + np.diag(resistance), force - bias
     force = force + muscle_forces(scene, links, ctrl)
+    if forces is not None:
+        force = force + external_forces(scene, links, forces)
     for link, lowest, depth in lowest_points(scene, links):
         velocity, jacobian, drift = link.point(lowest)
         push, resistance = contact_law(scene, depth + theta * h * velocity[2], velocity, h, theta)
@@ -208,6 +218,16 @@ def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float =
         mass = mass + jacobian.T @ np.diag(resistance) @ jacobian
         force = force + jacobian.T @ (push - resistance * drift)
     return np.linalg.solve(mass, force + fluid_forces(scene, links))
+
+
+def external_forces(scene: Scene, links: list[Link], forces: Array) -> Array:
+    """(nv,) of forces and torques (nbody, 6) at the bodies' centres of mass."""
+    total = np.zeros(scene.nv)
+    for link, com, wrench in zip(scene.body_link, scene.body_com, forces, strict=True):
+        if link >= 0:
+            _, jacobian, _ = links[link].point(links[link].rotation @ com)
+            total += jacobian.T @ wrench[:3] + links[link].angular_jacobian.T @ wrench[3:]
+    return total
 
 
 def fluid_forces(scene: Scene, links: list[Link]) -> Array:
@@ -267,13 +287,14 @@ def step(
     ctrl: Array,
     control_dt: float,
     integration: Integration,
+    forces: Array | None = None,
 ) -> tuple[Array, Array]:
     """One control step of one environment."""
     integrator, substeps, theta = integration
     h = control_dt / substeps
     for _ in range(substeps):
         implicit = h if integrator == "implicit" else 0.0
-        qvel = qvel + h * acceleration(scene, qpos, qvel, ctrl, implicit, theta)
+        qvel = qvel + h * acceleration(scene, qpos, qvel, ctrl, implicit, theta, forces)
         qpos = integrate(scene, qpos, qvel, h)
     return qpos, qvel
 

@@ -21,6 +21,8 @@ from diffsim.tasks import TASKS
 
 Array = NDArray[np.float64]
 
+ROBOTS = [name for name in TASKS if TASKS[name].asset == f"{name}.xml"]  # one task of each
+
 # A free sphere of 2 kg; it falls, rolls, slides and rests.
 BALL = """
 <mujoco>
@@ -364,12 +366,14 @@ def run(
     steps: int = 1,
     dtype: torch.dtype = torch.float64,
     factors: Array | None = None,
+    forces: Array | None = None,
     **simulator: object,
 ) -> tuple[Array, Array]:
     """qpos and qvel after some control steps of constant ctrl, without gradients."""
-    sim = Simulator(scene, len(qpos), dtype=dtype, factors=factors is not None, **simulator)
-    if factors is not None:
-        sim.factors = torch.as_tensor(factors, dtype=dtype)
+    optional = {name: x for name, x in (("factors", factors), ("forces", forces)) if x is not None}
+    sim = Simulator(scene, len(qpos), dtype=dtype, **dict.fromkeys(optional, True), **simulator)
+    for name, x in optional.items():
+        setattr(sim, name, torch.as_tensor(x, dtype=dtype))
     q, v, u = (torch.as_tensor(x, dtype=dtype) for x in (qpos, qvel, ctrl))
     with torch.no_grad():
         for _ in range(steps):

@@ -309,10 +309,10 @@ def test_cartpole_upright_and_hanging():
 # Only what a scene requires
 
 
-def source(scene, varied=False):
+def source(scene, **optional):
     """Warp's C++ of the scene's forward and backward kernel."""
     wp.init()
-    spec, text = kernel_spec(scene, divide(scene), wp.float64, implicit=False, env_last=False, varied=varied), ""
+    spec, text = kernel_spec(scene, divide(scene), wp.float64, implicit=False, env_last=False, **optional), ""
     for build in (forward_kernel, backward_kernel):
         module = build(spec).module
         module.load("cpu")

@@ -18,7 +18,10 @@ PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))
 # Tables of these pages use the column names of the csv file that the text below them names.
 CHECKED = [
     README,
-    *(ROOT / "docs" / name for name in ("shac.md", "sapo.md", "bptt.md", "pods.md", "ppo.md", "experiments.md")),
+    *(
+        ROOT / "docs" / name
+        for name in ("shac.md", "sapo.md", "bptt.md", "pods.md", "ppo.md", "experiments.md", "robustness.md")
+    ),
 ]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -16,6 +16,7 @@ from scenes import (
     BLOCK,
     CRANE,
     PENDULUM,
+    ROBOTS,
     SHOULDER,
     acceleration,
     acting_states,
@@ -48,7 +49,7 @@ def relative_error(value, expected):
 # Against MuJoCo
 
 
-def mujoco_acceleration(scene, qpos, qvel, ctrl):
+def mujoco_acceleration(scene, qpos, qvel, ctrl, forces=None):
     model = copy.copy(scene.mj_model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     muscles = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
@@ -62,6 +63,8 @@ def mujoco_acceleration(scene, qpos, qvel, ctrl):
         data.qpos, data.qvel, data.ctrl = qpos[e], qvel[e], low + (ctrl[e] + 1) / 2 * (high - low)
         if model.na:  # of a <muscle>, whose activation follows ctrl at once here
             data.act = (ctrl[e, muscles] + 1) / 2
+        if forces is not None:
+            data.xfrc_applied = forces[e]
         mujoco.mj_forward(model, data)
         qacc[e] = data.qacc
     return qacc
@@ -75,7 +78,7 @@ def check_against_mujoco(scene, dtype, rng):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_task_accelerations_are_mujocos(name, dtype, rng):
     check_against_mujoco(task_scene(name), dtype, rng)
 
@@ -167,7 +170,7 @@ def check_against_reference(scene, qpos, qvel, ctrl, integration):
 
 
 @pytest.mark.parametrize("integrator, theta", INTEGRATORS)
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_task_steps_are_the_references(name, integrator, theta, rng):
     scene = task_scene(name)
     states = acting_states(scene, 3, rng)

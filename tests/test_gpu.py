@@ -53,9 +53,9 @@ def test_kernels_compile_for_a_gpu_without_one(name: str) -> None:
             assert (function in code) == (feature in scene.features), function
 
 
-def test_kernels_with_factors_compile_for_a_gpu_without_one() -> None:
+def test_kernels_with_factors_and_forces_compile_for_a_gpu_without_one() -> None:
     scene = task_scene("ant")
-    spec = kernel_spec(scene, divide(scene, 4), wp.float32, implicit=True, env_last=True, varied=True)
+    spec = kernel_spec(scene, divide(scene, 4), wp.float32, implicit=True, env_last=True, varied=True, forced=True)
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
         compiled(kernel.module, arch=90)
 
@@ -63,9 +63,9 @@ def test_kernels_with_factors_compile_for_a_gpu_without_one() -> None:
 def episode(
     name: str, device: str, team: tuple[int, int] | None = None, integration: Integration | None = None
 ) -> dict[str, torch.Tensor]:
-    """The state after 32 control steps of random actions and factors, and the gradients of a random function of it.
+    """The state after 32 control steps of random actions, and the gradients of a random function of it.
 
-    With `integration` every environment has factors of its own, else there are none.
+    With `integration` every environment has factors and external forces of its own, else there are none.
     """
     n, kwargs = 8, dict(dtype=torch.float64)
     start = diffsim.make(name, num_envs=n, seed=0, **kwargs)
@@ -75,13 +75,14 @@ def episode(
     parts = [start.qpos, start.qvel, actions]
     if integration:
         parts.append(torch.rand(n, len(FACTORS), generator=generator, **kwargs) + 0.5)
+        parts.append(torch.randn(n, start.scene.nbody, 6, generator=generator, **kwargs))
     inputs = [x.to(device).detach().requires_grad_() for x in parts]
     division = divide(start.scene, *team) if team else None
-    kwargs |= dict(device=device, division=division, factors=integration is not None)
+    kwargs |= dict(device=device, division=division, **dict.fromkeys(("factors", "forces"), integration is not None))
     sim = Simulator(start.scene, n, integration or start.sim.integration, start.control_dt, HORIZON, **kwargs)
-    qpos, qvel, steps, *factors = inputs
-    if factors:
-        sim.factors = factors[0]
+    qpos, qvel, steps, *optional = inputs
+    if optional:
+        sim.factors, sim.forces = optional
     for action in steps:
         qpos, qvel = sim.step(qpos, qvel, action)
     assert not sim.nonfinite.any()
@@ -98,7 +99,7 @@ def episode(
     + [(name, Integration("implicit", 16, 0.5)) for name in ("ant", "humanoid_mtu")],
 )
 def test_gpu_agrees_with_cpu(name: str, integration: Integration | None) -> None:
-    """Without factors, and with factors and the gradient in them."""
+    """Without factors and forces, and with them and the gradient in them."""
     reference = episode(name, "cpu", integration=integration)
     for team in [(1, 1), (2, 1), (4, 1), (8, 4)]:
         ours = episode(name, "cuda", team, integration)

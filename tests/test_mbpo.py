@@ -18,7 +18,7 @@ from torch.distributions.transforms import TanhTransform
 import diffsim
 import mbpo
 from diffsim.planning import Dynamics
-from diffsim.training import parse
+from diffsim.training import Transition, parse
 
 FLAGS = (
     "--env ant --device cpu --hidden 16 --model-hidden 16 16 --num-envs 4 --steps 4 --batch-size 32 --seed-steps 0 "
@@ -166,8 +166,8 @@ def test_held_out_environments_are_not_learnt_from() -> None:
     assert learner.unseen.count == 8 and learner.real.count == 72 == learner.actor.normalizer.count * 0.9
     torch.testing.assert_close(learner.unseen.rows[:2, :5], start[:2])
     torch.testing.assert_close(learner.real.rows[:18, :5], start[2:])
-    rows = mbpo.Transition(*learner.real.rows[:72].split(learner.real.widths, 1))
-    changes = torch.cat((rows.next_obs - rows.obs, rows.reward), 1)
+    rows = learner.real.split(learner.real.rows[:72])
+    changes = torch.cat((rows.next_obs - rows.obs, rows.reward.unsqueeze(1)), 1)
     torch.testing.assert_close(learner.models.target.mean, changes.mean(0), rtol=1e-4, atol=1e-4)
 
 
@@ -183,13 +183,13 @@ def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatc
     for fits, length, states in ((0, 2, [-1, 0]), (1, 3, [-1, 0, 1]), (4, 6, [-1, 0, 1, 2]), (9, 6, [-1, 0, 1, 2])):
         learner.models.fits.fill_(fits)
         assert learner.imagine()["models/rollout_length"] == length
-        rows = mbpo.Transition(*learner.imagined.rows.split(learner.imagined.widths, 1))
+        rows = learner.imagined.split(learner.imagined.rows)
         assert len(rows.obs) == 6 * 250 and sorted(set(rows.obs.flatten().tolist())) == states
         counts = [(rows.obs == state).sum().item() for state in states]
         assert counts[0] >= counts[1] >= counts[-1] > 0 and counts[0] == 250 * -(-6 // len(states))
         torch.testing.assert_close(rows.next_obs, rows.obs + 1)
-        torch.testing.assert_close(rows.terminated, (rows.obs == 2).float())
-        torch.testing.assert_close(rows.reward, rows.action)
+        torch.testing.assert_close(rows.terminated, (rows.obs == 2).squeeze(1).float())
+        torch.testing.assert_close(rows.reward, rows.action.squeeze(1))
 
 
 def test_the_mixture_has_its_share_of_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,7 +231,7 @@ def test_enhanced_transitions_are_observed_and_rewarded_as_the_task_does() -> No
     env = learner.env
     for _ in range(2):
         learner.explore()
-    real = mbpo.Transition(*learner.real.rows[:72].split(learner.real.widths, 1))
+    real = learner.real.split(learner.real.rows[:72])
     blocks = [part.view(8, 9, -1) for part in real]  # of a step: 3 real, then twice 3 around them
     for part in blocks:
         torch.testing.assert_close(part[:, 3:6], part[:, :3], rtol=1e-3, atol=1e-3)
@@ -242,7 +242,7 @@ def test_enhanced_transitions_are_observed_and_rewarded_as_the_task_does() -> No
     state = torch.cat((env.qpos, env.qvel), 1)[1:].clone()
     obs, action = env.detach()[1:], torch.rand(3, 8)
     learner.args.enhance_scale, learner.args.sample_enhance = 0.1, 50
-    near = learner.around(state, mbpo.Transition(obs, action, *[torch.zeros(3)] * 3))
+    near = learner.around(state, Transition(obs, action, *[torch.zeros(3)] * 3))
     spread = near.action.view(50, 3, 8).atanh() - action.atanh()
     assert spread.std().item() == pytest.approx(0.1, rel=0.1)
     torch.testing.assert_close(near.obs[:, -8:], obs[:, -8:].repeat(50, 1))
@@ -257,7 +257,7 @@ def test_an_enhanced_transition_that_falls_has_failed() -> None:
     qpos, qvel = env.qpos[1:].clone(), env.qvel[1:].clone()
     qpos[0, 2], qvel[0, 2] = 0.28, -6.0
     obs = env.task.observe(qpos, qvel, torch.zeros(3, 8))
-    near = learner.around(torch.cat((qpos, qvel), 1), mbpo.Transition(obs, torch.zeros(3, 8), *[torch.zeros(3)] * 3))
+    near = learner.around(torch.cat((qpos, qvel), 1), Transition(obs, torch.zeros(3, 8), *[torch.zeros(3)] * 3))
     assert near.terminated.tolist() == [1, 0, 0] * 2
 
 
@@ -284,7 +284,7 @@ def test_targets_and_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.testing.assert_close(backup, torch.tensor([10.0, 2.0]))
     torch.manual_seed(0)
     learner = build("--initial-temperature", "0.3")
-    batch = mbpo.Transition(
+    batch = Transition(
         torch.randn(32, 37), torch.rand(32, 8), torch.randn(32), torch.randn(32, 37), (torch.rand(32) < 0.3).float()
     )
 

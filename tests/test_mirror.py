@@ -102,7 +102,7 @@ def test_gradients_pass_the_mirror() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(TASKS.keys() - set(MIRRORED)))
-def test_a_robot_in_a_plane_has_no_mirror_image(name: str) -> None:
+def test_a_robot_in_a_plane_or_on_a_clip_has_no_mirror_image(name: str) -> None:
     with pytest.raises(ValueError, match=f"task '{name}' has no mirror image"):
         TASKS[name]().mirror  # noqa: B018
 

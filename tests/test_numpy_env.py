@@ -38,7 +38,8 @@ def test_gymnasium_makes_every_kind(name: str) -> None:
     obs, _ = single.reset(seed=5)
     task = TASKS[name]()
     rand = torch.as_tensor(seeding.np_random(5)[0].random(task.num_random), dtype=torch.float32)
-    expected = task.observe(*task.reset(rand), torch.zeros(single.action_space.shape))
+    action = torch.zeros(single.action_space.shape)
+    expected = task.observe_at(*task.reset(rand), action, task.first_step(rand))
     np.testing.assert_allclose(obs, expected, rtol=1e-6)
     for suffix, kind in (("-v0", diffsim.DiffEnv), ("-numpy-v0", diffsim.NumpyVectorEnv)):
         vector = gymnasium.make_vec(IDS[name].replace("-v0", suffix), num_envs=3)

@@ -200,4 +200,4 @@ def test_symmetric_policies_are_paid(capsys: pytest.CaptureFixture[str]) -> None
 
     with pytest.raises(SystemExit):
         parse(ppo.Args, ["--env", "hopper", "--symmetric"])
-    assert "--symmetric: the robot of task 'hopper' has no left and right" in capsys.readouterr().err
+    assert "--symmetric: task 'hopper' has no mirror image" in capsys.readouterr().err

@@ -210,7 +210,7 @@ def test_symmetric_policies_are_paid_and_mirrored_states_are_worth_the_same(
 
     with pytest.raises(SystemExit):
         parse(sapo.Args, ["--env", "hopper", "--symmetric"])
-    assert "--symmetric: the robot of task 'hopper' has no left and right" in capsys.readouterr().err
+    assert "--symmetric: task 'hopper' has no mirror image" in capsys.readouterr().err
 
 
 def test_start_from_another_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from scenes import CRANE, leg_scene, parse, task_scene
-
-from diffsim.tasks import TASKS
+from scenes import CRANE, ROBOTS, leg_scene, parse, task_scene
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_features_of_the_tasks(name):
     expected = {
         "cartpole": {"hinge", "slide", "limit", "damping", "motor"},

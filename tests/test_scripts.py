@@ -33,6 +33,10 @@ SCALARS = {
     "sapo": "losses/actor losses/critic charts/entropy charts/temperature time/update_actor time/update_critic",
     "bptt": "losses/actor time/update",
     "ppo_baseline": "losses/policy losses/value losses/kl charts/learning_rate charts/std time/roll_out time/update",
+    "pfpn": (
+        "losses/policy losses/value losses/kl charts/learning_rate charts/entropy time/interact time/learn "
+        "particles/dead particles/moved particles/active particles/std"
+    ),
 }
 COMMON_SCALARS = (
     "charts/episodic_return charts/episodic_length charts/SPS eval/return eval/length grad/norm grad/skipped "
@@ -127,7 +131,9 @@ def test_files_of_a_run(script: ModuleType, trained: Path, checkpoint: dict[str,
     arguments = json.loads((trained / "args.json").read_text())
     assert arguments["num_envs"] == 3 and arguments["substeps"] == 4
     hidden, lr = ("actor_hidden", "actor_lr") if "actor_lr" in arguments else ("hidden", "lr")
-    assert arguments[hidden] == [64, 64] and arguments[lr] == (3e-4 if script.__name__ == "ppo_baseline" else 1e-2)
+    assert arguments[hidden] == [64, 64] and arguments[lr] == (
+        3e-4 if script.__name__ in ("ppo_baseline", "pfpn") else 1e-2
+    )
     assert list(arguments) == [field.name for field in dataclasses.fields(script.Args)]
     assert arguments == json.loads(json.dumps(checkpoint["args"])) | {"run_dir": str(trained)}
 
@@ -184,7 +190,7 @@ def test_nothing_captured_waits_for_the_device(
 
     monkeypatch.setattr(graph, "capture", capture)
     run(script, tmp_path, *small, "--stop-after", 3)
-    names = {"bptt": ["update"], "ppo_baseline": ["roll_out", "update"]}
+    names = {"bptt": ["update"], "ppo_baseline": ["roll_out", "update"], "pfpn": ["interact", "learn"]}
     assert captured == names.get(script.__name__, ["update_actor", "update_critic"])
     only_on_the_cpu = 'if self.device.type == "cpu" and bool(torch.isnan(action.detach()).any()):'
     assert set(places) == {f"env.py: {only_on_the_cpu}"}  # seen, so the rest would be seen

@@ -23,6 +23,7 @@ import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
+from diffsim.kernels.force import external_force
 from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
@@ -56,6 +57,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     passive_gain, limit_constants_gain = joint.passive_gain, joint.limit_constants_gain
     DRAG, drag = "drag" in uses, drag_law(T)
     drag_wrench, drag_adjoint = drag.drag_wrench, drag.drag_adjoint
+    force, FORCED, NBODY = external_force(spec), spec.forced > 0, spec.forced
+    add_forces_adjoint, write_forces_adjoint = force.add_forces_adjoint, force.write_forces_adjoint
+    finite_forces = force.finite_forces
     NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
     DRIVEN, MUSCLE, HILL, LIMIT = "motor" in uses, "muscle" in uses, "hill" in uses, "limit" in uses
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
@@ -191,7 +195,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         ck_f: t.array3,
         # the state that came in (its quaternion may not be of unit length), and whether the step was contained
         qpos: t.array2,
-        ctrl: t.array2,  # and behind it the factors, if varied; so in g_ctrl
+        ctrl: t.array2,  # and behind it the factors and the forces; so in g_ctrl
         nonfinite: wp.array(dtype=wp.bool),
         # gradient in
         g_qpos_out: t.array2,
@@ -232,6 +236,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             g_factors = wp.zeros(shape=NFACTORS, dtype=T)
         else:
             g_factors = u  # nobody reads or writes it there
+        if wp.static(FORCED):
+            g_forces = wp.zeros(shape=NBODY, dtype=vec6)
         for i in range(1, n):
             gq[i] = g_qpos_out[e, qpos_adr(m, at + i)]
             gqd[i] = g_qvel_out[e, VADR + link_of(m, at + i)]
@@ -355,6 +361,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 adj_v[i] = lv
                 adj_w[i] = lw
                 adj_p[i] = lp
+            if wp.static(FORCED):
+                add_forces_adjoint(m, at, n, ctrl, e, R, x, W, adj_w, adj_p, g_forces)
             if wp.static(HILL):
                 measure(m, lane, R, x, V, W, path, by_rate, power)
                 for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
@@ -460,6 +468,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             for k in range(NFACTORS):
                 if not wp.isfinite(g_factors[k]):
                     broken = T(1.0)
+        if wp.static(FORCED):
+            if not finite_forces(m, at, g_forces):
+                broken = T(1.0)
         if wp.static(THREADS_PER_ENV > 1):
             broken = add(broken)
         finite = broken == T(0.0)
@@ -485,6 +496,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     total = add(total)
                 if lane == 0:
                     g_ctrl[e, NU + k] = wp.where(keep, total, T(0.0))
+        if wp.static(FORCED):
+            write_forces_adjoint(m, at, e, keep, g_forces, g_ctrl)
         for i in range(1, n):
             g_qpos[e, qpos_adr(m, at + i)] = wp.where(keep, gq[i], T(0.0))
             g_qvel[e, VADR + link_of(m, at + i)] = wp.where(keep, gqd[i], T(0.0))

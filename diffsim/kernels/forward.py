@@ -14,6 +14,7 @@ import warp as wp
 
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
+from diffsim.kernels.force import external_force
 from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
@@ -40,6 +41,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     passive_force, passive_resistance = joint.passive_force, joint.passive_resistance
     muscle = muscle_law(spec, adjoint=False)
     add_pull, measure, hill = muscle.add_pull, muscle.measure, hill_law(T).hill
+    FORCED, add_forces = spec.forced > 0, external_force(spec).add_forces
     DRAG, drag_wrench = "drag" in uses, drag_law(T).drag_wrench
     NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
     MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
@@ -140,7 +142,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         # state in
         qpos: t.array2,
         qvel: t.array2,
-        ctrl: t.array2,  # and behind it the factors, if varied
+        ctrl: t.array2,  # and behind it the factors, if varied, and the forces, if forced
         # checkpoint out: rows row0 .. row0 + substeps - 1, written if record is 1
         record: int,
         row0: int,
@@ -258,6 +260,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 Ib[i] = ib
                 Id[i] = id
                 P[i] = force
+            if wp.static(FORCED):
+                add_forces(m, at, n, ctrl, e, R, x, P)
             if wp.static(HILL):
                 measure(m, lane, R, x, V, V, lengths, rates, rates)
                 for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):

@@ -1,5 +1,6 @@
 """The numbers of a scene as the kernels read them: Warp's types, and a struct of arrays on a device."""
 
+from collections.abc import Iterable, Sequence
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -66,6 +67,9 @@ def types(dtype: type) -> SimpleNamespace:
         contact_begin: wp.array(dtype=int)  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
+        body_begin: wp.array(dtype=int)  # bodies of entry k are body_begin[k] .. body_begin[k + 1]
+        body: wp.array(dtype=int)
+        body_com: wp.array(dtype=vec3)
         drag_frame: wp.array(dtype=mat3)  # principal axes in the link's frame, see drag.py
         drag_viscous: wp.array(dtype=vec3)  # (a, c, 0)
         drag_force: wp.array(dtype=vec3)
@@ -114,6 +118,7 @@ def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     writer.put_joints()
     writer.put_motors_and_muscles()
     writer.put_contacts()
+    writer.put_bodies()
     return writer.model
 
 
@@ -227,19 +232,28 @@ class _Writer:
     def put_contacts(self) -> None:
         """Spheres by lane, then by slot, and the constants of contact."""
         scene, d = self.scene, self.division
-        rows = [
-            (lane * d.slots + self.slot[lane, scene.contact_link[k]], k)
-            for lane, hand in enumerate(d.spheres)
-            for k in hand
-        ]
-        entry, sphere = np.array(sorted(rows), int).reshape(-1, 2).T
+        begin, sphere = self.by_entry(d.spheres, scene.contact_link)
         self.put(
-            contact_begin=(np.searchsorted(entry, np.arange(len(self.link) + 1)), int),
+            contact_begin=(begin, int),
             contact_position=(scene.contact_position[sphere], self.t.vec3),
             contact_radius=(scene.contact_radius[sphere], self.dtype),
         )
         for name in ("k_n", "k_d", "k_t", "mu"):
             setattr(self.model, name, self.dtype(getattr(scene, name)))
+
+    def put_bodies(self) -> None:
+        """Bodies by lane, then by slot; each is on the lane that carries its link's mass."""
+        link = self.scene.body_link
+        begin, body = self.by_entry([np.flatnonzero(np.isin(link, row)) for row in self.division.weighs], link)
+        self.put(body_begin=(begin, int), body=(body, int), body_com=(self.scene.body_com[body], self.t.vec3))
+
+    def by_entry(self, hands: Sequence[Iterable[int]], link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where each entry begins, and the things themselves, of things on links that are dealt to the lanes."""
+        rows = [
+            (lane * self.division.slots + self.slot[lane, link[k]], k) for lane, hand in enumerate(hands) for k in hand
+        ]
+        entry, things = np.array(sorted(rows), int).reshape(-1, 2).T
+        return np.searchsorted(entry, np.arange(len(self.link) + 1)), things
 
 
 def padded(rows: list[list[int]], width: int) -> np.ndarray:

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from diffsim.kernels.lanes import Division
-from diffsim.scene import Scene
+from diffsim.scene import FACTORS, Scene
 
 MAX_SPEED = 1e5  # m/s and rad/s; what is faster has blown up, and its squares would soon leave float32
 
@@ -21,6 +21,7 @@ class KernelSpec:
     dtype: type
     implicit: bool
     varied: bool  # constants are multiplied by factors of each environment (law.py)
+    forced: int  # number of bodies that external forces act on (force.py), 0 without
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, environment, component]
     # how threads share an environment (lanes.py); slots: the most links that one of them has
     threads_per_env: int
@@ -47,13 +48,24 @@ class KernelSpec:
         return self.nv + int(self.floating) + self.nball
 
     @property
+    def nfactors(self) -> int:
+        """Columns of the environment's factors behind the controls."""
+        return len(FACTORS) if self.varied else 0
+
+    @property
     def nfactor(self) -> int:
         """Numbers of the cached factorisation: U and 1/d of each joint, the base's packed Cholesky factor."""
         return 7 * (self.nlink - 1) + (21 if self.floating else 0)
 
 
 def kernel_spec(
-    scene: Scene, division: Division, dtype: type, implicit: bool, env_last: bool, varied: bool = False
+    scene: Scene,
+    division: Division,
+    dtype: type,
+    implicit: bool,
+    env_last: bool,
+    varied: bool = False,
+    forced: bool = False,
 ) -> KernelSpec:
     limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
     return KernelSpec(
@@ -65,6 +77,7 @@ def kernel_spec(
         dtype=dtype,
         implicit=implicit,
         varied=varied,
+        forced=scene.nbody if forced else 0,
         env_last=env_last,
         threads_per_env=division.threads_per_env,
         sharers=division.sharers,

@@ -54,6 +54,7 @@ class Task:
     firm: ClassVar[Firm]  # tasks without contact have none
     obs_dim: ClassVar[int]
     num_random: ClassVar[int]  # random numbers per reset
+    timed: ClassVar[bool] = False  # whether observations depend on the time: see first_step and observe_at
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: ClassVar[float] = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
@@ -103,9 +104,9 @@ class Task:
         """How the task looks with left and right exchanged.
 
         Raises:
-            ValueError: the robot has no left and right.
+            ValueError: the task has none, as its robot has no left and right or tracks a motion.
         """
-        raise ValueError(f"task {self.name!r} has no mirror image: its robot has no left and right")
+        raise ValueError(f"task {self.name!r} has no mirror image")
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """Start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).
@@ -121,6 +122,14 @@ class Task:
         action (..., nu) is the one that led there, clipped to [-1, 1]; zeros at the start of an episode.
         """
         raise NotImplementedError
+
+    def first_step(self, rand: Tensor) -> Tensor:
+        """At which control step (...) int64 of the task's own time an episode from rand (..., num_random) starts."""
+        return torch.zeros(rand.shape[:-1], dtype=torch.int64, device=rand.device)
+
+    def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
+        """`observe` at a control step (...) int64, which is `first_step` at the start of an episode."""
+        return self.observe(qpos, qvel, action)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Reward (...) of action (..., nu), clipped to [-1, 1], which led to obs (..., obs_dim)."""

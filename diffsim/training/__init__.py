@@ -26,8 +26,10 @@ from diffsim.training.flags import (
     parse_penalty,
 )
 from diffsim.training.gait import Gait, describe
+from diffsim.training.likeliest import Likeliest
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run, episode_metrics
 
 __all__ = [
@@ -42,14 +44,17 @@ __all__ = [
     "Fraction",
     "Gait",
     "Learner",
+    "Likeliest",
     "Natural",
     "NonNegative",
     "ObsNormalizer",
     "ParallelFlags",
     "Positive",
+    "ReplayBuffer",
     "Run",
     "SavedPolicy",
     "Stateful",
+    "Transition",
     "Widths",
     "describe",
     "distributed",

@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from diffsim.training.errors import fail
+from diffsim.training.likeliest import Likeliest
 from diffsim.training.normalizer import ObsNormalizer
 
 FORMAT = 2
@@ -22,6 +23,7 @@ FORMAT = 2
 LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
     "ELU": (nn.ELU, ()),
     "LayerNorm": (nn.LayerNorm, ("normalized_shape",)),
+    "Likeliest": (Likeliest, ("actions", "components", "shared")),
     "Linear": (nn.Linear, ("in_features", "out_features")),
     "ObsNormalizer": (ObsNormalizer, ("size",)),
     "ReLU": (nn.ReLU, ()),

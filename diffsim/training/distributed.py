@@ -49,6 +49,13 @@ def average(tensor: torch.Tensor) -> torch.Tensor:
     return tensor
 
 
+def stack(tensor: torch.Tensor) -> torch.Tensor:
+    """The tensors of all ranks (ranks, ...); it does not wait for the device and can be captured."""
+    every = tensor.new_zeros(size(), *tensor.shape)
+    every[rank()] = tensor
+    return average(every) * size()
+
+
 def gather(value: Any) -> list[Any]:
     """The values of all ranks, in the order of the ranks."""
     if not dist.is_initialized():

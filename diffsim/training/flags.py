@@ -20,10 +20,11 @@ import torch
 import tyro
 
 from diffsim import render
+from diffsim.clip import Clip, read_clip
 from diffsim.env import ActionError
 from diffsim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError, end_in_one_line
-from diffsim.tasks import TASKS
+from diffsim.tasks import TASKS, HumanoidImitation
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, parse_command_line
 from diffsim.training.variation import parse_ranges
@@ -57,6 +58,16 @@ NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
 Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]
 Decay = Annotated[float, Range("in [0, 1)", lambda value: 0 <= value < 1)]
 Widths = tuple[Count, ...]
+ClipFile = Annotated[
+    Clip | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="FILE",
+        instance_from_str=lambda words: read_clip(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, Clip),
+        str_from_instance=lambda clip: [str(clip)],
+    ),
+]
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -78,6 +89,8 @@ class SimulatorFlags:
     """constants of contact and limits (docs/transfer.md): the paper's, or such as another simulator agrees with"""
     penalty: tuple[str, ...] = ()
     """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
+    clip: ClipFile = None
+    """motion that humanoid_imitation tracks (docs/imitation.md): an .npz file, or the name of a shipped one"""
     threads: Natural = 0
     """CPU threads of the simulator, which change no result (0: as many as have work)"""
 
@@ -120,7 +133,7 @@ class RunFlags:
 class Flags(SimulatorFlags, RunFlags):
     """What every script takes. Each extends it by its hyperparameters."""
 
-    FIXED: ClassVar[tuple[str, ...]] = ("env",)  # what a checkpoint decides
+    FIXED: ClassVar[tuple[str, ...]] = ("env", "clip")  # what a checkpoint decides
 
     def task_defaults(self) -> dict[str, Any]:
         """Defaults that depend on other flags, such as the task, the device or the preset."""
@@ -128,6 +141,8 @@ class Flags(SimulatorFlags, RunFlags):
 
     def check(self) -> None:
         """Ends the script where arguments do not fit together."""
+        if self.clip and not issubclass(TASKS[self.env], HumanoidImitation):
+            fail(f"--clip is of {HumanoidImitation.name}: {self.env} tracks no motion")
 
     @classmethod
     def script(cls) -> str:
@@ -139,7 +154,7 @@ class Flags(SimulatorFlags, RunFlags):
 class ParallelFlags(Flags):
     """Many environments at once."""
 
-    FIXED: ClassVar[tuple[str, ...]] = ("env", "num_envs")
+    FIXED: ClassVar[tuple[str, ...]] = (*Flags.FIXED, "num_envs")
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""
@@ -195,6 +210,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     else:
         args.device = distributed.choose_device(args.device)
         defaults = dataclasses.replace(kind(), **_presets(args), **args.task_defaults())
+        if issubclass(task := TASKS[args.env], HumanoidImitation):
+            defaults.clip = read_clip(task.default_clip)
         args = _cli(kind, argv, defaults)
         args.device = distributed.choose_device(args.device)
     check_ranges(args)

@@ -71,6 +71,12 @@ class ClippedAdam:
         self.skipped += bad
         return norm
 
+    def moments(self, parameter: Tensor) -> list[Tensor]:
+        """Views of a parameter's moments (numel,), first and second; none before the first step."""
+        start, state = parameter.storage_offset(), self.adam.state[self.vector]
+        names = (name for name in ("exp_avg", "exp_avg_sq") if name in state)
+        return [state[name][start : start + parameter.numel()] for name in names]
+
     def state_dict(self) -> dict[str, Any]:
         """The moments, the learning rate and the count; not what the constructor is given."""
         return {"adam": self.adam.state_dict()["state"], "lr": self.lr, "skipped": self.skipped}

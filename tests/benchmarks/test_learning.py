@@ -72,6 +72,30 @@ def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.Mon
     assert shac["return passes"] == "5000 after 250 s; 7300 not; 7661 not"
 
 
+def test_runs_that_shared_their_machine_have_no_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They count for everything else; of another machine a learner's steps are shown and no seconds."""
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    for seed in (1, 2):
+        write_run(tmp_path / "runs" / f"ant__{seed}", np.arange(0, 7000, 10.0), 2048, 0.5)
+    path = tmp_path / "runs" / "ant__2" / "progress.csv"
+    rows = [row | {"seconds": ""} for row in learning.read_csv(path)]
+    with path.open("w") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    found = runner.summary(tmp_path / "runs", "ant", [5000])
+    assert (found["seeds"], found["training (s)"], found["return passes"]) == ("1 2", "350", "5000 after 250 s")
+    (tmp_path / "runs" / "ant__1").rename(tmp_path / "ant__1")
+    found = runner.summary(tmp_path / "runs", "ant", [5000])
+    assert (found["seeds"], found["training (s)"], found["return passes"]) == ("2", "", "")
+
+    args = learning.Args(output=tmp_path / "h100")
+    rows = [row | {"seed": "1"} for row in learning.read_csv(tmp_path / "ant__1" / "progress.csv")]
+    common.tables.write_csv(tmp_path / "cpu" / "shac_ant.csv", rows)
+    (curve,) = learning.curves(args, "shac", "ant")
+    assert curve["control_steps"][-1] == 700 * 2048 and np.isnan(curve["seconds"]).all()
+
+
 def test_a_return_that_some_seeds_pass() -> None:
     assert runner.words(5000, [100.0, 120.0, np.inf]) == "5000 after 120 s"
     assert runner.words(5000, [np.inf, 120.0, np.inf]) == "5000 by 1 of 3, after 120 s"

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import bptt
+import pfpn
 import ppo_baseline
 import sapo
 import shac
@@ -38,11 +39,10 @@ def sample_noise(actor: shac.Actor, horizon: int, num_envs: int) -> Tensor:
     return std * share(lambda n: torch.randn(horizon, n, len(std), generator=stream(actor)), num_envs)
 
 
-def draw(env: DiffEnv, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+def draw(env: DiffEnv, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     width = env.task.num_random
     rand = share(lambda n: torch.rand(steps, n, width, generator=stream(env)), env.num_envs)
-    qpos, qvel = env.task.reset(rand)
-    return qpos, qvel, env.task.observe(qpos, qvel, env._no_action.expand(steps, -1, -1))
+    return env._start_states(rand)
 
 
 def restore(run: Run, learner: Learner, restore: Callable[[Run, Learner], Learner] = Run.restore) -> Learner:
@@ -53,7 +53,7 @@ def restore(run: Run, learner: Learner, restore: Callable[[Run, Learner], Learne
 def main(directory: str, *setting: str) -> None:
     Run.restore = restore
     finalize, distributed.finalize = distributed.finalize, lambda: None  # the ranks stay connected until the last one
-    for script in (bptt, ppo_baseline, sapo, shac):
+    for script in (bptt, pfpn, ppo_baseline, sapo, shac):
         if script is shac:
             shac.Actor.sample_noise, DiffEnv._draw, distributed.finalize = sample_noise, draw, finalize
         rank, path = distributed.rank(), Path(directory) / script.__name__

@@ -70,7 +70,7 @@ def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> Non
     torch.manual_seed(0)
     args = parse(SCRIPTS[name].Args, "--env cartpole --device cpu --num-envs 2 --horizon 4".split())
     env = diffsim.make("cartpole", num_envs=2, horizon=4)
-    learner = getattr(SCRIPTS[name], {"ppo_baseline": "PPO"}.get(name, name.upper()))(args, env)
+    learner = getattr(SCRIPTS[name], {"ppo_baseline": "PPO", "pfpn": "PPO"}.get(name, name.upper()))(args, env)
     with torch.no_grad():
         for parameter in learner.policy.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
@@ -92,7 +92,7 @@ def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> Non
 def test_a_layer_that_cannot_be_saved_is_named(tmp_path: Path) -> None:
     learner = Tiny()
     learner.policy.append(nn.Dropout())
-    with pytest.raises(TypeError, match="layer Dropout; .* has ELU, LayerNorm, Linear"):
+    with pytest.raises(TypeError, match="layer Dropout; .* has ELU, LayerNorm, Likeliest, Linear"):
         save(tmp_path / "checkpoint.pt", "shac", learner, {})
     assert not list(tmp_path.iterdir())
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from learners import ROOT, assert_same, refusal, run
+from scenes import ROBOTS
 
 import diffsim
 import ppo_baseline
@@ -18,7 +19,7 @@ from diffsim.training import parse
 from diffsim.training.flags import RANDOMISED
 from diffsim.training.variation import Range, Variation, parse_ranges, soft_factors
 
-FIRM = sorted(name for name, task in TASKS.items() if hasattr(task, "firm"))
+FIRM = sorted(name for name in ROBOTS if hasattr(TASKS[name], "firm"))
 
 
 @pytest.fixture(scope="module")

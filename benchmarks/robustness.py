@@ -1,0 +1,283 @@
+"""What a policy's gait withstands: the smallest push that fells it, survival against impulse, and thrown cubes.
+
+    python benchmarks/robustness.py runs/learning/shac/ant__1          a run, or a checkpoint of any learner's script
+    python benchmarks/robustness.py runs/*/* --body torso --masses 5 10 20
+
+Robots walk for 2 to 4 s, each for a time of its own, so that they are in any phase of their gait. Then each is pushed
+at its trunk for 0.1 s, forwards (+x) or sideways (+y), as in Table 1 of the PFPN paper (Xu and Karamouzas 2021). The
+smallest push is the least force, to 2 %, at which at least half of them fall within 3 s: the force is doubled from
+1/16 of the weight until they do, then bisected. To fall is to end an episode of the task.
+
+A cube (Figure 8 there) flies at the trunk from the front at 0.2 m/s. The hit is one of point masses: it changes the
+momentum of the trunk along x by m M / (m + M) (1 + e) times the closing speed, over one control step, where M is the
+mass that the trunk shows to a push along x at this pose, limbs included, and e the restitution. The cube is gone then.
+
+Writes robustness.csv, a row for each policy, and robustness_curves.csv, one for each push and cube; robustness.png; and
+with --update-results the table of docs/robustness.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import common
+import mujoco
+import numpy as np
+import torch
+import tyro
+from common import Case, Line, Panel, load_case, parse, plot
+from tables import digits, markdown
+from torch import Tensor
+
+import diffsim
+from diffsim import DiffEnv, Scene, Simulator
+from diffsim.training import Count, NonNegative, Positive, fail
+from diffsim.training.evaluation import SEED
+
+WALK = (2.0, 4.0)  # s before the push
+PUSH = 0.1  # s
+FORWARD, SIDEWAYS = "forward", "sideways"
+DIRECTIONS = {FORWARD: (1.0, 0.0, 0.0), SIDEWAYS: (0.0, 1.0, 0.0)}
+MULTIPLES = np.linspace(0.25, 2.0, 8)  # of the smallest push, in the curves
+FIRST = 1 / 16  # of the weight, the first push
+MOST = 2**10  # times as much is given up
+TOLERANCE = 0.02  # of the smallest push
+KEY = ("checkpoint", "task", "learner", "contact", "seed")
+CURVE_KEY = (*KEY, "test", "level")  # level: of a push in multiples of the smallest, of a cube in kg
+COLUMNS = ("task", "learner", "contact", "seed", "mass", "forward N", "sideways N", "forward m/s", "sideways m/s")
+
+
+@dataclass
+class Args(common.CommonFlags):
+    checkpoints: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
+    ] = ()
+    env: tyro.conf.Suppress[common.Tasks] = common.TASKS
+    num_envs: Count = 64  # robots that begin to walk
+    body: str = ""  # the pushed one, by its name in the MJCF (default: the robot's first)
+    after: Positive = 3.0  # s from the beginning of the push in which a robot falls, or has survived
+    masses: tuple[Positive, ...] = (1, 2, 5, 10, 20, 50, 100)  # of the cubes, kg
+    speed: NonNegative = 0.2  # of the cubes, m/s
+    restitution: NonNegative = 0.0  # 0: the cube stays with the trunk; 1: it bounces off
+
+
+class State(NamedTuple):
+    """What a policy goes on from."""
+
+    qpos: Tensor  # (n, nq)
+    qvel: Tensor  # (n, nv)
+    action: Tensor  # (n, nu) the last one, which some tasks observe
+
+
+class Walkers:
+    """Robots under their policy, which forces may push. Nothing is reset: what has fallen lies there.
+
+    Args:
+        env: of the policy's task; its simulator's settings are taken over.
+        policy: observations (n, obs_dim) -> actions (n, nu).
+        body: the pushed one.
+        state: where they begin.
+    """
+
+    def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int, state: State) -> None:
+        self.task, self.scene, self.control_dt, self.body = env.task, env.scene, env.control_dt, body
+        self.policy, self.start = policy, state
+        n, how = len(state.qpos), env.sim.integration
+        self.sim = Simulator(env.scene, n, how, env.control_dt, device=env.device, dtype=env.dtype, forces=True)
+
+    def steps(self, seconds: float) -> int:
+        return max(1, round(seconds / self.control_dt))
+
+    @torch.no_grad()
+    def walk(self, seconds: float, force: Tensor | None = None, pushed: int = 0) -> Iterator[tuple[State, Tensor]]:
+        """The state after each control step, and who has fallen by then (n,); force (n, 3) acts in the first steps."""
+        state, fallen = self.start, torch.zeros(len(self.start.qpos), dtype=torch.bool, device=self.sim.device)
+        obs = self.task.observe(*state)
+        for step in range(self.steps(seconds)):
+            self.sim.forces[:, self.body, :3] = force if force is not None and step < pushed else 0.0
+            action = self.policy(obs).clamp(-1.0, 1.0)
+            state = State(*self.sim.step(state.qpos, state.qvel, action), action)
+            obs = self.task.observe(*state)
+            fallen = fallen | self.task.terminated(obs) | self.sim.nonfinite
+            yield state, fallen
+
+    def endure(self, seconds: float, force: Tensor, pushed: int) -> Tensor:
+        """(n,) control steps until each falls, all of them for those that do not."""
+        steps = torch.zeros(len(self.start.qpos), dtype=torch.long, device=self.sim.device)
+        for _, fallen in self.walk(seconds, force, pushed):
+            steps += ~fallen
+            if fallen.all():
+                break
+        return steps
+
+
+def starts(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> State:
+    """The states of those that still walk after a time of their own within WALK."""
+    env.reset(seed=SEED)
+    no_action = torch.zeros(env.num_envs, env.scene.nu, dtype=env.dtype, device=env.device)
+    walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action))
+    first, last = map(walkers.steps, WALK)
+    at = torch.randint(first, last + 1, (env.num_envs,), generator=torch.Generator().manual_seed(SEED)).to(env.device)
+    found, standing = walkers.start, torch.zeros_like(at, dtype=torch.bool)
+    for step, (state, fallen) in enumerate(walkers.walk(WALK[1]), 1):
+        now = at == step
+        found = State(*(torch.where(now[:, None], a, b) for a, b in zip(state, found, strict=True)))
+        standing |= now & ~fallen
+    return State(*(part[standing] for part in found))
+
+
+def smallest(share: Callable[[float], float], first: float) -> float:
+    """The least push, to TOLERANCE, that fells at least half, by the share that falls; infinite above MOST * first.
+
+    If the share does not grow with the push everywhere, it is one place where it crosses a half.
+    """
+    low, high = 0.0, first
+    while share(high) < 0.5:
+        low, high = high, 2 * high
+        if high > MOST * first:
+            return math.inf
+    while high - low > TOLERANCE * high:
+        middle = (low + high) / 2
+        low, high = (low, middle) if share(middle) >= 0.5 else (middle, high)
+    return high
+
+
+class Target(NamedTuple):
+    """What a cube hits, of each of n robots: a body's centre, as it moves along x."""
+
+    mass: np.ndarray  # (n,) kg that it shows to a push along x, 1 / (J M^-1 J')
+    velocity: np.ndarray  # (n,) m/s
+
+
+def target(scene: Scene, state: State, body: int) -> Target:
+    """By MuJoCo's Jacobian J and mass matrix M."""
+    model, found = scene.mj_model, list[tuple[float, float]]()
+    data, jacobian, solved = mujoco.MjData(model), np.zeros((3, model.nv)), np.zeros((1, model.nv))
+    for qpos, qvel in zip(*(part.double().numpy(force=True) for part in state[:2]), strict=True):
+        data.qpos = qpos
+        mujoco.mj_forward(model, data)
+        mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+        mujoco.mj_solveM(model, data, solved, jacobian[:1])
+        found.append((1 / (solved[0] @ jacobian[0]), jacobian[0] @ qvel))
+    return Target(*np.array(found).T)
+
+
+def impulse(hit: Target, mass: float, speed: float, restitution: float) -> np.ndarray:
+    """(n,) N s along x, of a cube that comes from the front at a speed; 0 on who is faster backwards."""
+    closing = np.maximum(hit.velocity + speed, 0.0)
+    return -(1 + restitution) * closing * mass * hit.mass / (mass + hit.mass)
+
+
+def load(path: Path, args: Args) -> tuple[Case, int]:
+    """The policy and the body to push; what cannot be pushed over ends the benchmark with one line."""
+    case = load_case(path, args.num_envs, args.device)
+    scene, name = case.env.scene, case.env.task.name
+    if "contact" not in scene.features:
+        fail(f"{case.path} was trained on {name}, which stands on no ground")
+    if case.env.task.min_height is None:
+        fail(f"{case.path} was trained on {name}, whose episodes do not end with a fall")
+    body = mujoco.mj_name2id(scene.mj_model, mujoco.mjtObj.mjOBJ_BODY, args.body) if args.body else 1
+    if body < 1:
+        names = ", ".join(scene.mj_model.body(k).name for k in range(1, scene.nbody))
+        fail(f"--body: the robot has no {args.body!r}; choose from {names}")
+    return case, body
+
+
+def measure(case: Case, body: int, args: Args) -> None:
+    """Both tests of one policy; the csv files have each push as soon as it is measured."""
+    env, scene = case.env, case.env.scene
+    policy = case.saved.network.to(env.device)
+    state = starts(env, policy, body)
+    count, mass = len(state.qpos), float(scene.mass.sum())
+    if 2 * count < env.num_envs:
+        fail(f"only {count} of {env.num_envs} walk for {WALK[0]:g} to {WALK[1]:g} s without a push")
+    walkers = Walkers(env, policy, body, state)
+    limit, push = walkers.steps(args.after), walkers.steps(PUSH)
+
+    def endured(force: Tensor, pushed: int) -> Tensor:
+        return walkers.endure(args.after, force, pushed)
+
+    def fallen(direction: str, newtons: float) -> float:
+        force = newtons * torch.tensor(DIRECTIONS[direction], dtype=env.dtype, device=env.device)
+        return float((endured(force.expand(count, 3), push) < limit).double().mean())
+
+    about = case.about | {"body": scene.mj_model.body(body).name, "after": args.after}
+    unpushed = fallen(FORWARD, 0.0)
+    if unpushed >= 0.5:
+        fail(f"{unpushed:.0%} fall without a push")
+    row: dict[str, object] = about | {"robots": count, "unpushed": unpushed, "mass": mass}
+    for direction in DIRECTIONS if scene.floating else (FORWARD,):  # what is planar does not feel the other
+        least = smallest(partial(fallen, direction), FIRST * 9.81 * mass)
+        row |= {f"{direction} N": least, f"{direction} m/s": least * push * env.control_dt / mass}
+        print(f"  {direction}: {digits(least)} N", flush=True)
+        for multiple in MULTIPLES if math.isfinite(least) else ():
+            share = 1 - fallen(direction, multiple * least)
+            kick = float(multiple) * least * push * env.control_dt
+            level: dict[str, object] = {
+                "test": direction,
+                "level": float(multiple),
+                "impulse": kick,
+                "m/s": kick / mass,
+            }
+            args.merge("robustness_curves", [about | level | {"survived": share}], CURVE_KEY)
+    args.merge("robustness", [row], KEY)
+
+    hit = target(scene, state, body)
+    for kilograms in args.masses:
+        kicks = impulse(hit, kilograms, args.speed, args.restitution)
+        force = torch.zeros(count, 3, dtype=env.dtype, device=env.device)
+        force[:, 0] = torch.as_tensor(kicks / env.control_dt)
+        steps = endured(force, 1).double()
+        found = {
+            "impulse": float(-kicks.mean()),
+            "m/s": float(-kicks.mean()) / mass,
+            "survived": float((steps == limit).double().mean()),
+            "steps": float(steps.mean()),
+            "steps sd": float(steps.std()),
+        }
+        settings = {"speed": args.speed, "restitution": args.restitution}
+        args.merge("robustness_curves", [about | {"test": "cube", "level": kilograms} | found | settings], CURVE_KEY)
+        print(f"  cube of {kilograms:g} kg: " + ", ".join(f"{k} {digits(v)}" for k, v in found.items()), flush=True)
+
+
+def panels(rows: list[dict[str, str]]) -> list[Panel]:
+    """Survival against the impulse of pushes, and control steps until the fall against the mass of cubes."""
+    result, labels = list[Panel](), dict.fromkeys(row["checkpoint"] for row in rows)
+    for test in (*DIRECTIONS, "cube"):
+        (x, y), lines = ("level", "steps") if test == "cube" else ("m/s", "survived"), list[Line]()
+        for k, label in enumerate(labels):
+            own = [row for row in rows if row["checkpoint"] == label and row["test"] == test]
+            points = np.array(sorted((float(row[x]), float(row[y])) for row in own)).reshape(-1, 2)
+            lines.append(Line(points[:, 0], points[:, 1], f"C{k}o-", label))
+        if test == "cube":
+            result.append(Panel(lines, test, "its mass (kg)", "control steps until the fall", log="x", zero=True))
+        else:
+            result.append(Panel(lines, test, "impulse per mass (N s/kg)", "share upright", zero=True))
+    return result
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """A line for each policy: the smallest pushes, and the change of the whole robot's speed that they would cause."""
+    tasks = [*diffsim.TASKS]
+    order = sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"]))
+    return markdown(order, COLUMNS)
+
+
+def main(args: Args) -> None:
+    if not (args.checkpoints or args.draw_only):
+        fail("of what? give a checkpoint or the directory of a run")
+    for case, body in [] if args.draw_only else [load(path, args) for path in args.checkpoints]:
+        print(f"{case.label}: {case.env.task.name}, {case.saved.script}.py", flush=True)
+        measure(case, body, args)
+    if rows := args.read("robustness_curves"):
+        plot(args.picture("robustness"), [panels(rows)], (3.8, 3.2))
+    args.publish("robustness", table(args.read("robustness")), "robustness.md")
+
+
+if __name__ == "__main__":
+    main(parse(Args, __doc__))

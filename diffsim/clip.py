@@ -1,0 +1,161 @@
+"""Clips: recorded motions of a robot with a free root, which a task may track."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from importlib.resources import files
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffsim.kinematics import difference
+
+CONTROL_DT = 1 / 60  # s
+SHORTEST = 6  # frames
+BEYOND = math.radians(30)  # joint limits are springs, so that recorded motions pass them a little
+SEAM = 3.0  # the ends of a loop may be this many times as far apart as any two successive frames
+
+
+def tangent(a: Tensor, b: Tensor) -> Tensor:
+    """(..., nv) what moves a to b, both (..., nq): positions, the rotation vector in the frame of a, joint angles."""
+    return torch.cat((b[..., :3] - a[..., :3], difference(a[..., 3:7], b[..., 3:7]), b[..., 7:] - a[..., 7:]), dim=-1)
+
+
+class Clip:
+    """A motion at the rate of control.
+
+    The last frame of a loop is the first one of the next round: equal but for x and y.
+
+    Attributes:
+        name: of the file, without .npz.
+        qpos: (T, nq) float64 in MuJoCo's convention, the world's frame, m and rad; quaternions wxyz of unit length.
+        loop: whether it goes on from the beginning.
+    """
+
+    def __init__(self, name: str, qpos: Tensor, loop: bool) -> None:
+        self.name, self.qpos, self.loop = name, qpos, loop
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Clip) and self.loop == other.loop and torch.equal(self.qpos, other.qpos)
+
+    def __len__(self) -> int:
+        """Frames of a round, which are numbered from 0."""
+        return len(self.qpos) - self.loop
+
+    @property
+    def advance(self) -> Tensor:
+        """(2,) m, by which x and y grow in a round; 0 if it is no loop."""
+        return (self.qpos[-1, :2] - self.qpos[0, :2]) * self.loop
+
+    def velocity(self, control_dt: float = CONTROL_DT) -> Tensor:
+        """qvel (T, nv) of each frame, the mean of the differences to the frames before and after it."""
+        step = tangent(self.qpos[:-1], self.qpos[1:])
+        before, after = (step[-1:], step[:1]) if self.loop else (step[:1], step[-1:])
+        return 0.5 * (torch.cat((before, step)) + torch.cat((step, after))) / control_dt
+
+    def check(self, model: mujoco.MjModel) -> None:
+        """That it can be a motion of a robot.
+
+        Raises:
+            ValueError: qpos of another width, or a joint angle far beyond the joint's limits.
+        """
+        if self.qpos.shape[1] != model.nq:
+            raise ValueError(f"clip {self}: qpos has {self.qpos.shape[1]} columns, the robot has {model.nq}")
+        hinges = model.jnt_qposadr[1:]
+        angle, (low, high) = self.qpos.numpy()[:, hinges], model.jnt_range[1:].T
+        excess = np.where(model.jnt_limited[1:], np.maximum(angle - high, low - angle), -np.inf)
+        if excess.max() > BEYOND:
+            frame, k = np.unravel_index(excess.argmax(), excess.shape)
+            name, most = model.joint(k + 1).name, math.degrees(BEYOND)
+            raise ValueError(
+                f"clip {self}: joint {name!r} is at {angle[frame, k]:.3g} rad after {frame * CONTROL_DT:.2f} s, more "
+                f"than {most:.0f} degrees beyond its limits {low[k]:.3g} to {high[k]:.3g}; are the angles in radians?"
+            )
+
+
+torch.serialization.add_safe_globals([Clip])  # checkpoints hold the clip that they were trained on
+
+
+def shipped() -> dict[str, Path]:
+    """The files of the clips that are part of the package, by name."""
+    folder = Path(str(files("diffsim") / "assets" / "clips"))
+    return {path.stem: path for path in sorted(folder.glob("*.npz"))}
+
+
+def read_clip(source: str | Path) -> Clip:
+    """Read a clip and resample it to the rate of control.
+
+    Positions and joint angles are interpolated linearly, the root's rotation along the shorter arc. The duration
+    becomes a whole number of control steps.
+
+    Args:
+        source: an .npz file with qpos (T, nq), either fps [1/s] or dt [s], and loop (optional, true if not there); or
+            the name of a shipped clip.
+
+    Raises:
+        ValueError: no such file, or something in it is missing, of the wrong shape, not finite or too short; a loop
+            that does not end as it begins.
+    """
+    path = Path(source)
+    if not path.is_file():
+        if str(source) not in shipped():
+            raise ValueError(f"no such clip: {source}; give an .npz file or one of {', '.join(shipped())}")
+        path = shipped()[str(source)]
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            content = dict(archive)
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"clip {path} is no .npz file of numbers") from error
+    if "qpos" not in content:
+        raise ValueError(f"clip {path} has no qpos (frames, nq)")
+    if ("fps" in content) == ("dt" in content):
+        raise ValueError(f"clip {path} needs its rate: either fps [1/s] or dt [s]")
+    try:
+        qpos = torch.tensor(content["qpos"].astype(np.float64))
+        dt = float(content["dt"]) if "dt" in content else 1.0 / float(content["fps"])
+        loop = bool(content.get("loop", True))
+    except (TypeError, ValueError, ZeroDivisionError) as error:
+        raise ValueError(f"clip {path}: qpos, fps, dt and loop must be numbers") from error
+    if not 0 < dt < math.inf:
+        raise ValueError(f"clip {path}: a frame takes {dt:g} s; the rate must be positive and finite")
+    if qpos.ndim != 2 or qpos.shape[1] < 8:
+        raise ValueError(f"clip {path}: qpos is {tuple(qpos.shape)}, must be (frames, nq)")
+    if not bool(qpos.isfinite().all()):
+        raise ValueError(f"clip {path}: qpos is not finite in frame {int((~qpos.isfinite()).any(1).nonzero()[0])}")
+    norm = qpos[:, 3:7].norm(dim=1, keepdim=True)
+    if bool((norm < 0.5).any()):
+        raise ValueError(f"clip {path}: columns 3 to 6 of qpos must be the root's quaternion wxyz, and one is near 0")
+    frames = round((len(qpos) - 1) * dt / CONTROL_DT) + 1
+    if frames < SHORTEST:
+        raise ValueError(f"clip {path} is too short: {frames} frames at 60 Hz, needs {SHORTEST}")
+    clip = Clip(path.stem, _resample(torch.cat((qpos[:, :3], qpos[:, 3:7] / norm, qpos[:, 7:]), 1), frames), loop)
+    gap, step = (tangent(a, b)[..., 2:].abs().max() for a, b in (clip.qpos[[0, -1]], (clip.qpos[:-1], clip.qpos[1:])))
+    if loop and gap > SEAM * step:
+        raise ValueError(
+            f"clip {path} is a loop, but its last frame differs from its first by up to {gap:.2g} (m, rad); "
+            "end it where the next round begins, or add loop=False"
+        )
+    return clip
+
+
+def _resample(qpos: Tensor, frames: int) -> Tensor:
+    """(frames, nq) at equal times from the first to the last of qpos (T, nq)."""
+    time = torch.linspace(0.0, len(qpos) - 1.0, frames, dtype=qpos.dtype)
+    k = time.long().clamp(max=len(qpos) - 2)
+    a, b, s = qpos[k], qpos[k + 1], (time - k).unsqueeze(1)
+    turn = s * difference(a[:, 3:7], b[:, 3:7])
+    half = 0.5 * turn.norm(dim=1, keepdim=True)
+    w, u = half.cos(), 0.5 * torch.sinc(half / math.pi) * turn
+    aw, au = a[:, 3:4], a[:, 4:7]
+    quat = torch.cat((aw * w - (au * u).sum(1, keepdim=True), aw * u + w * au + torch.linalg.cross(au, u)), 1)
+    # The product starts anew from each frame of the file: keep the sign, which a step never turns round.
+    signs = torch.where((quat[1:] * quat[:-1]).sum(1) < 0, -1.0, 1.0).cumprod(0).unsqueeze(1)
+    quat[1:] *= signs
+    return torch.cat((a[:, :3] + s * (b[:, :3] - a[:, :3]), quat, a[:, 7:] + s * (b[:, 7:] - a[:, 7:])), 1)

@@ -1,0 +1,95 @@
+"""External wrenches on bodies, MuJoCo's xfrc_applied, and their adjoint.
+
+A kernel with forces finds them behind the controls and, if there are any, the factors: six columns of ctrl for each
+body, force f and torque in world axes, at the body's centre of mass p. Their adjoints stand in the same columns of
+that of ctrl. The wrench is constant over a control step, p moves with the body. Of phi (backward.py) it is the term
+-W . wrench, with the derivatives
+
+    d/df = -(velocity of p under W),   d/dtorque = -(angular part of W),   d/dp = -f x (angular part of W).
+
+Both integrators take the wrench as it is at the start of a substep, like gravity: it depends on the pose alone, and on
+that only through its lever arm.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.model import types
+from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
+
+
+@cache
+def external_force(spec: KernelSpec) -> SimpleNamespace:
+    t, sp = types(spec.dtype), spatial(spec.dtype)
+    vec3, vec6, Model = t.vec3, t.vec6, t.Model
+    mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (t.mat3, vec3, vec6))
+    join, force_at, point_velocity = sp.join, sp.force_at, sp.point_velocity
+    FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base feels no force
+    FORCES = spec.nu + spec.nfactors  # the column of ctrl where they begin
+
+    @wp.func
+    def external(ctrl: t.array2, e: int, body: int, p: vec3):
+        """The force on a body, and the wrench about the carrier."""
+        k = FORCES + 6 * body
+        f = vec3(ctrl[e, k], ctrl[e, k + 1], ctrl[e, k + 2])
+        torque = vec3(ctrl[e, k + 3], ctrl[e, k + 4], ctrl[e, k + 5])
+        return f, force_at(p, f) + join(torque, vec3())
+
+    @wp.func
+    def add_forces(m: Model, at: int, n: int, ctrl: t.array2, e: int, R: mat3s, x: vec3s, P: vec6s):
+        """Adds the forces to the links' bias forces P."""
+        for i in range(FIRST, n):
+            for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
+                f, wrench = external(ctrl, e, m.body[entry], x[i] + R[i] * m.body_com[entry])
+                P[i] = P[i] - wrench
+
+    @wp.func
+    def add_forces_adjoint(
+        m: Model,
+        at: int,
+        n: int,
+        ctrl: t.array2,
+        e: int,
+        R: mat3s,
+        x: vec3s,
+        W: vec6s,
+        adj_w: vec6s,
+        adj_p: vec6s,
+        g_forces: vec6s,  # of each body, (force, torque)
+    ):
+        """Adds the forces' part of phi to the links' adjoints."""
+        for i in range(FIRST, n):
+            for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
+                body = m.body[entry]
+                p = x[i] + R[i] * m.body_com[entry]
+                f, wrench = external(ctrl, e, body, p)
+                turn = wp.spatial_top(W[i])
+                adj_w[i] = adj_w[i] - wrench
+                adj_p[i] = adj_p[i] - force_at(p, wp.cross(f, turn)) - wp.spatial_cross_dual(W[i], wrench)
+                g_forces[body] = g_forces[body] - join(point_velocity(W[i], p), turn)
+
+    @wp.func
+    def finite_forces(m: Model, at: int, g_forces: vec6s):
+        """Whether the adjoints of the forces on this lane's bodies are all finite."""
+        result = bool(True)
+        for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
+            if not wp.isfinite(g_forces[m.body[entry]]):
+                result = False
+        return result
+
+    @wp.func
+    def write_forces_adjoint(m: Model, at: int, e: int, keep: bool, g_forces: vec6s, g_ctrl: t.array2):
+        for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
+            body = m.body[entry]
+            for k in range(6):
+                g_ctrl[e, FORCES + 6 * body + k] = wp.where(keep, g_forces[body][k], spec.dtype(0.0))
+
+    return SimpleNamespace(
+        add_forces=add_forces,
+        add_forces_adjoint=add_forces_adjoint,
+        finite_forces=finite_forces,
+        write_forces_adjoint=write_forces_adjoint,
+    )

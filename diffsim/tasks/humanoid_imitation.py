@@ -1,0 +1,145 @@
+"""Humanoid imitation, after DeepMimic (Peng et al. 2018, https://arxiv.org/abs/1804.02717): track a recorded motion."""
+
+from __future__ import annotations
+
+import math
+from importlib.resources import files
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..clip import Clip, read_clip
+from ..kinematics import Kinematics, difference, matrix
+from ..mjcf import load_scene
+from .base import Task
+from .humanoid import Humanoid
+
+END_EFFECTORS = ("right_hand", "left_hand", "right_foot_inner", "left_foot_inner")  # the middle of each geom
+STRAY = 0.5  # m; the episode ends when the root is further from the reference's
+
+
+class HumanoidImitation(Task):
+    """The robot of the humanoid task. The reference is at frame `step` of the clip, which goes round if it is a loop.
+
+    Args:
+        clip: what to track; default the shipped one.
+
+    Raises:
+        ValueError: the clip is of another robot.
+    """
+
+    name = "humanoid_imitation"
+    asset = Humanoid.asset
+    substeps, fast, accurate, firm = Humanoid.substeps, Humanoid.fast, Humanoid.accurate, Humanoid.firm
+    obs_dim = 57
+    num_random = 1
+    timed = True
+    default_clip: ClassVar[str] = "humanoid_run"
+    start, spread = (), ()
+
+    def __init__(
+        self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
+    ) -> None:
+        super().__init__(device, dtype)
+        model = load_scene(str(files("diffsim") / "assets" / self.asset)).mj_model
+        self.clip = read_clip(self.default_clip) if clip is None else clip
+        self.clip.check(model)
+        self._kinematics = Kinematics(model, device, dtype)
+        geoms = [model.geom(name).id for name in END_EFFECTORS]
+        self._bodies = torch.tensor(model.geom_bodyid[geoms] - 1, device=device, dtype=torch.int64)
+        self._points = torch.tensor(model.geom_pos[geoms], device=device, dtype=dtype)
+        self._trunk, self._radii = (torch.tensor(x, device=device, dtype=dtype) for x in _spheres(model, body=1))
+
+        self.period = len(self.clip)
+        self._qpos, self._qvel = self.clip.qpos[: self.period].to(device, dtype), self.clip.velocity(self.control_dt)
+        self._qvel = self._qvel[: self.period].to(device, dtype)
+        self._advance = self.clip.advance.to(device, dtype)
+        at_origin = torch.cat((torch.zeros_like(self._qpos[:, :2]), self._qpos[:, 2:]), dim=-1)
+        self._reference = torch.cat((at_origin[:, 3:], self._qvel[:, 3:], *self._places(at_origin)), dim=-1)
+        self._sizes = (4, self._qpos.shape[1] - 7, self._qvel.shape[1] - 3, 3 * len(geoms), 3)
+
+    def first_step(self, rand: Tensor) -> Tensor:
+        """Reference state initialisation (DeepMimic, 6.1): any frame alike; the first one if rand is 0.5."""
+        count = self.period if self.clip.loop else self.period - 1
+        return ((rand[..., 0] + 0.5).remainder(1.0) * count).long().clamp(max=count - 1)
+
+    def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
+        """The reference's state at the first step."""
+        step = self.first_step(rand)
+        return self._qpos[step], self._qvel[step]
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        raise ValueError(f"an observation of task {self.name!r} depends on the time: use observe_at")
+
+    def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
+        """Height, quaternion wxyz, joints; qvel; x and y from the reference's; sine and cosine of the phase.
+
+        The distance from the reference decides on reward and end, so a value function needs it. Where in the world the
+        robot is, it does not.
+        """
+        frame, rounds = step % self.period, step // self.period
+        lag = qpos[..., :2] - (self._qpos[frame, :2] + rounds.unsqueeze(-1) * self._advance)
+        phase = frame.to(qpos.dtype).unsqueeze(-1) * (2 * math.pi / self.period)
+        return torch.cat((qpos[..., 2:], qvel, lag, phase.sin(), phase.cos()), dim=-1)
+
+    def frame(self, obs: Tensor) -> Tensor:
+        """The reference's frame (...) int64, which the phase in obs (..., obs_dim) tells."""
+        phase = torch.atan2(obs[..., -2], obs[..., -1]).detach()
+        return (phase * (self.period / (2 * math.pi))).round().long().remainder(self.period)
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """DeepMimic, 5.3: 0.65 r_p + 0.1 r_v + 0.15 r_e + 0.1 r_c, at most 1."""
+        pose, velocity, end_effector, centre_of_mass = self.terms(obs)
+        return 0.65 * pose + 0.1 * velocity + 0.15 * end_effector + 0.1 * centre_of_mass
+
+    def terms(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """r_p, r_v, r_e and r_c (...): pose, velocity, end effectors and centre of mass, each in [0, 1].
+
+        The root's rotation counts as a joint, and its angular velocity as a joint's rate.
+        """
+        qpos, qvel = self._state(obs)
+        quat, joints, rates, ends, centre = self._reference[self.frame(obs)].split(self._sizes, dim=-1)
+        places = self._places(qpos)
+        turn, bend = difference(quat, qpos[..., 3:7]), qpos[..., 7:] - joints
+        pose = torch.exp(-2.0 * (turn.square().sum(-1) + bend.square().sum(-1)))
+        velocity = torch.exp(-0.1 * (qvel[..., 3:] - rates).square().sum(-1))
+        end_effector = torch.exp(-40.0 * (places[0] - ends).square().sum(-1))
+        centre_of_mass = torch.exp(-10.0 * (places[1] - centre).square().sum(-1))
+        return pose, velocity, end_effector, centre_of_mass
+
+    def terminated(self, obs: Tensor) -> Tensor:
+        """The trunk touches the ground (DeepMimic, 6.2), the root strays from the reference, or the clip is over."""
+        qpos, _ = self._state(obs)
+        frame = self.frame(obs)
+        height = obs[..., :1] + (matrix(obs[..., 1:5])[..., 2:, :] * self._trunk).sum(-1) - self._radii
+        away = torch.cat((qpos[..., :2], qpos[..., 2:3] - self._qpos[frame, 2:3]), dim=-1)
+        over = frame == self.period - 1 if not self.clip.loop else torch.zeros_like(frame, dtype=torch.bool)
+        return (height < 0).any(-1) | (away.square().sum(-1) > STRAY**2) | over
+
+    def _state(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """qpos, with x and y from the reference's, and qvel."""
+        rest, qvel, lag, _ = obs.split((self._qpos.shape[1] - 2, self._qvel.shape[1], 2, 2), dim=-1)
+        return torch.cat((lag, rest), dim=-1), qvel
+
+    def _places(self, qpos: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the end effectors (..., 12) and of the centre of mass (..., 3), in the frame of qpos (..., nq)."""
+        positions, rotations = self._kinematics(qpos)
+        arms = (rotations.index_select(-3, self._bodies) * self._points.unsqueeze(-2)).sum(-1)
+        ends = positions.index_select(-2, self._bodies) + arms
+        return ends.flatten(-2), self._kinematics.centre(positions, rotations)
+
+
+def _spheres(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (K, 3) in the body's frame and radii (K,) of its spheres and of the ends of its capsules, m."""
+    centres, radii = list[np.ndarray](), list[float]()
+    for geom in np.flatnonzero(model.geom_bodyid == body):
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+        radius, half = model.geom_size[geom, :2]
+        ends = (-half, half) if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else (0.0,)
+        centres += [model.geom_pos[geom] + end * turn.reshape(3, 3)[:, 2] for end in ends]
+        radii += [radius] * len(ends)
+    return np.array(centres), np.array(radii)

@@ -1,0 +1,831 @@
+"""PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301).
+
+Each action has particles: normal distributions whose locations and scales are the same in all states, and whose weights
+the network gives. The policy is their mixture, which can have several peaks where a Gaussian has one. Particles without
+weight are moved to those that have it. PPO, SHAC and SAC train it, and the policies with which the paper compares it.
+
+    python pfpn.py --env ant --seed 1                        by PPO; writes runs/ant__pfpn__1__<time>/
+    python pfpn.py --env ant --algorithm shac                by the simulator's gradient; --algorithm sac: off-policy
+    python pfpn.py --resume <run>/checkpoint.pt              continue an interrupted run exactly
+    python pfpn.py --evaluate <run>/checkpoint.pt            evaluate its deterministic policy
+"""
+
+from __future__ import annotations
+
+from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
+
+# isort: split
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from diffsim.training import (
+    ClippedAdam,
+    Count,
+    Ensemble,
+    Fraction,
+    Likeliest,
+    Natural,
+    NonNegative,
+    ObsNormalizer,
+    ParallelFlags,
+    Positive,
+    ReplayBuffer,
+    Run,
+    Stateful,
+    Transition,
+    Widths,
+    distributed,
+    episode_metrics,
+    evaluate,
+    evaluate_checkpoint,
+    fail,
+    moments,
+    parse,
+)
+
+# The settings of ppo_baseline.py, shac.py and sac_baseline.py, so that only the policy differs.
+# fmt: off
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "ppo":  ("hidden", "num_envs", "horizon", "minibatch_size", "epochs", "entropy_coef", "iterations"),
+    "shac": ("hidden", "critic_hidden", "lr", "critic_lr", "target_rate", "num_envs", "minibatch_size", "epochs",
+             "iterations"),
+    "sac":  ("hidden", "critic_hidden", "num_envs", "minibatch_size", "temperature_lr", "lr", "critic_lr", "epochs",
+             "iterations"),
+}
+PER_TASK: dict[tuple[str, str], tuple[Any, ...]] = {  # a task that is not in the table has the humanoid's
+    ("ppo", "cartpole"):      ((64, 64),         32, 240,  1920, 5, 0.0,    500),
+    ("ppo", "hopper"):        ((128, 64, 32),  1024,  32,  8192, 5, 0.01,  5000),
+    ("ppo", "half_cheetah"):  ((128, 64, 32),  1024,  32,  8192, 5, 0.0,   5000),
+    ("ppo", "ant"):           ((128, 64, 32),  2048,  32, 16384, 5, 0.01,  5000),
+    ("ppo", "humanoid"):      ((256, 128, 64), 1024,  32,  8192, 5, 0.0,   5000),
+    ("ppo", "humanoid_mtu"):  ((512, 512, 256), 1024, 32,  8192, 6, 0.0,  20000),
+    ("shac", "cartpole"):     ((64, 64),      (64, 64),   1e-2, 1e-3, 0.8,    64,  512, 16,  500),
+    ("shac", "hopper"):       ((128, 64, 32), (64, 64),   2e-3, 2e-4, 0.8,   256, 2048, 16, 2000),
+    ("shac", "half_cheetah"): ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.8,    64,  512, 16, 2000),
+    ("shac", "ant"):          ((128, 64, 32), (64, 64),   2e-3, 2e-3, 0.8,    64,  512, 16, 2000),
+    ("shac", "humanoid"):     ((256, 128),    (128, 128), 2e-3, 5e-4, 0.005,  64,  512, 16, 2000),
+    ("shac", "humanoid_mtu"): ((512, 256),    (256, 256), 2e-3, 5e-4, 0.005,  64,  512, 16, 2000),
+    ("sac", "cartpole"):      ((64, 64),             (64, 64),              32, 1024, 5e-3, 5e-4, 5e-4, 1,  4_000),
+    ("sac", "hopper"):        ((256, 128, 64),       (256, 128, 64),        64, 2048, 5e-3, 5e-4, 5e-4, 1, 20_000),
+    ("sac", "half_cheetah"):  ((256, 128, 64),       (256, 128, 64),        64, 2048, 5e-3, 5e-4, 5e-4, 1, 20_000),
+    ("sac", "ant"):           ((256, 128, 64),       (256, 128, 64),       128, 4096, 5e-3, 5e-4, 5e-4, 1, 20_000),
+    ("sac", "humanoid"):      ((512, 256),           (512, 256),            64, 2048, 2e-4, 3e-4, 3e-4, 1, 20_000),
+    ("sac", "humanoid_mtu"):  ((512, 512, 512, 256), (512, 512, 512, 256), 256, 4096, 2e-4, 3e-4, 3e-4, 1, 40_000),
+}
+PPO_ON_CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more
+# fmt: on
+LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation of a component
+Estimator = Literal["implicit", "straight-through", "mixed"]
+
+
+@dataclass
+class Args(ParallelFlags):
+    """The policy and the algorithms. Defaults: of PPO on the humanoid."""
+
+    FIXED = (*ParallelFlags.FIXED, "algorithm", "policy", "particles", "hidden", "critic_hidden", "buffer_size")
+
+    algorithm: Literal["ppo", "shac", "sac"] = "ppo"
+    """what trains the policy: rewards alone, the simulator's gradient, or a replay buffer"""
+    policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
+    """particles; one Gaussian; a mixture whose locations and scales depend on the state too; fixed bins"""
+    particles: Count = 35
+    """particles (components, bins) of each action"""
+    resampling: Literal["weighted", "uniform", "none"] = "weighted"
+    """where dead particles go: to living ones in proportion to their mean weight, to any of them, or nowhere"""
+    resampling_interval: Count = 20
+    """iterations between resamplings"""
+    resampling_noise: NonNegative = 1.0
+    """a particle lands within this many standard deviations of the one that it copies"""
+    dead: Fraction = 0.05
+    """a particle is dead if its weight stayed below this share of 1 / particles since the last resampling"""
+    estimator: Estimator = "implicit"
+    """gradient of a sampled action, with shac and sac: only straight-through is biased (docs/pfpn.md)"""
+    density_floor: NonNegative = 0.01
+    """the implicit gradient divides by the action's density, at least by this; 0: no bias, no bound either"""
+    log_particles: tuple[Natural, ...] = ()
+    """actions, counted from 0, whose particles' locations and mean weights are logged"""
+
+    iterations: Count = 5000
+    """learning iterations, a window of all environments and its updates each (per task)"""
+    num_envs: Count = 1024
+    """parallel environments N, over all processes of torchrun (per task; PPO on a CPU: at most 256)"""
+    horizon: Count = 32
+    """control steps of a window (1/60 s each) (per task)"""
+    hidden: Widths = (256, 128, 64)
+    """units of the hidden layers of the policy, which PPO's value shares (per task)"""
+    critic_hidden: Widths = (128, 128)
+    """units of the hidden layers of SHAC's and SAC's critics (per task)"""
+    lr: Positive = 3e-4
+    """learning rate of the policy; of PPO the initial one, of SHAC too (per task)"""
+    critic_lr: Positive = 5e-4
+    """learning rate of SHAC's and SAC's critics, of SHAC the initial one (per task)"""
+    gamma: Fraction = 0.99
+    """discount factor"""
+    trace_decay: Fraction = 0.95
+    """lambda of PPO's advantages and of SHAC's values"""
+    epochs: Count = 5
+    """passes over a window's samples: of PPO, of SHAC's critic; SAC: updates per control step (per task)"""
+    minibatch_size: Count = 8192
+    """samples of an update (per task; PPO on a CPU: at most 2048)"""
+    entropy_coef: NonNegative = 0.0
+    """PPO, SHAC: weight of the entropy, of a mixture's weights or of a Gaussian (per task)"""
+    target_rate: Fraction = 0.005
+    """SHAC, SAC: target critic <- (1 - rate) target critic + rate critic (per task)"""
+    buffer_size: Count = 1_000_000
+    """SAC: transitions in the replay buffer"""
+    temperature_lr: Positive = 5e-3
+    """SAC: learning rate of the logarithm of the entropy's weight (per task)"""
+    eval_every: Natural = 500
+    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
+    save_every: Natural = 500
+    """save the checkpoint every this many iterations, SAC's with the replay buffer (0: only at the end)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        row = PER_TASK.get((self.algorithm, self.env), PER_TASK[self.algorithm, "humanoid"])
+        values = dict(zip(COLUMNS[self.algorithm], row, strict=True))
+        if self.algorithm == "ppo" and self.device == "cpu":
+            values |= {name: min(values[name], most) for name, most in PPO_ON_CPU.items()}
+        return values
+
+    def check(self) -> None:
+        super().check()
+        if self.policy != "gaussian" and self.particles < 2:
+            fail(f"--particles {self.particles}: --policy {self.policy} needs at least 2")
+        if self.dead == 1:
+            fail("--dead 1: with equal weights all particles would be dead")
+        if self.policy == "discrete" and self.algorithm == "sac":
+            fail("--policy discrete has no density, whose entropy --algorithm sac needs")
+        if self.policy == "discrete" and self.algorithm == "shac" and self.estimator == "implicit":
+            fail("--policy discrete has no implicit gradient: choose --estimator straight-through or mixed")
+        if self.algorithm == "sac" and self.estimator == "mixed":
+            fail("--estimator mixed needs the rewards of a window, which --algorithm sac has not")
+        if self.algorithm == "sac" and distributed.size() > 1:
+            fail("--algorithm sac is one process alone: a replay buffer is not shared among ranks")
+        if self.algorithm == "sac" and self.buffer_size < self.horizon * self.num_envs:
+            fail(f"--buffer-size {self.buffer_size} holds no window of {self.horizon} steps of {self.num_envs}")
+
+
+# The policy -----------------------------------------------------------------------------------------------------------
+
+
+class Mixture:
+    """pi(a|s) = prod_k sum_i w_ki N(u_k; mu_ki, xi_ki^2) (Eq. 3), of m actions k with n components i each.
+
+    The action a is u, or tanh u if squashed (Eq. 27). A log_std of minus infinity makes the components points.
+    """
+
+    def __init__(self, logits: Tensor, loc: Tensor, log_std: Tensor, squashed: bool) -> None:
+        self.logits, self.log_weight = logits, F.log_softmax(logits, -1)  # (..., m, n)
+        self.loc, self.log_std, self.squashed = loc, log_std, squashed  # (..., m, n) or (m, n)
+
+    def action(self, u: Tensor) -> Tensor:
+        return torch.tanh(u) if self.squashed else u
+
+    def log_slope(self, u: Tensor) -> Tensor:
+        """log da/du."""
+        return 2 * (math.log(2) - u - F.softplus(-2 * u)) if self.squashed else torch.zeros_like(u)
+
+    def log_density(self, u: Tensor) -> Tensor:
+        """Of each u_k by itself (..., m)."""
+        rate = (-self.log_std).exp() * math.sqrt(0.5)
+        z = torch.addcmul(-self.loc * rate, u.unsqueeze(-1), rate)
+        return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
+
+    def log_prob(self, u: Tensor) -> Tensor:
+        """log pi(a|s) of the action of u (..., m): (...). Eq. 28, with the slope outside of the logarithm."""
+        return (self.log_density(u) - self.log_slope(u)).sum(-1)
+
+    def entropy(self) -> Tensor:
+        """Of the weights (appendix B), summed over the actions (...); of a single component its differential one."""
+        if self.logits.shape[-1] == 1:
+            return (self.log_std + (1 + math.log(2 * math.pi)) / 2).sum((-1, -2))
+        return -(self.log_weight.exp() * self.log_weight).sum((-1, -2))
+
+    @torch.no_grad()
+    def sample(self) -> Tensor:
+        """u (..., m), Eq. 4 and 5."""
+        return self.rsample("mixed")[0]
+
+    def rsample(self, estimator: Estimator, floor: float = 0.0) -> tuple[Tensor, Tensor]:
+        """u (..., m), differentiable, and the log probability of the chosen components (...), which "mixed" needs."""
+        noise, std = torch.randn_like(self.logits[..., 0]), self.log_std.exp()
+        if self.logits.shape[-1] == 1:  # a Gaussian
+            return self.loc.squeeze(-1) + std.squeeze(-1) * noise, torch.zeros_like(self.logits[..., 0, 0])
+        if estimator == "straight-through":
+            scores = self.logits - torch.empty_like(self.logits).exponential_().log()  # Gumbel noise
+            index = scores.argmax(-1, keepdim=True)
+        else:  # the same choice, with less noise to draw
+            total = self.logits.detach().softmax(-1).cumsum(-1)
+            level = (1 - torch.rand_like(noise).unsqueeze(-1)) * total[..., -1:]
+            index = (total < level).sum(-1, keepdim=True)
+        loc, scale = (x.expand_as(self.logits).gather(-1, index).squeeze(-1) for x in (self.loc, std))
+        u = loc + scale * noise
+        if estimator == "straight-through":
+            each = self.loc + std * noise.unsqueeze(-1)  # what each component would have drawn
+            u = u + self.relaxation(u.detach(), each.detach(), scores)
+        if estimator == "implicit":
+            u = self.attach(u.detach(), floor)
+        return u, self.log_weight.gather(-1, index).squeeze(-1).sum(-1)
+
+    def relaxation(self, u: Tensor, each: Tensor, scores: Tensor) -> Tensor:
+        """Zero, whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
+        x = scores.softmax(-1)  # Concrete distribution of temperature 1
+        gap = self.action(each) - self.action(u).unsqueeze(-1)
+        gap = gap / self.log_slope(u).exp().clamp(min=1e-3).unsqueeze(-1)  # of u, for the same gap of actions
+        return (gap * (x - x.detach())).sum(-1)
+
+    def attach(self, u: Tensor, floor: float) -> Tensor:
+        """u with its implicit gradient: its cumulative probability F(u) stays, so du = -dF / p(u) (Figurnov 2018)."""
+        z = (u.unsqueeze(-1) - self.loc) * (-self.log_std).exp()
+        cumulative = (self.logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
+        least = floor * self.log_slope(u).exp()  # the floor is of the action's density
+        density = torch.maximum(self.log_density(u).detach().exp(), least)
+        return u - (cumulative - cumulative.detach()) / density
+
+
+def logsumexp(x: Tensor) -> Tensor:
+    """Over the last dimension. torch's own takes several times as long on a CPU where an exponential underflows."""
+    largest = x.detach().argmax(-1, keepdim=True)
+    return (x.gather(-1, largest) - F.log_softmax(x, -1).gather(-1, largest)).squeeze(-1)
+
+
+class Bins(Mixture):
+    """The mixture of points, DISCRETE in the paper. What it draws is a location; others count as the nearest one."""
+
+    def log_density(self, u: Tensor) -> Tensor:
+        nearest = (u.unsqueeze(-1) - self.loc).abs().argmin(-1, keepdim=True)
+        return self.log_weight.gather(-1, nearest).squeeze(-1)
+
+
+# Its parameters, of a network's features: deterministic holds the layers of the action without noise, before any tanh.
+
+
+class Particles(nn.Module):
+    """PFPN (Figure 2), whose weights alone depend on the state; or the bins of DISCRETE, which stay where they are."""
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        bins = args.policy == "discrete"
+        self.mixture = Bins if bins else Mixture
+        self.shape, self.squashed = (actions, args.particles), args.algorithm != "ppo" and not bins
+        loc, log_std = spread(*self.shape, self.squashed)
+        self.linear, self.likeliest = almost_constant(inputs, torch.zeros_like(loc)), Likeliest(*self.shape)
+        self.loc.data.copy_(loc)
+        self.loc.requires_grad_(not bins)
+        self.log_std = nn.Parameter(log_std.masked_fill(torch.tensor(bins), -math.inf), requires_grad=not bins)
+        self.deterministic = [self.linear, self.likeliest]
+
+    @property
+    def loc(self) -> nn.Parameter:
+        return self.likeliest.get_parameter("loc")
+
+    def forward(self, features: Tensor) -> Mixture:
+        logits = self.linear(features).unflatten(-1, self.shape)
+        return self.mixture(logits, self.loc, self.log_std, self.squashed)
+
+
+class GMM(nn.Module):
+    """A Gaussian mixture: locations and scales depend on the state too."""
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        self.shape, self.squashed = (actions, args.particles), args.algorithm != "ppo"
+        loc, log_std = spread(*self.shape, self.squashed)
+        self.linear = almost_constant(inputs, torch.stack((torch.zeros_like(loc), loc)))
+        self.log_std = almost_constant(inputs, log_std)
+        self.deterministic = [self.linear, Likeliest(*self.shape, shared=False)]
+
+    def forward(self, features: Tensor) -> Mixture:
+        logits, loc = self.linear(features).unflatten(-1, (2, *self.shape)).unbind(-3)
+        log_std = self.log_std(features).unflatten(-1, self.shape).clamp(*LOG_STD)
+        return Mixture(logits, loc, log_std, self.squashed)
+
+
+class Gaussian(nn.Module):
+    """A single component, as the other scripts have it: its scale depends on the state with SAC alone."""
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        self.shape, self.squashed = (actions, 1), args.algorithm != "ppo"
+        self.linear = nn.Linear(inputs, actions)
+        own = torch.full(self.shape, -1.0 if args.algorithm == "shac" else 0.0)
+        self.log_std = nn.Linear(inputs, actions) if args.algorithm == "sac" else nn.Parameter(own)
+        self.deterministic = [self.linear]
+
+    def forward(self, features: Tensor) -> Mixture:
+        loc, log_std = self.linear(features).unsqueeze(-1), self.log_std
+        if isinstance(log_std, nn.Linear):
+            log_std = log_std(features).unsqueeze(-1).clamp(*LOG_STD)
+        return Mixture(torch.zeros_like(loc), loc, log_std, self.squashed)
+
+
+Head = Particles | GMM | Gaussian
+HEADS: dict[str, type[Particles] | type[GMM] | type[Gaussian]]
+HEADS = {"pfpn": Particles, "discrete": Particles, "gmm": GMM, "gaussian": Gaussian}
+
+
+def spread(actions: int, n: int, squashed: bool) -> tuple[Tensor, Tensor]:
+    """Locations that cover each action evenly, and log standard deviations that cover the gaps between them (m, n)."""
+    if squashed:
+        loc = torch.atanh(-1 + (2 * torch.arange(n, dtype=torch.float64) + 1) / n)
+    else:
+        loc = torch.linspace(-1, 1, n, dtype=torch.float64)
+    gap = loc.diff()
+    widest = torch.maximum(F.pad(gap, (1, 0)), F.pad(gap, (0, 1)))
+    return loc.float().repeat(actions, 1), widest.log().float().repeat(actions, 1)
+
+
+def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
+    """A layer that begins with small weights around an output."""
+    layer = nn.Linear(inputs, output.numel())
+    nn.init.trunc_normal_(layer.weight, std=0.01, a=-0.02, b=0.02)
+    layer.bias.data.copy_(output.flatten())
+    return layer
+
+
+# Resampling -----------------------------------------------------------------------------------------------------------
+
+
+class Resampling(nn.Module):
+    """Keeps which particles have had weight, and moves the others to those (section 3.3). Works in place."""
+
+    largest: Tensor
+    total: Tensor
+    age: Tensor
+    moved: Tensor
+
+    def __init__(self, args: Args, head: Head) -> None:
+        super().__init__()
+        self.args, self.active = args, args.policy == "pfpn"  # the other policies have nothing to move
+        self.register_buffer("largest", torch.zeros(head.shape))  # weight since the last resampling
+        self.register_buffer("total", torch.zeros(head.shape))  # of the weights since then
+        self.register_buffer("age", torch.zeros((), dtype=torch.int64))  # iterations
+        self.register_buffer("moved", torch.zeros(()))  # particles, ever
+        if self.active and (wrong := [k for k in args.log_particles if k >= head.shape[0]]):
+            fail(f"--log-particles {wrong[0]}: the actions of {args.env!r} are 0 to {head.shape[0] - 1}")
+
+    def record(self, acting: Mixture) -> None:
+        """Take the weights (..., m, n) with which the policy acts."""
+        if self.active:
+            weight = acting.logits.detach().softmax(-1).flatten(0, -3)
+            torch.maximum(self.largest, weight.amax(0), out=self.largest)
+            self.total += weight.sum(0)
+
+    @torch.no_grad()
+    def end_iteration(self, head: Head, optimizer: ClippedAdam) -> dict[str, Tensor]:
+        """Resample if it is time; that is decided on the device, so a captured iteration does the same."""
+        if not self.active:
+            return {}
+        assert isinstance(head, Particles)
+        head.log_std.clamp_(*LOG_STD)
+        self.age += 1
+        due = self.age % self.args.resampling_interval == 0
+        largest = self.largest.copy_(distributed.stack(self.largest).amax(0))  # ranks decide alike
+        total = distributed.average(self.total)
+        dead = largest < self.args.dead / head.shape[1]  # Eq. 8
+        dead &= ~dead.all(-1, keepdim=True)  # nothing recorded
+        weight = total / total.sum(-1, keepdim=True)
+        if self.args.resampling != "none":
+            chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
+            self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))
+        found = {
+            "particles/dead": dead.to(weight.dtype).mean(),
+            "particles/moved": self.moved,
+            "particles/active": (-torch.xlogy(weight, weight).sum(-1)).exp().mean(),
+            "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
+        }
+        loc = torch.tanh(head.loc) if head.squashed else head.loc.clone()
+        for name, values in (("loc", loc), ("weight", weight)):
+            for k in self.args.log_particles:
+                found |= {f"particles/{name}_{k}_{i}": value for i, value in enumerate(values[k].unbind())}
+        for seen in (self.largest, self.total):
+            seen *= ~due
+        return found
+
+    def move(self, head: Particles, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
+        """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
+
+        |D| copies share the weight of their target: log(|D| + 1) less in the logits of each. Adam's moments of what is
+        overwritten start at zero.
+        """
+        m, n = head.shape
+        draws = distributed.stack(torch.empty(m, n, n, device=dead.device).exponential_())[0]
+        own = torch.arange(n, device=dead.device).expand(m, n)
+        target = torch.where(dead, (chance.unsqueeze(1) / draws).argmax(-1), own)
+        copies = torch.zeros_like(chance).scatter_add(1, target, dead.to(chance.dtype))
+        head.linear.bias.data.view(m, n).sub_(torch.log1p(copies))
+        parameters = head.linear.weight, head.linear.bias, head.loc, head.log_std
+        for parameter in parameters:
+            rows = parameter.data.view(m, n, -1)
+            rows.copy_(rows.gather(1, target.unsqueeze(-1).expand_as(rows)))
+            for moment in optimizer.moments(parameter):
+                moment.view(m, n, -1).masked_fill_(dead.unsqueeze(-1), 0.0)
+        uniform = distributed.stack(2 * torch.rand_like(head.loc) - 1)[0]
+        head.loc.add_(dead * self.args.resampling_noise * uniform * head.log_std.exp())
+        self.moved += dead.sum()
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+def mlp(inputs: int, hidden: Widths, activation: type[nn.Module] = nn.ELU, norm: bool = False) -> nn.Sequential:
+    """Linear, activation and, if asked for, LayerNorm per hidden layer."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), activation(), *([nn.LayerNorm(width)] if norm else [])]
+        inputs = width
+    return nn.Sequential(*layers)
+
+
+class Actor(nn.Module):
+    """pi(a|s), of normalized observations."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.normalizer = ObsNormalizer(obs_dim)
+        activation = nn.ReLU if args.algorithm == "sac" else nn.ELU
+        self.body = mlp(obs_dim, args.hidden, activation, norm=args.algorithm == "shac")
+        self.head = HEADS[args.policy](args, args.hidden[-1], action_dim)
+
+    def forward(self, obs: Tensor) -> Mixture:
+        mixture: Mixture = self.head(self.body(obs))
+        return mixture
+
+    def deterministic(self) -> nn.Sequential:
+        """The locations of the largest weights, of observations as they come, with the same weights."""
+        squash = [nn.Tanh()] if self.head.squashed else []
+        return nn.Sequential(self.normalizer, *self.body, *self.head.deterministic, *squash)
+
+
+class ActorCritic(Actor):
+    """And V(s), in units of its normalizer, of the same features."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__(args, obs_dim, action_dim)
+        self.value = nn.Linear(args.hidden[-1], 1)
+
+    def both(self, obs: Tensor) -> tuple[Mixture, Tensor]:
+        features = self.body(obs)
+        return self.head(features), self.value(features).squeeze(-1)
+
+
+# What the algorithms share --------------------------------------------------------------------------------------------
+# In each, the halves of an iteration, interact and learn, change tensors in place and never wait for the device: on a
+# GPU each becomes one CUDA graph.
+
+
+class Window(NamedTuple):
+    """What came of H steps of all environments, time first: (H, N, ...)."""
+
+    obs: Tensor  # s_t, on which the policy acted
+    next_obs: Tensor  # s_{t+1}, before any reset
+    reward: Tensor
+    terminated: Tensor
+    done: Tensor  # terminated or truncated
+    nonfinite: Tensor
+    episode_return: Tensor  # of the episode so far, as is the length
+    episode_length: Tensor
+
+    def metrics(self, env: DiffEnv) -> dict[str, Tensor]:
+        return episode_metrics(env, self.done, {"r": self.episode_return, "l": self.episode_length}, self.nonfinite)
+
+
+def collect(env: DiffEnv, horizon: int, act: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Window, list[Tensor]]:
+    """Steps of all environments from where they stand, and what `act` returned beside the actions (H, N, ...)."""
+    steps, obs = [], env.detach()
+    for _ in range(horizon):
+        action, *beside = act(obs)
+        next_obs, reward, terminated, truncated, info = env.step(action)
+        ends = terminated, terminated | truncated, info["nonfinite"]
+        episode = info["episode"]["r"], info["episode"]["l"]
+        steps.append((obs, info["final_obs"], reward, *ends, *episode, *beside))
+        obs = next_obs
+    columns = [torch.stack(tensors) for tensors in zip(*steps, strict=True)]
+    known = len(Window._fields)
+    return Window(*columns[:known]), columns[known:]
+
+
+def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+    """SHAC's Eq. 7 of (H, N) steps, backward in time: the value's targets; minus the value, PPO's advantages.
+
+    A done ends the return as the window's end does. next_value is V(s_{t+1}), before any reset: zero where the episode
+    terminated, but not where its time ran out.
+    """
+    returns = torch.empty_like(reward)
+    following = next_value[-1]
+    for t in reversed(range(len(reward))):
+        following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))
+        following = returns[t] = reward[t] + gamma * following
+    return returns
+
+
+def named(learner: object, names: str) -> dict[str, Stateful]:
+    """Those attributes of a learner: all that the next iteration depends on."""
+    return {name: getattr(learner, name) for name in names.split()}
+
+
+def follow(slow: nn.Module, fast: nn.Module, rate: float) -> None:
+    """slow <- (1 - rate) slow + rate fast."""
+    for own, other in zip(slow.parameters(), fast.parameters(), strict=True):
+        own.lerp_(other.detach(), rate)
+
+
+# PPO ------------------------------------------------------------------------------------------------------------------
+
+
+class PPO:
+    """Proximal Policy Optimization, with the constants of ppo_baseline.py."""
+
+    target_kl, lr_bounds, clip_coef, value_coef, bound_coef = 0.008, (1e-6, 1e-2), 0.2, 2.0, 1e-4
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        obs_dim, action_dim, samples = env.task.obs_dim, env.scene.nu, args.horizon * env.num_envs
+        self.actor = ActorCritic(args, obs_dim, action_dim).to(env.device)
+        self.policy = self.actor.deterministic()
+        self.resampling = Resampling(args, self.actor.head).to(env.device)
+        self.return_normalizer = ObsNormalizer().to(env.device)
+        self.optimizer = ClippedAdam(self.actor, 1.0, lr=args.lr)
+        sizes = (obs_dim,), (action_dim,), (), (), ()  # normalized s_t; u; its log probability; advantage; target
+        self.samples = [torch.zeros(samples, *size, device=env.device) for size in sizes]
+        self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
+        self.modules = named(self, "actor resampling return_normalizer optimizer")
+
+    def act(self, obs: Tensor) -> tuple[Tensor, ...]:
+        mixture, value = self.actor.both(self.actor.normalizer(obs))
+        self.resampling.record(mixture)
+        u = mixture.sample()
+        return u, u, mixture.log_prob(u), value
+
+    @torch.no_grad()
+    def interact(self) -> dict[str, Tensor]:
+        """Act for a window, and keep its samples with their advantages and value targets."""
+        args, normalizer = self.args, self.actor.normalizer
+        window, (u, log_prob, value) = collect(self.env, args.horizon, self.act)
+        next_value = self.return_normalizer.inverse(self.actor.both(normalizer(window.next_obs))[1])
+        next_value = next_value.masked_fill(window.terminated, 0.0)
+        target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
+        advantage = target - self.return_normalizer.inverse(value)
+        self.return_normalizer.update(target)
+        var, mean = moments(advantage.flatten())
+        advantage = (advantage - mean) / (var.sqrt() + 1e-8)
+        samples = normalizer(window.obs), u, log_prob, advantage, self.return_normalizer(target)
+        for buffer, tensor in zip(self.samples, samples, strict=True):
+            buffer.copy_(tensor.flatten(0, 1))
+        normalizer.update(window.obs)
+        return window.metrics(self.env)
+
+    def learn(self) -> dict[str, Tensor]:
+        """Descend the clipped loss in epochs of minibatches."""
+        args, metrics = self.args, []
+        for _ in range(args.epochs):
+            order = torch.randperm(len(self.samples[0]), device=self.env.device)
+            batches = (tensor[order].chunk(self.minibatches) for tensor in self.samples)
+            for obs, u, log_prob, advantage, target in zip(*batches, strict=True):
+                mixture, value = self.actor.both(obs)
+                log_ratio = mixture.log_prob(u) - log_prob
+                kl = (log_ratio.detach().expm1() - log_ratio.detach()).mean()  # estimated; not below zero
+                adapt(self.optimizer.lr, distributed.average(kl), self.target_kl, self.lr_bounds)
+                ratio = log_ratio.exp()
+                clipped = ratio.clamp(1 - self.clip_coef, 1 + self.clip_coef)
+                policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()
+                value_loss = (value - target).square().mean()
+                bound_loss = (mixture.loc.abs() - 1.1).clamp(min=0).square().mean(-1).sum(-1).mean()
+                loss = policy_loss + self.value_coef * value_loss + self.bound_coef * bound_loss
+                if args.entropy_coef:
+                    loss = loss - args.entropy_coef * mixture.entropy().mean()
+                norm = self.optimizer.step(loss)
+                metrics.append(torch.stack((policy_loss.detach(), value_loss.detach(), kl, norm)))
+        names = ("losses/policy", "losses/value", "losses/kl", "grad/norm")
+        return dict(zip(names, torch.stack(metrics).mean(0), strict=True)) | {
+            "grad/skipped": self.optimizer.skipped,
+            "charts/learning_rate": self.optimizer.lr,
+            "charts/entropy": mixture.entropy().detach().mean(),  # of the last minibatch
+            **self.resampling.end_iteration(self.actor.head, self.optimizer),
+        }
+
+
+@torch.no_grad()
+def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) -> None:
+    """Divides lr by 1.5 where kl is beyond twice the target, and multiplies it by 1.5 below half of it."""
+    lr.mul_(1.5 ** ((kl < target / 2).to(lr.dtype) - (kl > 2 * target).to(lr.dtype))).clamp_(*bounds)
+
+
+# SHAC -----------------------------------------------------------------------------------------------------------------
+
+
+class SHAC:
+    """Short-Horizon Actor-Critic, with the constants of shac.py. The gradient goes on through the sampled actions."""
+
+    betas, final_lr = (0.7, 0.95), 1e-5
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        obs_dim, samples = env.task.obs_dim, args.horizon * env.num_envs
+        self.actor = Actor(args, obs_dim, env.scene.nu).to(env.device)
+        self.policy = self.actor.deterministic()
+        self.resampling = Resampling(args, self.actor.head).to(env.device)
+        self.critic = mlp(obs_dim, args.critic_hidden, norm=True).append(nn.Linear(args.critic_hidden[-1], 1))
+        for layer in self.critic:
+            if isinstance(layer, nn.Linear):
+                nn.init.orthogonal_(layer.weight, math.sqrt(2))
+                nn.init.zeros_(layer.bias)
+        self.critic.to(env.device)
+        self.target = copy.deepcopy(self.critic).requires_grad_(False)
+        self.optimizer = ClippedAdam(self.actor, 1.0, self.betas)
+        self.critic_optimizer = ClippedAdam(self.critic, 1.0, self.betas)
+        self.obs = torch.zeros(samples, obs_dim, device=env.device)  # the critic's samples
+        self.value = torch.zeros(samples, device=env.device)
+        self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
+        self.modules = named(self, "actor resampling critic target optimizer critic_optimizer")
+
+    def schedule(self, iteration: int) -> None:
+        """Linear decay of the learning rates."""
+        args, done = self.args, (iteration - 1) / self.args.iterations
+        self.optimizer.lr.fill_(args.lr + (self.final_lr - args.lr) * done)
+        self.critic_optimizer.lr.fill_(args.critic_lr + (self.final_lr - args.critic_lr) * done)
+
+    def act(self, obs: Tensor) -> tuple[Tensor, ...]:
+        mixture = self.actor(self.actor.normalizer(obs))
+        self.resampling.record(mixture)
+        u, chosen = mixture.rsample(self.args.estimator, self.args.density_floor)
+        return mixture.action(u), chosen, mixture.entropy().expand_as(chosen)
+
+    def interact(self) -> dict[str, Tensor]:
+        """Descend the loss of a window of all environments; keep the critic's samples of it."""
+        args, normalizer = self.args, self.actor.normalizer
+        window, (chosen, entropy) = collect(self.env, args.horizon, self.act)
+        loss = self.loss(window, chosen, entropy)
+        norm = self.optimizer.step(loss)
+        window = Window(*(tensor.detach() for tensor in window))
+        value = td_lambda(window.reward, self.next_values(window), window.done, args.gamma, args.trace_decay)
+        self.value.copy_(value.flatten())
+        self.obs.copy_(normalizer(window.obs).flatten(0, 1))
+        normalizer.update(window.obs)
+        metrics = {"losses/actor": loss.detach(), "charts/entropy": entropy.detach().mean(), "grad/norm": norm}
+        return metrics | window.metrics(self.env)
+
+    def loss(self, window: Window, chosen: Tensor, entropy: Tensor) -> Tensor:
+        """Eq. 5: each environment's window is cut at its dones; of (H, N) choices' log probabilities and entropies."""
+        args, (reward, done) = self.args, (window.reward, window.done)
+        next_value, discount = self.next_values(window), discounts(done, args.gamma, reward.dtype)
+        ends = done.clone()
+        ends[-1] = True
+        loss = -(discount * reward + discount * args.gamma * ends * next_value).mean()
+        if args.estimator == "mixed":  # the score function of the chosen particles
+            with torch.no_grad():
+                value = self.target(self.actor.normalizer(window.obs)).squeeze(-1)
+                advantage = td_lambda(reward, next_value, done, args.gamma, 1.0) - value
+            loss = loss - (discount * advantage * chosen).mean()
+        return loss - args.entropy_coef * entropy.mean()
+
+    def next_values(self, window: Window) -> Tensor:
+        """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
+        values: Tensor = self.target(self.actor.normalizer(window.next_obs)).squeeze(-1)
+        return values.masked_fill(window.terminated, 0.0)
+
+    def learn(self) -> dict[str, Tensor]:
+        """Fit the critic to the window's TD(lambda) returns, and let the target critic follow."""
+        args = self.args
+        for _ in range(args.epochs):
+            losses = []
+            for obs, value in zip(self.obs.chunk(self.minibatches), self.value.chunk(self.minibatches), strict=True):
+                loss = F.mse_loss(self.critic(obs).squeeze(-1), value)
+                self.critic_optimizer.step(loss)
+                losses.append(loss.detach())
+        follow(self.target, self.critic, args.target_rate)
+        skipped = self.optimizer.skipped + self.critic_optimizer.skipped
+        found = {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        return found | self.resampling.end_iteration(self.actor.head, self.optimizer)
+
+
+def discounts(done: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
+    """gamma^t of (H, N) steps, which starts anew after the dones."""
+    t = torch.arange(len(done), device=done.device).unsqueeze(1)
+    starts = done.roll(1, 0)
+    starts[0] = True
+    age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values  # steps since the start or the last done
+    return gamma ** age.to(dtype)
+
+
+# SAC ------------------------------------------------------------------------------------------------------------------
+
+
+class SAC:
+    """Soft Actor-Critic: see sac_baseline.py. The critics' gradient goes on through the sampled actions."""
+
+    max_grad_norm = 100.0
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        obs_dim, action_dim, hidden = env.task.obs_dim, env.scene.nu, args.critic_hidden
+        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.policy = self.actor.deterministic()
+        self.resampling = Resampling(args, self.actor.head).to(env.device)
+        critics = [mlp(obs_dim + action_dim, hidden, nn.ReLU).append(nn.Linear(hidden[-1], 1)) for _ in range(2)]
+        self.critics = Ensemble(critics).to(env.device)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)
+        self.optimizer = ClippedAdam(self.actor, self.max_grad_norm, lr=args.lr)
+        self.critic_optimizer = ClippedAdam(self.critics, self.max_grad_norm, lr=args.critic_lr)
+        self.temperature_optimizer = ClippedAdam(self.temperature, self.max_grad_norm, lr=args.temperature_lr)
+        self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
+        optimizers = "optimizer critic_optimizer temperature_optimizer"
+        self.modules = named(self, f"actor resampling critics targets temperature {optimizers} buffer")
+
+    def act(self, obs: Tensor) -> tuple[Tensor, ...]:
+        mixture = self.actor(self.actor.normalizer(obs))
+        self.resampling.record(mixture)
+        action = mixture.action(mixture.sample())
+        return action, action
+
+    @torch.no_grad()
+    def interact(self) -> dict[str, Tensor]:
+        """Act for a window, into the buffer."""
+        window, (action,) = collect(self.env, self.args.horizon, self.act)
+        terminated = window.terminated.to(window.reward.dtype)
+        made = window.obs, action, window.reward, window.next_obs, terminated
+        self.buffer.add(Transition(*(tensor.flatten(0, 1) for tensor in made)))
+        self.actor.normalizer.update(window.obs)
+        return window.metrics(self.env)
+
+    def learn(self) -> dict[str, Tensor]:
+        """As many updates as there were control steps."""
+        args, normalizer, rows = self.args, self.actor.normalizer, []
+        for _ in range(args.horizon * args.epochs):
+            batch = self.buffer.sample(args.minibatch_size)
+            obs, next_obs = normalizer(batch.obs), normalizer(batch.next_obs)
+            rows.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
+        found = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
+        found |= self.resampling.end_iteration(self.actor.head, self.optimizer)
+        skipped = self.optimizer.skipped + self.critic_optimizer.skipped
+        return found | {"charts/temperature": self.temperature["log"].detach().exp(), "grad/skipped": skipped}
+
+    def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
+        """Descend the soft Bellman residual, and let the target critics follow."""
+        args = self.args
+        with torch.no_grad():
+            mixture = self.actor(next_obs)
+            u = mixture.sample()
+            soft = self.values(self.targets, next_obs, mixture.action(u)).amin(0)
+            soft = soft - self.temperature["log"].exp() * mixture.log_prob(u)
+            target = batch.reward + args.gamma * (1 - batch.terminated) * soft
+        values = self.values(self.critics, obs, batch.action)
+        loss = (values - target).square().mean(1).sum()
+        self.critic_optimizer.step(loss)
+        follow(self.targets, self.critics, args.target_rate)
+        return {"losses/critic": loss.detach() / 2, "charts/value": values.detach().mean()}
+
+    def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
+        """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
+        mixture = self.actor(obs)
+        u, _ = mixture.rsample(self.args.estimator, self.args.density_floor)
+        density = mixture.log_prob(u)
+        value = self.values(self.critics, obs, mixture.action(u)).amin(0)
+        loss = (self.temperature["log"].detach().exp() * density - value).mean()
+        norm = self.optimizer.step(loss)
+        surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
+        self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
+        return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
+
+    def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
+        """Each critic's Q(s, a) (2, B)."""
+        inputs = torch.cat((obs, action), -1)
+        return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
+
+
+# The run --------------------------------------------------------------------------------------------------------------
+
+ALGORITHMS: dict[str, type[PPO] | type[SHAC] | type[SAC]] = {"ppo": PPO, "shac": SHAC, "sac": SAC}
+
+
+def train(args: Args) -> None:
+    run = Run(args)
+    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    learner = run.restore(ALGORITHMS[args.algorithm](args, env))
+    interact, learn = run.capture(learner.interact, env), run.capture(learner.learn)
+    for iteration in run:
+        if isinstance(learner, SHAC):
+            learner.schedule(iteration)
+        run.log(interact() | learn())
+        if run.evaluation_due:
+            run.log_evaluation(evaluate(eval_env, learner.policy))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parse(Args, argv)
+    if args.evaluate:
+        evaluate_checkpoint(args)
+    else:
+        train(args)
+
+
+if __name__ == "__main__":
+    main()

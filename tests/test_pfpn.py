@@ -1,0 +1,546 @@
+"""PFPN's policy against closed forms and quadrature, its algorithms against the other scripts and known optima."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from learners import assert_same, read_progress, refusal, run
+from torch import Tensor
+from torch.distributions import Categorical, MixtureSameFamily, Normal
+
+import pfpn
+import ppo_baseline
+import sac_baseline
+import shac
+from diffsim.training import ClippedAdam, Transition, load_policy, parse
+
+BATCH, M, N = 7, 3, 5  # states, actions, particles
+
+
+def parameters(*batch: int) -> list[Tensor]:
+    """Logits, locations and log standard deviations of a mixture, at random."""
+    torch.manual_seed(0)
+    shapes = ((*batch, M, N), (M, N), (M, N))
+    logits, loc, log_std = (torch.randn(shape, dtype=torch.float64) for shape in shapes)
+    return [logits.requires_grad_(), (0.6 * loc).requires_grad_(), (0.3 * log_std - 1).requires_grad_()]
+
+
+# The mixture ----------------------------------------------------------------------------------------------------------
+
+
+def test_density_and_its_gradient_are_those_of_torchs_mixture() -> None:
+    logits, loc, log_std = inputs = parameters(BATCH)
+    u = torch.randn(BATCH, M, dtype=torch.float64)
+    components = Normal(loc.expand(BATCH, M, N), log_std.exp().expand(BATCH, M, N))
+    expected = MixtureSameFamily(Categorical(logits=logits), components).log_prob(u)
+    density = pfpn.Mixture(*inputs, False).log_prob(u)
+    torch.testing.assert_close(density, expected.sum(-1))
+    own, torchs = (torch.autograd.grad(x.sum(), inputs, retain_graph=True) for x in (density, expected))
+    torch.testing.assert_close(own, torchs, rtol=1e-10, atol=1e-12)
+    slope = torch.log1p(-torch.tanh(u).square())
+    torch.testing.assert_close(pfpn.Mixture(*inputs, True).log_prob(u), (expected - slope).sum(-1))
+
+
+def test_density_far_from_every_particle_is_finite_as_is_its_gradient() -> None:
+    inputs = [x.detach().float().requires_grad_() for x in parameters()]
+    density = pfpn.Mixture(*inputs, True).log_prob(torch.full((M,), 60.0))
+    assert density.isfinite() and all(g.isfinite().all() for g in torch.autograd.grad(density, inputs))
+
+
+@pytest.mark.parametrize("estimator", ["implicit", "straight-through", "mixed"])
+def test_draws_follow_the_density(estimator: pfpn.Estimator) -> None:
+    """Kolmogorov and Smirnov's distance of 100,000 draws of each action, which do not depend on each other."""
+    logits, loc, log_std = parameters()
+    mixture = pfpn.Mixture(logits.expand(100_000, M, N), loc, log_std, False)
+    u = mixture.rsample(estimator)[0].detach().sort(0).values
+    z = (u.unsqueeze(-1) - loc) / log_std.exp()
+    cumulative = (logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
+    rank = (torch.arange(100_000) / 100_000).unsqueeze(-1)
+    assert (cumulative - rank).abs().max() < 0.006
+    shuffled = mixture.sample() - u.mean(0)
+    assert (torch.corrcoef(shuffled.T) - torch.eye(M)).abs().max() < 0.02
+
+
+def test_bins_count_as_the_nearest() -> None:
+    logits = parameters(BATCH)[0][:, :1]
+    bins = pfpn.Bins(logits, torch.linspace(-1, 1, N).expand(1, N), torch.full((1, N), -math.inf), False)
+    u = bins.sample()
+    index = ((u + 1) / 2 * (N - 1)).round().long()
+    torch.testing.assert_close(u, -1 + 2 * index.double() / (N - 1))
+    expected = logits.log_softmax(-1).squeeze(1).gather(1, index).squeeze(1)
+    torch.testing.assert_close(bins.log_prob(u + 0.1), expected)
+    assert all(g.isfinite().all() for g in torch.autograd.grad(bins.log_prob(u).sum() + bins.entropy().sum(), logits))
+
+
+def test_entropy_is_of_the_weights_or_of_the_gaussian() -> None:
+    logits, loc, log_std = parameters(BATCH)
+    entropy = pfpn.Mixture(logits, loc, log_std, False).entropy()
+    torch.testing.assert_close(entropy, Categorical(logits=logits).entropy().sum(-1))
+    gaussian = pfpn.Mixture(logits[..., :1], loc[:, :1], log_std[:, :1], False)
+    torch.testing.assert_close(gaussian.entropy(), Normal(0, log_std[:, :1].exp()).entropy().sum().expand(1)[0])
+
+
+# Gradients of samples -------------------------------------------------------------------------------------------------
+
+
+def test_implicit_gradient_keeps_the_cumulative_probability() -> None:
+    """By definition; so it is that of the quantile, and unbiased. dF/du is the density, so the rest is determined."""
+    inputs = parameters()
+    torch.manual_seed(3)
+    u, _ = pfpn.Mixture(*inputs, True).rsample("implicit")
+    logits, loc, log_std = inputs
+    cumulative = (logits.softmax(-1) * torch.special.ndtr((u.unsqueeze(-1) - loc) / log_std.exp())).sum()
+    for total, own in zip(torch.autograd.grad(cumulative, inputs, retain_graph=True), inputs, strict=True):
+        assert total.abs().max() < 1e-12
+        assert torch.autograd.grad(u.sum(), own, retain_graph=True)[0].abs().max() > 0.01
+
+
+def test_straight_through_gradient() -> None:
+    """Eq. 25: of locations and scales that of the chosen one; of logits the gaps times the gradient of the choice."""
+    inputs = parameters()
+    mixture = pfpn.Mixture(*inputs, True)
+    torch.manual_seed(5)
+    u, _ = mixture.rsample("straight-through")
+    torch.manual_seed(5)
+    noise = torch.randn(M, dtype=torch.float64).unsqueeze(-1)
+    scores = inputs[0].log_softmax(-1) - torch.empty(M, N, dtype=torch.float64).exponential_().log()
+    each, x = (inputs[1] + inputs[2].exp() * noise).detach(), scores.softmax(-1)
+    hot = torch.nn.functional.one_hot(scores.argmax(-1), N).double()
+    torch.testing.assert_close(u, (hot * each).sum(-1))
+    action = torch.tanh(u)
+    gradients = torch.autograd.grad(action.sum(), inputs)
+    gap = torch.tanh(each) - action.detach().unsqueeze(-1)
+    torch.testing.assert_close(gradients[0], torch.autograd.grad((gap * x).sum(), inputs[0])[0])
+    slope = (1 - action.square()).unsqueeze(-1) * hot
+    torch.testing.assert_close(gradients[1:], (slope, slope * inputs[2].exp() * noise))
+    torch.testing.assert_close(gradients[0].sum(-1), torch.zeros(M, dtype=torch.float64))
+
+
+def test_straight_through_weights_are_biased() -> None:
+    """Of two particles at -1 and 1 E[a^2] does not depend on the weights; the estimate has mean 4 E[x1 x2 sign(a)]."""
+    count, p = 100_000, 0.8
+    log_odds = math.log(p / (1 - p))
+    logits = torch.tensor([0.0, log_odds], dtype=torch.float64).expand(count, 1, 2).clone().requires_grad_()
+    loc = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
+    torch.manual_seed(0)
+    mixture = pfpn.Mixture(logits, loc, torch.full_like(loc, -20), False)
+    u, _ = mixture.rsample("straight-through")
+    (gradient,) = torch.autograd.grad(u.square().sum(), logits)
+    y = torch.linspace(-40, 40, 400_001, dtype=torch.float64)
+    both = y.sigmoid() * (-y).sigmoid()  # x1 x2 where the logistic noise puts their log odds at y
+    expected = 4 * torch.trapezoid(both * y.sign() * (y - log_odds).sigmoid() * (log_odds - y).sigmoid(), y).item()
+    mean, error = gradient[:, 0, 1].mean().item(), gradient[:, 0, 1].std().item() / math.sqrt(count)
+    assert abs(mean - expected) < 4 * error and expected > 50 * error
+    u, chosen = mixture.rsample("mixed")  # which adds the score function
+    (score,) = torch.autograd.grad((u.square().sum(-1).detach() * chosen).sum(), logits)
+    assert abs(score[:, 0, 1].mean().item()) < 4 * score[:, 0, 1].std().item() / math.sqrt(count)
+
+
+def test_the_density_floor_bounds_the_implicit_gradient() -> None:
+    """Between two far peaks, where the density is almost zero."""
+    logits = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
+    u, slopes = torch.zeros(1, dtype=torch.float64), []
+    for floor in (0.0, 0.01):
+        mixture = pfpn.Mixture(logits, torch.tensor([[-1.0, 1.0]]), torch.full((1, 2), -2.0), True)
+        slopes += torch.autograd.grad(torch.tanh(mixture.attach(u, floor)), logits)
+    assert slopes[0].abs().max() > 1e6 and slopes[1].abs().max() == pytest.approx(0.25 / 0.01, rel=1e-3)
+
+
+# Resampling -----------------------------------------------------------------------------------------------------------
+
+
+def head(*arguments: str) -> tuple[pfpn.Particles, pfpn.Resampling, ClippedAdam, Tensor]:
+    """A policy head in float64, its resampling, an optimizer that has moments, and features of states."""
+    flags = "--env ant --device cpu --particles 6 --resampling-interval 1 --resampling-noise 0"
+    args = parse(pfpn.Args, [*flags.split(), *arguments])
+    torch.manual_seed(0)
+    own = pfpn.Particles(args, 4, M).double()
+    with torch.no_grad():
+        for parameter in own.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+    resampling, optimizer = pfpn.Resampling(args, own).double(), ClippedAdam(own, 1.0, lr=1e-3)
+    features = torch.randn(50, 4, dtype=torch.float64)
+    first, second = torch.randn_like(optimizer.vector), torch.rand_like(optimizer.vector)
+    optimizer.adam.state[optimizer.vector] = {"step": torch.tensor(1.0), "exp_avg": first, "exp_avg_sq": second}
+    return own, resampling, optimizer, features
+
+
+def kill(own: pfpn.Particles, places: list[tuple[int, int]], bias: float = -1e4) -> None:
+    for k, i in places:
+        own.linear.weight.data.view(M, 6, 4)[k, i] = 0
+        own.linear.bias.data.view(M, 6)[k, i] = bias
+
+
+DEAD = [(0, 1), (0, 2), (0, 3), (0, 4), (2, 0), (2, 5)]
+
+
+@pytest.mark.parametrize(("algorithm", "resampling"), [("ppo", "weighted"), ("sac", "uniform")])
+def test_resampling_leaves_the_policy_as_it_is(algorithm: str, resampling: str) -> None:
+    """The theorem (Eq. 10), with several dead particles on one target; what is not involved stays bitwise."""
+    own, moving, optimizer, features = head("--algorithm", algorithm, "--resampling", resampling)
+    kill(own, DEAD)
+    u = 2 * torch.randn(50, M, dtype=torch.float64)
+    before = own(features)
+    moving.record(before)
+    parameters = own.linear.weight, own.linear.bias, own.loc, own.log_std
+    views = [x.data.view(M, 6, -1) for x in parameters]
+    moments = [moment.view(M, 6, -1) for x in parameters for moment in optimizer.moments(x)]
+    old, old_moments = ([x.clone() for x in each] for each in (views, moments))
+    metrics = moving.end_iteration(own, optimizer)
+    after = own(features)
+    assert (after.log_prob(u) - before.log_prob(u)).abs().max() < 1e-10
+    assert metrics["particles/moved"] == 6 and metrics["particles/dead"].item() == pytest.approx(6 / 18)
+
+    dead = torch.zeros(M, 6, dtype=torch.bool)
+    dead[tuple(zip(*DEAD, strict=True))] = True
+    assert after.log_weight.exp().amax(0)[dead].min() > 1e-3  # alive again
+    target = (views[2] == views[2].transpose(1, 2)) & ~dead.unsqueeze(1)  # equal locations
+    copies = (target & dead.unsqueeze(-1)).sum(1)
+    assert (target.sum(-1) == 1).all() and copies.sum() == 6 and copies.max() >= 3
+    alone = ~dead & (copies == 0)
+    assert alone.any() and all(torch.equal(x[alone], was[alone]) for x, was in zip(views, old, strict=True))
+    for moment, was in zip(moments, old_moments, strict=True):
+        assert not moment[dead].any() and was[dead].any() and torch.equal(moment[~dead], was[~dead])
+    assert not moving.largest.any() and not moving.total.any()
+
+
+def test_weights_below_the_threshold_bound_the_change() -> None:
+    """Of particles that are almost dead the policy changes, in total variation, by no more than their weight."""
+    own, moving, optimizer, features = head()
+    kill(own, [(0, 1), (1, 2), (1, 3)], bias=-6.0)
+    before = own(features)
+    moving.record(before)
+    lost = before.log_weight.exp()[:, [0, 1, 1], [1, 2, 3]]
+    assert lost.max() < 0.05 / 6 and lost.min() > 1e-7
+    x = torch.linspace(-12, 12, 20_001, dtype=torch.float64)
+    densities = []
+    for _ in range(2):
+        mixture = own(features[:10].unsqueeze(0))
+        densities.append(mixture.log_density(x.reshape(-1, 1, 1).expand(-1, 10, M)).exp())
+        moving.end_iteration(own, optimizer)
+    assert moving.moved == 3
+    variation = torch.trapezoid((densities[0] - densities[1]).abs() / 2, x, dim=0)
+    bound = torch.stack((lost[:10, 0], lost[:10, 1] + lost[:10, 2], torch.zeros(10)), -1)
+    assert (variation <= bound + 1e-9).all() and variation.max() > 1e-6
+
+
+def test_targets_are_drawn_by_weight_and_copies_land_around_them() -> None:
+    own, moving, optimizer, features = head("--particles", "400", "--resampling-noise", "0.5")
+    weight, bias = own.linear.weight.data.view(M, 400, 4), own.linear.bias.data.view(M, 400)
+    weight.zero_()
+    bias.fill_(-1e4)
+    bias[:, :3] = torch.tensor([0.6, 0.3, 0.1], dtype=torch.float64).log()
+    own.loc.data[:, :3] = torch.tensor([-0.9, 0.0, 0.9], dtype=torch.float64)
+    own.log_std.data.fill_(-3)
+    moving.record(own(features))
+    moving.end_iteration(own, optimizer)
+    target = own.loc[:, 3:].round().long() + 1
+    counts = torch.stack([torch.bincount(row, minlength=3) for row in target]).sum(0)
+    expected = torch.tensor([0.6, 0.3, 0.1]) * 397 * M
+    assert ((counts - expected).square() / expected).sum() < 14  # chi square, 2 degrees of freedom, p < 0.001
+    shift, width = own.loc[:, 3:] - torch.tensor([-0.9, 0.0, 0.9])[target], 0.5 * math.exp(-3)
+    assert shift.abs().max() <= width and shift.std().item() == pytest.approx(width / math.sqrt(3), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("case", "flags", "dead"),
+    [
+        ("not due", "--resampling-interval 3", 6),
+        ("nothing recorded", "", 0),
+        ("none dead", "", 0),
+        ("switched off", "--resampling none", 6),
+    ],
+)
+def test_nothing_is_moved(case: str, flags: str, dead: int) -> None:
+    own, moving, optimizer, features = head(*flags.split())
+    if case != "none dead":
+        kill(own, DEAD)
+    if case != "nothing recorded":
+        moving.record(own(features))
+    state = [*own.parameters(), *optimizer.adam.state[optimizer.vector].values()]
+    before = [x.clone() for x in state]
+    metrics = moving.end_iteration(own, optimizer)
+    assert all(torch.equal(x, was) for x, was in zip(state, before, strict=True))
+    assert moving.moved == 0 and bool(moving.largest.any()) == (case == "not due")
+    assert metrics["particles/dead"].item() == pytest.approx(dead / 18)
+
+
+# Problems -------------------------------------------------------------------------------------------------------------
+
+
+class Problem:
+    """Environments without simulator: a reward of state and action; the action is the next state."""
+
+    device, episode_length = torch.device("cpu"), 10**9
+    scene = SimpleNamespace(nu=1)
+    task = SimpleNamespace(obs_dim=1)
+    sim = SimpleNamespace(nonfinite_gradients=torch.zeros(1))
+
+    def __init__(self, num_envs: int, reward: Callable[[Tensor, Tensor], Tensor], steps: int = 1) -> None:
+        self.num_envs, self.reward, self.steps, self.t = num_envs, reward, steps, 0
+        self.x = torch.zeros(num_envs, 1)
+
+    def detach(self) -> Tensor:
+        self.t, self.x = 0, torch.zeros(self.num_envs, 1)
+        return self.x
+
+    def step(self, action: Tensor) -> tuple[Any, ...]:
+        self.t += 1
+        reward, self.x = self.reward(self.x, action).squeeze(1), action
+        no = torch.zeros(self.num_envs, dtype=torch.bool)
+        terminated = ~no if self.t % self.steps == 0 else no
+        info = {"final_obs": action, "nonfinite": no, "episode": {"r": reward.detach(), "l": reward.detach()}}
+        return self.x, reward, terminated, no, info
+
+
+def build(flags: str, reward: Callable[[Tensor, Tensor], Tensor], envs: int = 256, steps: int = 1) -> Any:
+    shared = f"--env ant --device cpu --horizon {steps} --hidden 1".split()
+    args = parse(pfpn.Args, [*shared, *flags.split()])
+    env: Any = Problem(envs, reward, steps)
+    return pfpn.ALGORITHMS[args.algorithm](args, env)
+
+
+def solve(learner: Any, iterations: int) -> Any:
+    for iteration in range(1, iterations + 1):
+        if isinstance(learner, pfpn.SHAC):
+            learner.schedule(iteration)
+        learner.interact()
+        learner.learn()
+    return learner
+
+
+PEAKS = (-0.25, 0.75)
+
+
+def distance(action: Tensor) -> Tensor:
+    return torch.minimum((action - PEAKS[0]).abs(), (action - PEAKS[1]).abs())
+
+
+def masses(actor: pfpn.Actor) -> tuple[float, float]:
+    """The shares of actions within 0.15 of each peak."""
+    mixture = actor(torch.zeros(20_000, 1))
+    action = mixture.action(mixture.sample())
+    left, right = (((action - peak).abs() < 0.15).double().mean().item() for peak in PEAKS)
+    return left, right
+
+
+def ppo_bandit(flags: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setattr(pfpn.PPO, "lr_bounds", (3e-3, 3e-3))
+    torch.manual_seed(1)
+    flags = f"--minibatch-size 256 --epochs 4 --lr 3e-3 --entropy-coef 0 {flags}"
+    return build(flags, lambda _, action: 1 / (distance(action) + 0.1))
+
+
+def test_ppo_bandit_with_two_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figure 11: particles cover both peaks, a Gaussian one of them."""
+    found = {}
+    for policy in ("pfpn", "gaussian"):
+        learner = ppo_bandit(f"--policy {policy}", monkeypatch)
+        if policy == "gaussian":
+            learner.actor.head.log_std.data.fill_(-1)
+        solve(learner, 120)
+        found[policy] = masses(learner.actor)
+        assert distance(learner.policy(torch.zeros(1, 1))).item() < 0.15
+    assert min(found["pfpn"]) > 0.2 and sum(found["pfpn"]) > 0.98
+    assert max(found["gaussian"]) > 0.9 and min(found["gaussian"]) < 0.01
+
+
+def test_ppo_bandit_stays_on_both_peaks_with_entropy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the bonus one of the equal peaks has less than 0.02 by then. Particles have been moved."""
+    learner = solve(ppo_bandit("--hidden 16 --entropy-coef 0.2", monkeypatch), 80)
+    assert min(masses(learner.actor)) > 0.2 and learner.resampling.moved > 0
+
+
+@pytest.mark.parametrize("estimator", ["implicit", "straight-through", "mixed", "gaussian"])
+def test_shac_bandit_with_two_peaks(estimator: str) -> None:
+    """Through the reward's gradient: with each estimator particles find both peaks."""
+    policy = "--policy gaussian" if estimator == "gaussian" else f"--estimator {estimator}"
+    flags = f"--algorithm shac --epochs 1 --critic-hidden 4 --lr 3e-3 --iterations 400 --entropy-coef 0.01 {policy}"
+    torch.manual_seed(1)
+    found = masses(solve(build(flags, lambda _, action: (-distance(action) / 0.15).exp()), 100).actor)
+    assert min(found) < 0.01 if estimator == "gaussian" else min(found) > 0.25
+
+
+@pytest.mark.parametrize("estimator", ["implicit", "mixed"])
+def test_gradient_of_a_window_is_that_of_the_expectation(estimator: str) -> None:
+    """Of two steps, whose second policy and reward depend on the first action, against quadrature over both actions.
+
+    The value of what follows is zero for both, so with "mixed" the advantage is of the rewards alone.
+    """
+    flags = f"--algorithm shac --hidden 3 --critic-hidden 2 --particles 3 --gamma 0.9 --estimator {estimator}"
+
+    def reward(x: Tensor, action: Tensor) -> Tensor:
+        return torch.sin(3 * action) * (1 + x) - (action - 0.5 * x).square()
+
+    torch.manual_seed(0)
+    learner = build(f"{flags} --density-floor 0", reward, 200_000, steps=2)
+    linear = learner.actor.head.linear
+    with torch.no_grad():
+        for parameter in (linear.weight, linear.bias):
+            parameter += 0.5 * torch.randn_like(parameter)
+        for parameter in learner.target.parameters():
+            parameter.zero_()
+    parameters = dict(learner.actor.named_parameters())
+    window, others = pfpn.collect(learner.env, 2, learner.act)
+    estimate = torch.autograd.grad(learner.loss(window, *others), list(parameters.values()))
+
+    u, du = torch.linspace(-6, 6, 801), 12 / 800
+    action = torch.tanh(u).unsqueeze(-1)
+    first = learner.actor(torch.zeros(1, 1)).log_density(u.unsqueeze(-1)).squeeze(-1).exp() * du
+    mixture = learner.actor(action.unsqueeze(1))  # of the first action, (801, 1, m, n)
+    second = mixture.log_density(u.reshape(1, -1, 1).expand(len(u), -1, 1)).squeeze(-1).exp() * du
+    value = reward(torch.zeros_like(action), action).squeeze(-1)
+    value = value + 0.9 * (second * reward(action.unsqueeze(1), action.unsqueeze(0)).squeeze(-1)).sum(-1)
+    exact = torch.autograd.grad(-(first * value).sum() / 2, list(parameters.values()))
+    assert first.sum().item() == pytest.approx(1, abs=1e-4)
+    for name, mean, expected in zip(parameters, estimate, exact, strict=True):
+        assert (mean - expected).norm() < 0.05 * expected.norm(), (name, mean, expected)
+
+
+def test_sac_bandit_has_its_soft_optimum() -> None:
+    """The policy proportional to exp(r / alpha), which has two peaks of unequal height."""
+    flags = "--algorithm sac --horizon 8 --num-envs 16 --minibatch-size 128 --critic-hidden 64 --particles 15"
+    flags += " --lr 4e-3 --critic-lr 4e-3 --temperature-lr 1e-9 --target-rate 0.05 --buffer-size 5000"
+
+    def reward(_: Tensor, action: Tensor) -> Tensor:
+        return 2 * (action + 0.6).square() - 2 * torch.cos(5 * (action + 0.6))
+
+    torch.manual_seed(1)
+    actor = solve(build(flags, reward, 16), 110).actor
+    a = torch.linspace(-0.9995, 0.9995, 2000).unsqueeze(-1)
+    density = actor(torch.zeros(1, 1)).log_prob(torch.atanh(a)).softmax(0).detach()
+    assert (density - reward(a, a).squeeze(-1).softmax(0)).abs().sum() / 2 < 0.12
+
+
+def test_sac_target_counts_the_entropy_of_what_follows() -> None:
+    """And neither it nor a value after a failure."""
+    torch.manual_seed(0)
+    learner = build("--algorithm sac --hidden 8 --critic-hidden 8", lambda _, action: action, 4)
+    learner.temperature["log"].data.fill_(-1)
+    obs, next_obs = torch.randn(2, 32, 1)
+    batch = Transition(obs, torch.rand(32, 1), torch.randn(32), next_obs, (torch.rand(32) < 0.3).float())
+    state = torch.get_rng_state()
+    mixture = learner.actor(next_obs)
+    u = mixture.sample()
+    values = torch.stack([learner.targets[k](torch.cat((next_obs, torch.tanh(u)), 1)).squeeze(1) for k in range(2)])
+    own = torch.stack([learner.critics[k](torch.cat((obs, batch.action), 1)).squeeze(1) for k in range(2)])
+    following = values.amin(0) - math.exp(-1) * mixture.log_prob(u)
+    target = batch.reward + 0.99 * (1 - batch.terminated) * following
+    torch.set_rng_state(state)
+    loss = learner.update_critics(batch, obs, next_obs)["losses/critic"]
+    torch.testing.assert_close(loss, (own - target).square().mean().detach())
+
+
+def test_locations_beyond_the_bounds_are_drawn_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pfpn.PPO, "bound_coef", 1e4)
+    learner = ppo_bandit("", monkeypatch)
+    loc = learner.actor.head.loc.data
+    loc.copy_(torch.linspace(-2, 2, 35))
+    before = loc.clone()
+    solve(learner, 1)
+    assert (loc.abs() < before.abs())[before.abs() > 1.1].all()
+
+
+# Runs -----------------------------------------------------------------------------------------------------------------
+
+SMALL = "--env cartpole --device cpu --threads 1 --quiet --num-envs 4 --horizon 8 --minibatch-size 32 --epochs 2"
+SMALL += " --hidden 8 --eval-episodes 1 --resampling-interval 1 --particles 8 --dead 0.999 --lr 0.03 --buffer-size 100"
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "shac --estimator mixed", "sac"])
+def test_a_run_resumes_bitwise_with_its_particles(algorithm: str, tmp_path: Path) -> None:
+    """Of a threshold so high that particles are moved on the way. Its deterministic policy stands alone."""
+    flags = f"{SMALL} --algorithm {algorithm} --iterations 6 --log-particles 0".split()
+    whole = run(pfpn, tmp_path / "whole", *flags)
+    run(pfpn, tmp_path / "part", *flags, "--stop-after", 3)
+    part = run(pfpn, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
+    assert_same(part["modules"], whole["modules"])
+    moved = whole["modules"]["resampling"]["moved"]
+    last = {name: float(value or "nan") for name, value in read_progress(tmp_path / "whole")[-1].items()}
+    assert sum(last[f"particles_weight_0_{i}"] for i in range(8)) == pytest.approx(1, abs=1e-4)
+    assert last["particles_moved"] == moved > 0
+
+    actor = pfpn.Actor(parse(pfpn.Args, flags), 5, 1)
+    actor.load_state_dict(whole["modules"]["actor"], strict=False)  # PPO's has a value
+    obs = torch.randn(20, 5)
+    mixture = actor(actor.normalizer(obs))
+    expected = mixture.action(mixture.loc[0][mixture.log_weight.argmax(-1)])
+    torch.testing.assert_close(load_policy(tmp_path / "whole" / "checkpoint.pt").network(obs), expected)
+
+
+@pytest.mark.parametrize(
+    "flags", ["gmm --algorithm ppo", "gmm --algorithm shac", "gaussian --algorithm sac", "discrete --algorithm ppo",
+              "discrete --algorithm shac --estimator straight-through"]
+)  # fmt: skip
+def test_other_policies_train(flags: str, tmp_path: Path) -> None:
+    checkpoint = run(pfpn, tmp_path, *f"{SMALL} --iterations 2 --policy {flags}".split())
+    assert all(float(row["grad_skipped"]) == 0 for row in read_progress(tmp_path))
+    action = load_policy(tmp_path / "checkpoint.pt").network(torch.randn(50, 5))
+    assert action.shape == (50, 1) and action.isfinite().all()
+    if flags.startswith("discrete"):
+        bins = torch.linspace(-1, 1, 8)
+        assert (action - bins).abs().amin(1).max() < 1e-6
+        torch.testing.assert_close(checkpoint["modules"]["actor"]["head.likeliest.loc"][0], bins)
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "shac"])
+def test_a_gaussian_is_trained_as_by_the_other_scripts(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same random numbers give the same weights, up to rounding: the order of sums differs."""
+    shared = "--env cartpole --device cpu --quiet --num-envs 16 --horizon 32 --iterations 3 --eval-episodes 1"
+    if algorithm == "ppo":
+        shared += " --minibatch-size 100 --epochs 2 --entropy-coef 0.01"
+        theirs = run(ppo_baseline, tmp_path / "theirs", *shared.split(), *"--lr-bounds 3e-4 3e-4".split())
+        monkeypatch.setattr(pfpn.PPO, "lr_bounds", (3e-4, 3e-4))
+    else:
+        own = "--critic-iterations 2 --critic-minibatches 4"
+        theirs = run(shac, tmp_path / "theirs", *shared.split(), *own.split())
+        shared += " --epochs 2 --minibatch-size 128"
+    ours = run(pfpn, tmp_path / "ours", *f"{shared} --algorithm {algorithm} --policy gaussian".split())
+    weights = [list(checkpoint["policy"]["weights"].values()) for checkpoint in (ours, theirs)]
+    torch.testing.assert_close(*weights, rtol=1e-3, atol=2e-5)
+
+
+SAME = {"actor_hidden": "hidden", "actor_lr": "lr", "gae_lambda": "trace_decay", "td_lambda": "trace_decay"}
+SAME |= {"critic_iterations": "epochs", "updates_per_step": "epochs", "batch_size": "minibatch_size"}
+SAME |= {"steps": "horizon", "tau": "target_rate"}
+
+
+@pytest.mark.parametrize("env", ["cartpole", "humanoid_mtu"])
+@pytest.mark.parametrize(("algorithm", "script"), [("ppo", ppo_baseline), ("shac", shac), ("sac", sac_baseline)])
+def test_settings_are_those_of_the_other_scripts(algorithm: str, script: ModuleType, env: str) -> None:
+    flags = ["--env", env, "--device", "cpu"]
+    own = vars(parse(pfpn.Args, [*flags, "--algorithm", algorithm])) | vars(pfpn.ALGORITHMS[algorithm])
+    other = {SAME.get(name, name): value for name, value in vars(parse(script.Args, flags)).items()}
+    shared = other.keys() & own.keys() - {"run_dir", "eval_every", "save_every"}
+    assert len(shared) > 20 and {name: own[name] for name in shared} == {name: other[name] for name in shared}
+    if algorithm == "shac":
+        assert own["target_rate"] == pytest.approx(1 - other["target_alpha"])
+        assert own["minibatch_size"] * other["critic_minibatches"] == other["num_envs"] * other["horizon"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--particles 1", "--particles 1: --policy pfpn needs at least 2"),
+        ("--dead 1", "--dead 1: with equal weights all particles would be dead"),
+        ("--policy discrete --algorithm sac", "--policy discrete has no density"),
+        ("--policy discrete --algorithm shac", "choose --estimator straight-through or mixed"),
+        ("--algorithm sac --estimator mixed", "--estimator mixed needs the rewards of a window"),
+        ("--algorithm sac --buffer-size 10", "--buffer-size 10 holds no window of 32 steps of 128"),
+        ("--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),
+    ],
+)
+def test_wrong_arguments_are_refused(
+    arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["--env", "ant", "--device", "cpu", "--run-dir", str(tmp_path / "run"), *arguments.split()]
+    assert message in refusal(lambda: pfpn.main(argv), capsys)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,83 @@
+"""Record a clip for humanoid_imitation: the cycle of a policy's motion that ends best where it begins.
+
+python tools/record.py diffsim/policies/humanoid.pt diffsim/assets/clips/humanoid_run.npz
+python tools/record.py runs/<run>/checkpoint.pt walk.npz --seconds 2
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from diffsim.clip import Clip, tangent
+from diffsim.training import evaluate, fail, load_policy, make_policy_env, parse_command_line
+
+SETTLING = 3.0  # s at the start of the episode that are left out
+SHORTEST = 0.3  # s
+
+
+@dataclass
+class Args:
+    policy: Annotated[Path, tyro.conf.Positional]
+    """checkpoint of any script, of a robot with a free root and hinges"""
+    output: Annotated[Path, tyro.conf.Positional]
+    """the .npz file"""
+    seconds: float = 1.0
+    """the longest cycle"""
+    episodes: int = 8
+    """of as many episodes, the one of median return"""
+
+
+def cycle(qpos: Tensor, shortest: int, longest: int) -> tuple[Tensor, float]:
+    """Frames (P + 1, nq) of qpos (T, nq) whose ends are closest, and how far apart these are (RMS)."""
+    best, found = float("inf"), (0, 0)
+    for period in range(shortest, longest + 1):
+        error = tangent(qpos[:-period], qpos[period:])[:, 2:].square().mean(-1)
+        error = error.unfold(0, 3, 1).mean(-1)  # the frames before and after, too: the velocities
+        if (least := error.min().item()) < best:
+            best, found = least, (int(error.argmin()) + 1, period)
+    start, period = found
+    return qpos[start : start + period + 1], best**0.5
+
+
+def close(qpos: Tensor) -> Tensor:
+    """The last frame made equal to the first but in x, the difference spread evenly over the cycle."""
+    share = torch.linspace(0.0, 1.0, len(qpos), dtype=qpos.dtype).unsqueeze(1)
+    gap = qpos[:1] - qpos[-1:]
+    gap[:, 0] = 0.0
+    closed = qpos + share * gap  # the quaternions' ends are close, so that normalising is enough
+    closed[:, :2] -= closed[:1, :2].clone()
+    closed[:, 3:7] /= closed[:, 3:7].norm(dim=1, keepdim=True)
+    return closed
+
+
+def main() -> None:
+    args = parse_command_line(Args, None, description=__doc__)
+    torch.set_num_threads(1)
+    saved = load_policy(args.policy)
+    env = make_policy_env(saved, args.episodes)
+    seen = evaluate(env, saved.network)
+    motion = torch.tensor(seen.median_episode(env.episode_length * env.control_dt)[0], dtype=torch.float64)
+    first, shortest, longest = (round(t / env.control_dt) for t in (SETTLING, SHORTEST, args.seconds))
+    if len(motion) < first + 2 * longest:
+        fail(f"the episode lasts {len(motion) * env.control_dt:.1f} s, too short for cycles of {args.seconds} s")
+    qpos, seam = cycle(motion[first:], shortest, longest)
+    clip = Clip(args.output.stem, close(qpos), loop=True)
+    clip.check(env.scene.mj_model)
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(args.output, qpos=clip.qpos.numpy().astype(np.float32), fps=round(1 / env.control_dt))
+    speed = clip.advance[0].item() / (len(clip) * env.control_dt)
+    size = args.output.stat().st_size / 1e3
+    print(
+        f"{args.output}: {len(clip)} frames, {speed:.2f} m/s, its ends {seam:.1e} apart (RMS, m and rad), {size:.1f} kB"
+    )
+
+
+if __name__ == "__main__":
+    main()
