@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -29,7 +30,7 @@ from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration
 from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
-from diffsim.planning.restarts import best_of_random_starts, starting_actions
+from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
 from diffsim.tasks import TASKS
 from diffsim.training import (
@@ -99,6 +100,10 @@ class Args(Flags):
     """start from this trajectory instead of --restarts: an .npz with qpos (T+1, nq), qvel (T+1, nv), action (T, nu)"""
     restarts: Count = 16
     """random action sequences from which trajectory optimisation starts; the best are kept"""
+    window: Natural = 0
+    """optimise first by windows of so many control steps, each a fifth of it later than the last (0: all at once)"""
+    window_iterations: Count = 8
+    """iLQR iterations of a later window"""
     guides: Count = 1
     """guiding distributions n, from as many of the best trajectories"""
     screening: Count = 40
@@ -124,6 +129,8 @@ class Args(Flags):
     """L-BFGS iterations of the fit to the guiding samples"""
     samples: Count = 10
     """trajectories of the policy per iteration"""
+    confirmation: Count = 40
+    """further trajectories of a policy that looks better, before it is accepted"""
     active: Count = 100
     """trajectories in the active set S_k"""
     stored: Count = 300
@@ -132,6 +139,20 @@ class Args(Flags):
     """L-BFGS iterations of each of an iteration's two optimisations"""
     regularizer_bounds: tuple[Positive, Positive] = (1e-4, 1.0)
     """w_r starts at their geometric mean and is changed by factors of ten between them"""
+    reach: Positive = 1.0
+    """feedback: states further from the guides than so many standard deviations teach nothing"""
+    bound: Positive = 2.0
+    """feedback: actions before tanh that are taught are within this"""
+    lessons: Count = 40000
+    """feedback: at most so many of the states that taught, drawn anew, are in a fit"""
+    recent: bool = False
+    """feedback: the newest, not random ones"""
+    soft: NonNegative = 0.0
+    """feedback: lessons at a distance of so many standard deviations count exp(-1/2) (0: all alike)"""
+    midway: NonNegative = 0.0
+    """feedback: so many times --samples trajectories per iteration that start at states of the guides"""
+    widen: NonNegative = 0.0
+    """feedback: guiding samples with so many times their noise teach too (0: none)"""
     step: Positive = 0.1
     """policy-gradient: length of a step along the normalised gradient"""
 
@@ -223,8 +244,10 @@ class Search:
         self.student = policy.theta
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
-        for samples in (guiding, own) if args.variant == "feedback" else ():
-            self.learn(samples)
+        if args.variant == "feedback":
+            wide = [g._replace(L=args.widen * g.L) for g in self.guides]
+            for samples in (guiding, own, *([self.follow(wide, args.guiding_samples)] if args.widen else [])):
+                self.learn(samples)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides
 
@@ -243,7 +266,7 @@ class Search:
             active = torch.cat((active, self.adapt()))  # line 9: generate adaptive guiding samples
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
         if better:  # its samples may have been lucky: confirm it with more
-            active = torch.cat((active, S.append(self.draw(theta, source, args.guiding_samples))))
+            active = torch.cat((active, S.append(self.draw(theta, source, args.confirmation))))
             better, values = self.estimate(theta, active)
         metrics |= values | {"gps/accepted": float(better), "gps/regularizer": self.w_r}
         low, high = (0.0, 0.0) if args.variant == "unregularized" else args.regularizer_bounds
@@ -252,9 +275,16 @@ class Search:
             self.w_r = max(self.w_r / 10, low)  # line 13: decrease w_r
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
-            S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
+            if args.variant != "feedback":
+                S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
         if args.variant == "feedback":
             metrics["gps/near"] = self.learn(S.samples.pick(slice(before, None)))
+            if args.midway:
+                x = torch.cat([guide.x[:-1] for guide in self.guides])
+                count = int(args.midway * args.samples)
+                start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
+                self.control_steps += count * args.horizon
+                self.learn(self.roll_out(theta, self.noise(count), -1, start))
         S.prune(args.stored)
         return metrics | self.metrics(self.draw(theta) if args.variant == "restart" else new)
 
@@ -354,8 +384,9 @@ class Search:
         """
         x = samples.x[:, :-1].flatten(0, 1)
         u, L, distance = nearest_feedback(self.system, self.guides, x, self.network.obs_std)
-        near = distance <= 1.0  # standard deviation
-        new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
+        near, u = distance <= self.args.reach, u.clamp(-self.args.bound, self.args.bound)
+        weight = torch.exp(-0.25 * (distance / (self.args.soft or 1e9)).square())
+        new = samples.obs.flatten(0, 1)[near], u[near], weight[near, None, None] * torch.linalg.inv(L[near])
         self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
         return near.double().mean().item()
 
@@ -364,7 +395,10 @@ class Search:
 
         Their covariance is eta Q_uu^-1, so that an error counts by what it costs under iLQR's value function.
         """
-        obs, u, inverse = self.lessons
+        index = torch.randperm(len(self.lessons[0]), generator=self.rng)[: self.args.lessons]
+        if self.args.recent:
+            index = torch.arange(len(self.lessons[0]))[-self.args.lessons :]
+        obs, u, inverse = (part[index.to(part.device)] for part in self.lessons)
 
         def objective(theta: Tensor) -> Tensor:
             return -(inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)).square().mean()
@@ -406,6 +440,12 @@ class Search:
             "gps/guide_nats": -log_w[guided, -1].mean().item() if self.S.initial else math.nan,
         }
 
+    def save_plan(self, path: Path) -> None:
+        """The best plan, as a --demonstration."""
+        guide, nq = self.guides[0], self.system.nq
+        qpos, qvel, action = (t.cpu().numpy() for t in (guide.x[:, :nq], guide.x[:, nq:], guide.u.tanh()))
+        np.savez(path, qpos=qpos, qvel=qvel, action=action)
+
     # Checkpoints
 
     def state_dict(self) -> dict[str, Any]:
@@ -437,13 +477,21 @@ def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
         if iteration % 10 == 9:
             say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
 
+    def ahead(done: int, costs: Tensor) -> None:
+        if done % 50 < max(args.window // 5, 1):
+            say(f"planned {done} steps ahead: cost of the window {costs.min():.2f}, {len(costs)} trajectories")
+
     try:
         if args.demonstration:
             example = load_demonstration(system, args.demonstration, T)
             x, u = follow_demonstration(system, *example, args.tracking)
         else:
-            u = starting_actions(args.restarts, T, system.nu, system.control_dt, search.rng).to(system.device)
+            W = min(args.window or T, T)
+            u = starting_actions(args.restarts, W, system.nu, system.control_dt, search.rng).to(system.device)
             x, u = best_of_random_starts(system, search.cost, system.start()[0], u, args.guides, args.screening, show)
+            if W < T:
+                x, u, _, _ = ilqr(system, search.cost, x, u, args.ilqr_iterations)
+                x, u = receding_horizon(system, search.cost, x, u, T, max(W // 5, 1), args.window_iterations, ahead)
     except ValueError as error:
         fail(error)
     return ilqr(system, search.cost, x, u, args.ilqr_iterations, show=show)
@@ -692,6 +740,7 @@ def train(args: Args) -> None:
     search = run.restore(Search(args, run.make_eval_env()))
     if run.iteration == 0:
         run.log(search.prepare(run.message), search.control_steps)
+        search.save_plan(run.directory / "plan.npz")
     for iteration in run:  # lines 5 to 18
         run.log(search.iterate(iteration), search.control_steps)
         if run.evaluation_due:

@@ -1,4 +1,4 @@
-"""Trajectory optimisation from nothing: from many random action sequences, of which the best are kept."""
+"""Trajectory optimisation from nothing: many random action sequences, of which the best are kept and continued."""
 
 from __future__ import annotations
 
@@ -60,3 +60,39 @@ def best_of_random_starts(
     plan = ilqr(system, cost, x[whole], u[whole], iterations, show=show)
     best = plan.cost.argsort()[:keep]
     return plan.x[best], plan.u[best]
+
+
+def receding_horizon(
+    system: Dynamics,
+    cost: Cost,
+    x: Tensor,
+    u: Tensor,
+    steps: int,
+    advance: int,
+    iterations: int,
+    show: Callable[[int, Tensor], None] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Continues R trajectories window by window, each of which begins `advance` steps after the one before.
+
+    Over a long horizon most random starts fall, and what comes after a fall has no useful gradient. A window ends soon
+    enough for a few actions to prevent the fall.
+
+    Args:
+        x, u: (R, W + 1, nx), (R, W, nu) the first windows, optimised.
+        steps: T, the length in the end.
+        advance: control steps of a window that are kept, at most W. What a window adds begins without action.
+        iterations: of iLQR, a window.
+        show: gets the control steps done and the windows' costs (R,).
+
+    Returns:
+        x (R, T + 1, nx), u (R, T, nu).
+    """
+    done, xs, us = 0, list[Tensor](), list[Tensor]()
+    while done + u.shape[1] < steps:
+        xs, us, done = [*xs, x[:, :advance]], [*us, u[:, :advance]], done + advance
+        actions = torch.cat((u[:, advance:], torch.zeros_like(u[:, :advance])), 1)
+        x, u, _ = system.rollout(x[:, advance], u.shape[1], lambda t, _, actions=actions: actions[:, t])  # type: ignore[misc]
+        x, u, total, _ = ilqr(system, cost, x, u, iterations)
+        if show:
+            show(done + u.shape[1], total)
+    return torch.cat((*xs, x), 1)[:, : steps + 1], torch.cat((*us, u), 1)[:, :steps]
