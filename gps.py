@@ -141,6 +141,8 @@ class Args(Flags):
     """w_r starts at their geometric mean and is changed by factors of ten between them"""
     reach: Positive = 1.0
     """feedback: states further from the guides than so many standard deviations teach nothing"""
+    tail: Natural = 20
+    """feedback: the last so many steps of a guide teach nothing, as what comes after them costs nothing"""
     bound: Positive = 2.0
     """feedback: actions before tanh that are taught are within this"""
     lessons: Count = 40000
@@ -383,7 +385,8 @@ class Search:
         runs late. Far away, as after a fall, linear feedback means nothing.
         """
         x = samples.x[:, :-1].flatten(0, 1)
-        u, L, distance = nearest_feedback(self.system, self.guides, x, self.network.obs_std)
+        guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
+        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std)
         near, u = distance <= self.args.reach, u.clamp(-self.args.bound, self.args.bound)
         weight = torch.exp(-0.25 * (distance / (self.args.soft or 1e9)).square())
         new = samples.obs.flatten(0, 1)[near], u[near], weight[near, None, None] * torch.linalg.inv(L[near])

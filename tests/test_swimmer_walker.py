@@ -47,7 +47,7 @@ def test_swimmer_is_carried_by_its_fluid() -> None:
             for t in range(300):
                 wave = torch.sin(torch.tensor([[0.0, -lag]], dtype=REAL) + 2 * np.pi * t / 30)
                 with torch.no_grad():
-                    qpos, qvel = sim.step(qpos, qvel, 0.1 * (wave - qpos[:, 3:]) - 0.01 * qvel[:, 3:])
+                    qpos, qvel = sim.step(qpos, qvel, 0.05 * (wave - qpos[:, 3:]) - 0.005 * qvel[:, 3:])
             ends.append(qpos[0, 0].item())
     forward, vacuum, backward, still = ends
     assert forward > 1 and backward < -1 and abs(vacuum) < 0.05 and abs(still) < 0.05

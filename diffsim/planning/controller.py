@@ -30,6 +30,10 @@ class LinearGaussian(NamedTuple):
     eta: Tensor  # () the temperature of exp(-cost / eta), of which this is the I-projection
     mu: Tensor  # () regularisation of the pass that made it; 0 unless Q_uu was not positive definite
 
+    def first(self, steps: int) -> LinearGaussian:
+        """Its first steps."""
+        return self._replace(x=self.x[: steps + 1], u=self.u[:steps], K=self.K[:steps], L=self.L[:steps])
+
     def mean(self, system: Dynamics, t: int | slice, x: Tensor) -> Tensor:
         """(..., nu) at states x (..., nx) of step t, or (..., steps, nx) of a slice of steps."""
         tangent = system.difference(x, self.x[t])

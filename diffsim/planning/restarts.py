@@ -13,17 +13,17 @@ from diffsim.planning.ilqr import Cost, ilqr
 
 
 def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Generator) -> Tensor:
-    """Where to start from: (count, steps, nu) nothing, then by turns a sinusoid per motor, a random walk, white noise.
+    """Where to start from: (count, steps, nu) nothing, then by turns a wave, a random walk and white noise.
 
-    dt is the control step in seconds; rng is on the CPU, as the result.
+    The motors of a wave have one frequency of 0.5 to 8 Hz, and each its amplitude and phase. dt is the control step in seconds; rng is on the CPU, as the result.
     """
     t = dt * torch.arange(steps, dtype=REAL).view(-1, 1)
     result = [torch.zeros(steps, nu, dtype=REAL)]
     for i in range(1, count):
         amplitude = torch.rand(1, nu, generator=rng, dtype=REAL)
         if i % 3 == 1:
-            frequency, phase = torch.rand(2, 1, nu, generator=rng, dtype=REAL)
-            result.append(amplitude * torch.sin(2 * math.pi * (2.0 * frequency * t + phase)))
+            octaves, phase = 4 * torch.rand(1, generator=rng, dtype=REAL), torch.rand(1, nu, generator=rng, dtype=REAL)
+            result.append(amplitude * torch.sin(2 * math.pi * (0.5 * 2**octaves * t + phase)))
         else:
             white = torch.randn(steps, nu, generator=rng, dtype=REAL)
             result.append(amplitude * (white.cumsum(0) * dt**0.5 if i % 3 == 2 else 0.5 * white))

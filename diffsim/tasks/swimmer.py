@@ -12,7 +12,7 @@ from .base import Task
 
 
 class Swimmer(Task):
-    """qpos = (x, y, yaw, 2 joints) [m, rad]; action: 100 N m per joint."""
+    """qpos = (x, y, yaw, 2 joints) [m, rad]; action: 200 N m per joint."""
 
     name = "swimmer"
     asset = "swimmer.xml"
