@@ -102,17 +102,15 @@ class Args(Flags):
     """random action sequences from which trajectory optimisation starts; the best are kept"""
     window: Natural = 0
     """optimise first by windows of so many control steps, each a fifth of it later than the last (0: all at once)"""
-    window_iterations: Count = 8
-    """iLQR iterations of a later window"""
     guides: Count = 1
     """guiding distributions n, from as many of the best trajectories"""
     screening: Count = 40
     """iLQR iterations of all restarts"""
     ilqr_iterations: Count = 300
     """further iLQR iterations of the best"""
-    tracking: NonNegative = 0.05
-    """weight of the squared deviation from the example in the initial guiding distributions (Section 6)"""
-    spread: Positive = 1.0
+    tracking: NonNegative = 5e-4
+    """weight of the squared deviation from the example in the initial guiding distributions (Section 6; paper: 0.05)"""
+    spread: Positive = 3.0
     """standard deviation of the guiding actions, relative to the policy's: sets the temperature of exp(reward)"""
     guiding_samples: Count = 40
     """trajectories drawn from the guiding distributions"""
@@ -129,8 +127,6 @@ class Args(Flags):
     """L-BFGS iterations of the fit to the guiding samples"""
     samples: Count = 10
     """trajectories of the policy per iteration"""
-    confirmation: Count = 40
-    """further trajectories of a policy that looks better, before it is accepted"""
     active: Count = 100
     """trajectories in the active set S_k"""
     stored: Count = 300
@@ -145,16 +141,14 @@ class Args(Flags):
     """feedback: the last so many steps of a guide teach nothing, as what comes after them costs nothing"""
     bound: Positive = 2.0
     """feedback: actions before tanh that are taught are within this"""
-    lessons: Count = 40000
+    lessons: Count = 20000
     """feedback: at most so many of the states that taught, drawn anew, are in a fit"""
-    recent: bool = False
-    """feedback: the newest, not random ones"""
-    soft: NonNegative = 0.0
-    """feedback: lessons at a distance of so many standard deviations count exp(-1/2) (0: all alike)"""
-    midway: NonNegative = 0.0
-    """feedback: so many times --samples trajectories per iteration that start at states of the guides"""
-    widen: NonNegative = 0.0
-    """feedback: guiding samples with so many times their noise teach too (0: none)"""
+    robust: bool = False
+    """feedback: the absolute, not the squared error of far-off lessons"""
+    flat: bool = False
+    """feedback: errors count alike, not by the guides' covariance"""
+    timed: bool = False
+    """feedback: guiding samples teach by time"""
     step: Positive = 0.1
     """policy-gradient: length of a step along the normalised gradient"""
 
@@ -247,9 +241,8 @@ class Search:
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
         if args.variant == "feedback":
-            wide = [g._replace(L=args.widen * g.L) for g in self.guides]
-            for samples in (guiding, own, *([self.follow(wide, args.guiding_samples)] if args.widen else [])):
-                self.learn(samples)
+            self.learn(guiding)
+            self.learn(own)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides
 
@@ -267,8 +260,8 @@ class Search:
         if iteration <= args.adaptive and args.variant in GUIDED:
             active = torch.cat((active, self.adapt()))  # line 9: generate adaptive guiding samples
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
-        if better:  # its samples may have been lucky: confirm it with more
-            active = torch.cat((active, S.append(self.draw(theta, source, args.confirmation))))
+        if better:  # its samples may have been lucky: confirm it with as many again
+            active = torch.cat((active, S.append(self.draw(theta, source))))
             better, values = self.estimate(theta, active)
         metrics |= values | {"gps/accepted": float(better), "gps/regularizer": self.w_r}
         low, high = (0.0, 0.0) if args.variant == "unregularized" else args.regularizer_bounds
@@ -277,16 +270,10 @@ class Search:
             self.w_r = max(self.w_r / 10, low)  # line 13: decrease w_r
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
-            if args.variant != "feedback":
-                S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
+            if args.variant != "feedback":  # line 16: resample from theta*
+                S.append(self.draw(policy.theta, S.best))
         if args.variant == "feedback":
             metrics["gps/near"] = self.learn(S.samples.pick(slice(before, None)))
-            if args.midway:
-                x = torch.cat([guide.x[:-1] for guide in self.guides])
-                count = int(args.midway * args.samples)
-                start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
-                self.control_steps += count * args.horizon
-                self.learn(self.roll_out(theta, self.noise(count), -1, start))
         S.prune(args.stored)
         return metrics | self.metrics(self.draw(theta) if args.variant == "restart" else new)
 
@@ -388,8 +375,15 @@ class Search:
         guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
         u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std)
         near, u = distance <= self.args.reach, u.clamp(-self.args.bound, self.args.bound)
-        weight = torch.exp(-0.25 * (distance / (self.args.soft or 1e9)).square())
-        new = samples.obs.flatten(0, 1)[near], u[near], weight[near, None, None] * torch.linalg.inv(L[near])
+        if self.args.timed and not self.lessons:
+            u = torch.cat(
+                [
+                    g.mean(self.system, slice(0, len(g.u)), samples.x[samples.source == i][:, :-1])
+                    for i, g in enumerate(self.guides)
+                ]
+            ).flatten(0, 1)
+        inverse = torch.diag(1 / self.network.sigma).expand_as(L[near]) if self.args.flat else torch.linalg.inv(L[near])
+        new = samples.obs.flatten(0, 1)[near], u[near], inverse
         self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
         return near.double().mean().item()
 
@@ -399,12 +393,11 @@ class Search:
         Their covariance is eta Q_uu^-1, so that an error counts by what it costs under iLQR's value function.
         """
         index = torch.randperm(len(self.lessons[0]), generator=self.rng)[: self.args.lessons]
-        if self.args.recent:
-            index = torch.arange(len(self.lessons[0]))[-self.args.lessons :]
         obs, u, inverse = (part[index.to(part.device)] for part in self.lessons)
 
         def objective(theta: Tensor) -> Tensor:
-            return -(inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)).square().mean()
+            e = (inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)).square()
+            return -(2 * ((1 + e.sum((1, 2))).sqrt() - 1)).mean() if self.args.robust else -e.mean()
 
         self.student, value = maximise(objective, self.student, self.args.lbfgs_iterations)
         return self.student, {"gps/lessons": len(u), "gps/error": math.sqrt(-value)}
@@ -494,7 +487,7 @@ def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
             x, u = best_of_random_starts(system, search.cost, system.start()[0], u, args.guides, args.screening, show)
             if W < T:
                 x, u, _, _ = ilqr(system, search.cost, x, u, args.ilqr_iterations)
-                x, u = receding_horizon(system, search.cost, x, u, T, max(W // 5, 1), args.window_iterations, ahead)
+                x, u = receding_horizon(system, search.cost, x, u, T, max(W // 5, 1), 8, search.rng, ahead)
     except ValueError as error:
         fail(error)
     return ilqr(system, search.cost, x, u, args.ilqr_iterations, show=show)

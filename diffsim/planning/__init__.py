@@ -23,7 +23,7 @@ from diffsim.planning.ilqr import (
     ilqr,
     step_jacobian,
 )
-from diffsim.planning.restarts import best_of_random_starts, starting_actions
+from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
 
 __all__ = [
@@ -47,6 +47,7 @@ __all__ = [
     "load_demonstration",
     "maximum_entropy_controllers",
     "nearest_feedback",
+    "receding_horizon",
     "starting_actions",
     "step_jacobian",
 ]

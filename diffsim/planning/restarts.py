@@ -15,7 +15,11 @@ from diffsim.planning.ilqr import Cost, ilqr
 def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Generator) -> Tensor:
     """Where to start from: (count, steps, nu) nothing, then by turns a wave, a random walk and white noise.
 
-    The motors of a wave have one frequency of 0.5 to 8 Hz, and each its amplitude and phase. dt is the control step in seconds; rng is on the CPU, as the result.
+    The motors of a wave have one frequency of 0.5 to 8 Hz, and each its amplitude and phase.
+
+    Args:
+        dt: the control step in seconds.
+        rng: on the CPU, as the result.
     """
     t = dt * torch.arange(steps, dtype=REAL).view(-1, 1)
     result = [torch.zeros(steps, nu, dtype=REAL)]
@@ -70,29 +74,37 @@ def receding_horizon(
     steps: int,
     advance: int,
     iterations: int,
+    rng: torch.Generator,
     show: Callable[[int, Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Continues R trajectories window by window, each of which begins `advance` steps after the one before.
 
     Over a long horizon most random starts fall, and what comes after a fall has no useful gradient. A window ends soon
-    enough for a few actions to prevent the fall.
+    enough for a few actions to prevent the fall. What it adds begins with no action, the last one, the last ones
+    repeated, and noise; the cheapest of the four optima is kept.
 
     Args:
         x, u: (R, W + 1, nx), (R, W, nu) the first windows, optimised.
         steps: T, the length in the end.
-        advance: control steps of a window that are kept, at most W. What a window adds begins without action.
+        advance: control steps of a window that are kept, at most W / 2.
         iterations: of iLQR, a window.
+        rng: of the noise, on the CPU.
         show: gets the control steps done and the windows' costs (R,).
 
     Returns:
         x (R, T + 1, nx), u (R, T, nu).
     """
-    done, xs, us = 0, list[Tensor](), list[Tensor]()
-    while done + u.shape[1] < steps:
+    (R, W, nu), done, xs, us = u.shape, 0, list[Tensor](), list[Tensor]()
+    while done + W < steps:
         xs, us, done = [*xs, x[:, :advance]], [*us, u[:, :advance]], done + advance
-        actions = torch.cat((u[:, advance:], torch.zeros_like(u[:, :advance])), 1)
-        x, u, _ = system.rollout(x[:, advance], u.shape[1], lambda t, _, actions=actions: actions[:, t])  # type: ignore[misc]
-        x, u, total, _ = ilqr(system, cost, x, u, iterations)
+        noise = torch.randn(R, advance, nu, generator=rng, dtype=REAL).to(u.device)
+        ends = 0 * noise, u[:, -1:].expand(-1, advance, -1), u[:, -advance:], 0.3 * noise
+        u = torch.cat([torch.cat((u[:, advance:], end), 1) for end in ends])
+        x, u, finite = system.rollout(x[:, advance].repeat(4, 1), W, lambda t, _, u=u: u[:, t])  # type: ignore[misc]
+        plan = ilqr(system, cost, x, u, iterations)
+        total = torch.where(finite.all(1), plan.cost, math.inf).view(4, R)
+        best = total.argmin(0) * R + torch.arange(R, device=u.device)
+        x, u = plan.x[best], plan.u[best]
         if show:
-            show(done + u.shape[1], total)
+            show(done + W, plan.cost[best])
     return torch.cat((*xs, x), 1)[:, : steps + 1], torch.cat((*us, u), 1)[:, :steps]
