@@ -20,53 +20,45 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers, nearest_feedback
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
-from diffsim.planning.demonstration import follow_demonstration, load_demonstration
+from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration
 from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
 from diffsim.tasks import TASKS
-from diffsim.training import (
-    Count,
-    Finite,
-    Flags,
-    Natural,
-    NonNegative,
-    Positive,
-    Run,
-    distributed,
-    evaluate_checkpoint,
-    parse,
-)
+from diffsim.training import distributed
+from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.checkpoint import Stateful
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
+from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, parse
 from diffsim.training.lbfgs import maximise
 from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.run import Run
 
 Variant = Literal[
     "full", "feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
 ]
+LESSONS, REACH = 20_000, 0.5  # of feedback: states of a fit; standard deviations from a guide within which it teaches
 GUIDED = "full", "feedback", "unregularized"  # those with guides in S
 # fmt: off
-COLUMNS = ("horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight", "attitude_weight",
-           "hidden", "noise")
+COLUMNS = ("variant", "horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight",
+           "attitude_weight", "window", "hidden", "noise")
 PER_TASK = {
-    "cartpole":     (240, "native", 1e-3, 0.0, 0.0,   0.0, 0.0,  50, 0.10),
-    "hopper":       (500, "target", 1e-1, 1.5, 1.25, 10.0, 1.0,  50, 0.10),
-    "half_cheetah": (500, "target", 1e-1, 3.0, 0.8,   1.0, 0.1,  50, 0.10),
-    "ant":          (500, "target", 1e-2, 3.0, 0.75, 10.0, 0.1, 100, 0.10),
-    "humanoid":     (500, "target", 1e-2, 2.5, 1.3,  10.0, 0.1, 200, 0.01),
-    "swimmer":      (500, "target", 1e-1, 2.0, 0.0,   0.0, 0.0,  50, 0.10),
-    "walker":       (500, "target", 1e-1, 1.2, 1.35, 10.0, 0.0,  50, 0.10),
+    "cartpole":     ("full",     240, "native", 1e-3, 0.0, 0.0,   0.0, 0.0,  0,  50, 0.10),
+    "hopper":       ("feedback", 500, "target", 1e-1, 1.5, 1.25, 10.0, 1.0, 50,  50, 0.10),
+    "half_cheetah": ("feedback", 500, "target", 1e-1, 3.0, 0.8,   1.0, 0.1, 50,  50, 0.10),
+    "ant":          ("feedback", 500, "target", 1e-2, 3.0, 0.75, 10.0, 0.1, 50, 100, 0.10),
+    "humanoid":     ("feedback", 500, "target", 1e-2, 2.5, 1.3,  10.0, 0.1, 50, 200, 0.01),
+    "swimmer":      ("feedback", 500, "target", 1e-2, 2.0, 0.0,   0.0, 0.0, 80,  50, 0.10),
+    "walker":       ("feedback", 500, "target", 1e-1, 1.2, 1.35, 10.0, 0.0, 50,  50, 0.10),
 }
 # fmt: on
 
@@ -77,8 +69,8 @@ class Args(Flags):
 
     FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples")
 
-    variant: Variant = "full"
-    """the algorithm; with imitation of the guides' feedback as its line 7 (ours); or one of Figure 2's comparisons"""
+    variant: Variant = "feedback"
+    """the algorithm (full), after imitation of the guides' feedback (ours), or one of Figure 2's others (per task)"""
     iterations: Count = 80
     """iterations K of the policy search"""
     horizon: Count = 500
@@ -101,7 +93,7 @@ class Args(Flags):
     restarts: Count = 16
     """random action sequences from which trajectory optimisation starts; the best are kept"""
     window: Natural = 0
-    """optimise first by windows of so many control steps, each a fifth of it later than the last (0: all at once)"""
+    """plan by windows of so many control steps, each a fifth of it later than the last (0: at once; per task)"""
     guides: Count = 1
     """guiding distributions n, from as many of the best trajectories"""
     screening: Count = 40
@@ -124,7 +116,7 @@ class Args(Flags):
     noise: Positive = 0.1
     """the policy's standard deviation, relative to that of the planned actions over time (per task)"""
     pretraining: Count = 1500
-    """L-BFGS iterations of the fit to the guiding samples"""
+    """L-BFGS iterations of the fit to the guiding samples; a tenth of them for feedback's later fits"""
     samples: Count = 10
     """trajectories of the policy per iteration"""
     active: Count = 100
@@ -135,20 +127,12 @@ class Args(Flags):
     """L-BFGS iterations of each of an iteration's two optimisations"""
     regularizer_bounds: tuple[Positive, Positive] = (1e-4, 1.0)
     """w_r starts at their geometric mean and is changed by factors of ten between them"""
-    reach: Positive = 1.0
-    """feedback: states further from the guides than so many standard deviations teach nothing"""
+    imitation: Natural = 20
+    """feedback: the first so many iterations imitate the guides, the others search"""
     tail: Natural = 20
     """feedback: the last so many steps of a guide teach nothing, as what comes after them costs nothing"""
     bound: Positive = 2.0
     """feedback: actions before tanh that are taught are within this"""
-    lessons: Count = 20000
-    """feedback: at most so many of the states that taught, drawn anew, are in a fit"""
-    robust: bool = False
-    """feedback: the absolute, not the squared error of far-off lessons"""
-    flat: bool = False
-    """feedback: errors count alike, not by the guides' covariance"""
-    timed: bool = False
-    """feedback: guiding samples teach by time"""
     step: Positive = 0.1
     """policy-gradient: length of a step along the normalised gradient"""
 
@@ -156,8 +140,6 @@ class Args(Flags):
     """evaluate the best policy every this many iterations (0: only at the end)"""
     eval_episodes: Count = 50
     """trajectories of an evaluation"""
-    save_every: Natural = 10
-    """save the checkpoint every this many iterations (0: only at the end)"""
 
     def task_defaults(self) -> dict[str, Any]:
         return dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
@@ -241,7 +223,7 @@ class Search:
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
         if args.variant == "feedback":
-            self.learn(guiding)
+            self.learn(guiding.pick(slice(0, None, 8)))
             self.learn(own)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides
@@ -253,7 +235,8 @@ class Search:
             return policy_gradient(self) if args.variant == "policy-gradient" else dagger(self)
         active = S.choose(args.active, args.samples)  # line 6: choose S_k
         # line 7: theta_k <- arg max Phi
-        theta, metrics = self.imitate() if args.variant == "feedback" else self.optimise(S.samples.pick(active))
+        imitating = args.variant == "feedback" and iteration <= args.imitation
+        theta, metrics = self.imitate() if imitating else self.optimise(S.samples.pick(active))
         source, before = len(S.generators), len(S.samples.u)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
         active = torch.cat((active, S.append(new, theta)))
@@ -270,14 +253,12 @@ class Search:
             self.w_r = max(self.w_r / 10, low)  # line 13: decrease w_r
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
-            if args.variant != "feedback":  # line 16: resample from theta*
+            if not imitating:  # line 16: resample from theta*
                 S.append(self.draw(policy.theta, S.best))
-        if args.variant == "feedback":
+        if imitating:
             metrics["gps/near"] = self.learn(S.samples.pick(slice(before, None)))
         S.prune(args.stored)
         return metrics | self.metrics(self.draw(theta) if args.variant == "restart" else new)
-
-    # Trajectories
 
     def reward(self, x: Tensor, u: Tensor) -> Tensor:
         """What is optimised (Section 6): reward (...) of u (..., nu), which led to x (..., nx)."""
@@ -315,9 +296,9 @@ class Search:
         start = self.guides[0].x[:1].expand(len(noise), -1) if start is None else start
         return self.measure(*system.rollout(start, self.args.horizon, act), source)
 
-    def draw(self, theta: Tensor, source: int = -1, count: int | None = None) -> Samples:
+    def draw(self, theta: Tensor, source: int = -1) -> Samples:
         """Trajectories, --samples of them; those of the restart variant that join S start at states of the guides."""
-        count, start = count or self.args.samples, None
+        count, start = self.args.samples, None
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
         if source >= 0 and self.args.variant == "restart":
             x = torch.cat([guide.x[:-1] for guide in self.guides])
@@ -325,13 +306,10 @@ class Search:
         return self.roll_out(theta, noise, source, start)
 
     def metrics(self, samples: Samples) -> dict[str, float]:
-        return {
-            "charts/episodic_return": samples.native.sum(1).mean().item(),
-            "gps/objective": samples.returns.mean().item(),
-            "gps/objective_std": samples.returns.std(correction=0).item(),
-            "sim/nonfinite": self.nonfinite,
-            "sim/model_steps": self.plan_steps,
-        }
+        objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
+        objective["charts/episodic_return"] = samples.native.sum(1).mean()
+        counts = {"sim/nonfinite": self.nonfinite, "sim/model_steps": self.plan_steps}
+        return {name: value.item() for name, value in objective.items()} | counts
 
     def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
         """So many trajectories of guides in equal shares, numbered from the first one's source on."""
@@ -348,8 +326,6 @@ class Search:
         samples = samples._replace(reward=samples.reward.clamp(min=self.floor))
         self.guide_return = samples.returns.mean().item(), samples.returns.std(correction=0).item()
         return samples
-
-    # Lines 7, 9 and 10
 
     def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
         """Line 7, from two starts (Section 5): theta*, and theta* fitted to the sample of the highest reward."""
@@ -374,33 +350,26 @@ class Search:
         x = samples.x[:, :-1].flatten(0, 1)
         guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
         u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std)
-        near, u = distance <= self.args.reach, u.clamp(-self.args.bound, self.args.bound)
-        if self.args.timed and not self.lessons:
-            u = torch.cat(
-                [
-                    g.mean(self.system, slice(0, len(g.u)), samples.x[samples.source == i][:, :-1])
-                    for i, g in enumerate(self.guides)
-                ]
-            ).flatten(0, 1)
-        inverse = torch.diag(1 / self.network.sigma).expand_as(L[near]) if self.args.flat else torch.linalg.inv(L[near])
-        new = samples.obs.flatten(0, 1)[near], u[near], inverse
+        near, u = distance <= REACH, u.clamp(-self.args.bound, self.args.bound)
+        new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
         self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
         return near.double().mean().item()
 
     def imitate(self) -> tuple[Tensor, dict[str, float]]:
         """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides.
 
-        Their covariance is eta Q_uu^-1, so that an error counts by what it costs under iLQR's value function.
+        Their covariance is eta Q_uu^-1, so that an error counts by what it costs under iLQR's value function; beyond
+        a standard deviation linearly, because few far-off states would rule a square.
         """
-        index = torch.randperm(len(self.lessons[0]), generator=self.rng)[: self.args.lessons]
+        index = torch.randperm(len(self.lessons[0]), generator=self.rng)[:LESSONS]
         obs, u, inverse = (part[index.to(part.device)] for part in self.lessons)
 
         def objective(theta: Tensor) -> Tensor:
-            e = (inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)).square()
-            return -(2 * ((1 + e.sum((1, 2))).sqrt() - 1)).mean() if self.args.robust else -e.mean()
+            e = inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)
+            return 1 - (1 + e.square().sum((1, 2))).sqrt().mean()
 
-        self.student, value = maximise(objective, self.student, self.args.lbfgs_iterations)
-        return self.student, {"gps/lessons": len(u), "gps/error": math.sqrt(-value)}
+        self.student, value = maximise(objective, self.student, self.args.pretraining // 10)
+        return self.student, {"gps/lessons": len(u), "gps/error": -value}
 
     def adapt(self) -> Tensor:
         """Line 9: guides of exp(reward / eta) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
@@ -436,14 +405,6 @@ class Search:
             "gps/guide_nats": -log_w[guided, -1].mean().item() if self.S.initial else math.nan,
         }
 
-    def save_plan(self, path: Path) -> None:
-        """The best plan, as a --demonstration."""
-        guide, nq = self.guides[0], self.system.nq
-        qpos, qvel, action = (t.cpu().numpy() for t in (guide.x[:, :nq], guide.x[:, nq:], guide.u.tanh()))
-        np.savez(path, qpos=qpos, qvel=qvel, action=action)
-
-    # Checkpoints
-
     def state_dict(self) -> dict[str, Any]:
         state = {name: getattr(self, name) for name in self.NUMBERS} | {"rng": self.rng.get_state()}
         guides, adapted = ([tuple(guide) for guide in guides] for guides in (self.guides, self.adapted))
@@ -453,10 +414,10 @@ class Search:
         for name in self.NUMBERS:
             setattr(self, name, state[name])
         device = self.system.device
-        self.guides, self.adapted = (
-            [LinearGaussian(*(tensor.to(device) for tensor in guide)) for guide in state[name]]
-            for name in ("guides", "adapted")
+        stored = (
+            [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[key]] for key in ("guides", "adapted")
         )
+        self.guides, self.adapted = stored
         self.lessons = tuple(tensor.to(device) for tensor in state["lessons"])
         self.student = state["student"].to(device)
         self.rng.set_state(state["rng"])
@@ -473,21 +434,18 @@ def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
         if iteration % 10 == 9:
             say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
 
-    def ahead(done: int, costs: Tensor) -> None:
-        if done % 50 < max(args.window // 5, 1):
-            say(f"planned {done} steps ahead: cost of the window {costs.min():.2f}, {len(costs)} trajectories")
+    def ahead(end: int, costs: Tensor) -> None:
+        say(f"planning, window up to step {end}: cost {costs.min():.2f}")
 
     try:
         if args.demonstration:
             example = load_demonstration(system, args.demonstration, T)
             x, u = follow_demonstration(system, *example, args.tracking)
         else:
-            W = min(args.window or T, T)
-            u = starting_actions(args.restarts, W, system.nu, system.control_dt, search.rng).to(system.device)
+            first = min(args.window or T, T)
+            u = starting_actions(args.restarts, first, system.nu, system.control_dt, search.rng).to(system.device)
             x, u = best_of_random_starts(system, search.cost, system.start()[0], u, args.guides, args.screening, show)
-            if W < T:
-                x, u, _, _ = ilqr(system, search.cost, x, u, args.ilqr_iterations)
-                x, u = receding_horizon(system, search.cost, x, u, T, max(W // 5, 1), 8, search.rng, ahead)
+            x, u = receding_horizon(system, search.cost, x, u, T, max(first // 5, 1), 8, search.rng, ahead)
     except ValueError as error:
         fail(error)
     return ilqr(system, search.cost, x, u, args.ilqr_iterations, show=show)
@@ -542,14 +500,10 @@ class Policy(nn.Module):
         draws = [scale * torch.randn(size, generator=rng) for scale, size in zip(scales, self.sizes, strict=True)]
         return torch.cat(draws).to(self.sigma)
 
-    def standard(self, obs: Tensor) -> Tensor:
-        """(..., obs_dim) as the network sees them."""
-        return (obs - self.obs_mean) / self.obs_std
-
     def mean(self, theta: Tensor, obs: Tensor) -> Tensor:
         """(..., nu) of obs (..., obs_dim)."""
         w1, b1, w2, b2 = (w.view(shape) for w, shape in zip(theta.split(self.sizes), self.shapes, strict=True))
-        hidden = F.softplus(F.linear(self.standard(obs), w1, b1))
+        hidden = F.softplus(F.linear((obs - self.obs_mean) / self.obs_std, w1, b1))
         return self.u_mean + self.u_std * F.linear(hidden, w2, b2)
 
     def log_prob(self, theta: Tensor, obs: Tensor, u: Tensor) -> Tensor:
@@ -726,8 +680,8 @@ def evaluate(search: Search) -> Evaluation:
     distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
     speed = (distance / (lengths * system.control_dt)).mean().item() if travels(system.scene) else None
     qpos, action = S.x[:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
-    others = dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
-    others |= dict(without_noise=without_noise, plan=search.plan_return, guides=search.guide_return[0])
+    others = dict(without_noise=without_noise, plan=search.plan_return, guides=search.guide_return[0])
+    others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
     return Evaluation(returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
 
 
@@ -736,7 +690,7 @@ def train(args: Args) -> None:
     search = run.restore(Search(args, run.make_eval_env()))
     if run.iteration == 0:
         run.log(search.prepare(run.message), search.control_steps)
-        search.save_plan(run.directory / "plan.npz")
+        save_demonstration(search.system, search.guides[0].x, search.guides[0].u, run.directory / "plan.npz")
     for iteration in run:  # lines 5 to 18
         run.log(search.iterate(iteration), search.control_steps)
         if run.evaluation_due:

@@ -48,16 +48,21 @@ import gps  # noqa: E402
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
-# What a run is called, and its flags: Figure 2's variants, adaptive guides of Section 4.2, and wider guides
+# What a run is called, and its flags: Figure 2's variants, adaptive guides of Section 4.2, what feedback consists of,
+# and fewer samples
 CASES: dict[str, str] = {variant: f"--variant {variant}" for variant in get_args(gps.Variant)}
-CASES |= {"adaptive": "--adaptive 40", "wide": "--spread 3", "feedback-wide": "--variant feedback --spread 3"}
+CASES |= {"adaptive": "--variant full --adaptive 10 --adaptive-iterations 10"}
+ABLATIONS = {"only": "--imitation 1000", "unbounded": "--bound 100", "tail": "--tail 0", "narrow": "--spread 1"}
+ABLATIONS |= {"stiff": "--tracking 0.05", "few": "--samples 4 --guiding-samples 10 --active 40"}
+CASES |= {f"feedback-{name}": f"--variant feedback {flags}" for name, flags in ABLATIONS.items()}
+FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
+PLAN = "--ilqr-iterations 40 --demonstration benchmarks/plans/"
 # What docs/gps.md shows, per task: seeds, cases, flags
 SUITE: dict[str, tuple[tuple[int, ...], tuple[str, ...], str]] = {
-    "cartpole": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
-    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
-    "swimmer": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
-    "walker": ((1, 2, 3, 4, 5), tuple(CASES), "--iterations 80"),
-    "ant": ((1, 2, 3), ("full", "feedback"), "--iterations 80 --horizon 100"),
+    "cartpole": ((1, 2, 3, 4, 5), tuple(FIGURE_2), "--iterations 60"),
+    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), f"--iterations 30 {PLAN}hopper.npz"),
+    "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--iterations 40 {PLAN}walker.npz"),
+    "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--iterations 30 {PLAN}swimmer.npz"),
 }
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
@@ -65,7 +70,7 @@ KEPT = (  # columns of progress.csv
     "gps_guides gps_guides_std gps_fit eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
-PLANNED = "full", "feedback"  # cases whose generalisation and samples are compared
+PLANNED = "full", "feedback"  # cases whose generalisation is measured
 TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (250, 400)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
 COLOURS = {case: f"C{i}" for i, case in enumerate(CASES)}
@@ -146,8 +151,8 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 
-def train(directory: Path, flags: Sequence[str]) -> str:
-    """Trains, or resumes, or finds that it is done; returns what there is to say."""
+def train(directory: Path, flags: Sequence[str], count: int) -> str:
+    """Trains, or resumes, or finds that it is done, and perturbs; returns what there is to say."""
     path, (env, case, seed) = directory / "checkpoint.pt", directory.name.split("__")
     start = ["--env", env, *CASES[case].split(), "--seed", seed]
     if path.exists():
@@ -158,7 +163,13 @@ def train(directory: Path, flags: Sequence[str]) -> str:
     command = [sys.executable, str(ROOT / "gps.py"), *start, "--run-dir", str(directory), "--threads", "1", *flags]
     with (directory.parent / f"{directory.name}.log").open("a") as log:
         code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT).returncode
-    return f"{directory.name}: {'done' if code == 0 else f'exit code {code}, see {log.name}'}"
+    if code:
+        return f"{directory.name}: exit code {code}, see {log.name}"
+    if case in PLANNED:
+        search = load_search(path)
+        write_csv(directory / "generalisation.csv", generalisation(search, count))
+        write_csv(directory / "paths.csv", paths(search))
+    return f"{directory.name}: done"
 
 
 def jobs(args: Args) -> dict[str, list[str]]:
@@ -174,7 +185,7 @@ def jobs(args: Args) -> dict[str, list[str]]:
 def train_all(args: Args) -> None:
     args.runs.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(args.jobs) as pool:
-        for text in pool.map(lambda job: train(args.runs / job[0], job[1]), jobs(args).items()):
+        for text in pool.map(lambda job: train(args.runs / job[0], job[1], args.count), jobs(args).items()):
             print(text, flush=True)
 
 
@@ -288,13 +299,8 @@ def collect(args: Args) -> None:
         for row in read_csv(directory / "progress.csv"):
             kept = {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT}
             tables["runs"].append(run | dict(horizon=horizon) | kept)
-        if run["variant"] in PLANNED and (directory / "checkpoint.pt").is_file():
-            if not (directory / "generalisation.csv").is_file():
-                search = load_search(directory / "checkpoint.pt")
-                write_csv(directory / "generalisation.csv", generalisation(search, args.count))
-                write_csv(directory / "paths.csv", paths(search))
-            for name in ("generalisation", "paths"):
-                tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
+        for name in ("generalisation", "paths"):
+            tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
     first: dict[str, tuple[str, ...]] = {}  # one run a task is drawn, every fourth step
     drawn = [
         r for r in tables["paths"] if (r["variant"], r["seed"]) == first.setdefault(r["env"], (r["variant"], r["seed"]))

@@ -12,7 +12,7 @@ from diffsim.planning.controller import (
     nearest_feedback,
 )
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
-from diffsim.planning.demonstration import follow_demonstration, load_demonstration
+from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration
 from diffsim.planning.dynamics import REAL, Dynamics
 from diffsim.planning.ilqr import (
     Cost,
@@ -48,6 +48,7 @@ __all__ = [
     "maximum_entropy_controllers",
     "nearest_feedback",
     "receding_horizon",
+    "save_demonstration",
     "starting_actions",
     "step_jacobian",
 ]

@@ -37,6 +37,12 @@ def load_demonstration(system: Dynamics, path: Path, steps: int) -> tuple[Tensor
     return x, torch.atanh(arrays["action"].clamp(-0.995, 0.995))[:steps].to(system.device)
 
 
+def save_demonstration(system: Dynamics, x: Tensor, u: Tensor, path: Path) -> None:
+    """Writes a trajectory x (T + 1, nx), u (T, nu) as load_demonstration reads it."""
+    qpos, qvel, action = (part.cpu().numpy() for part in (x[:, : system.nq], x[:, system.nq :], u.tanh()))
+    np.savez_compressed(path, qpos=qpos, qvel=qvel, action=action)
+
+
 def follow_demonstration(system: Dynamics, x: Tensor, u: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """A trajectory of the system that tracks an example x (T + 1, nx), u (T, nu), which it need not reproduce.
 
