@@ -674,7 +674,7 @@ def evaluate(search: Search) -> Evaluation:
     noise[0] = 0.0
     rollouts = search.roll_out(search.network.theta, noise)
     (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
-    fallen = system.task.terminated(system.observe(S.x[:, 1:])).int()
+    fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & search.args.early_termination).int()
     alive = fallen.cumsum(1) - fallen == 0
     returns, lengths, x = (S.native * alive).sum(1), alive.sum(1), S.x[..., 0]
     distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]

@@ -358,9 +358,13 @@ class MBPO:
         # A part of the observation may be the action before, which stays as it was.
         obs = made.obs + observe(start, 0 * action) - observe(state, 0 * made.action)
         next_obs = observe(end, action)
-        reward, terminated = task.reward(next_obs, action) * finite, task.terminated(next_obs) | ~finite
+        reward, terminated = task.reward(next_obs, action) * finite, self.failed(next_obs) | ~finite
         parts = Transition(obs, action, reward, next_obs, terminated.to(reward.dtype))
         return Transition(*(x.flatten(0, 1) for x in parts))
+
+    def failed(self, obs: Tensor) -> Tensor:
+        """Whether an observation (..., obs_dim) ends its episode."""
+        return self.env.task.terminated(obs) & self.args.early_termination
 
     # Models ----------------------------------------------------------------------------------------------------------
 
@@ -395,7 +399,7 @@ class MBPO:
     @torch.no_grad()
     def imagine(self) -> dict[str, Tensor]:
         """Rollouts of the elites with the policy, branched from real states; one that ends is followed by another."""
-        args, task, models = self.args, self.env.task, self.models
+        args, models = self.args, self.models
         least, most = args.rollout_lengths
         length = (least + (most - least) * (2 * models.fits / args.iterations).clamp(max=1.0)).floor()
         obs = self.real.sample(args.elites * args.branches).obs
@@ -407,7 +411,7 @@ class MBPO:
             action, _ = self.actor(seen)
             change, reward = models.predict(seen, action)
             next_obs = obs + change
-            terminated = task.terminated(next_obs)
+            terminated = self.failed(next_obs)
             self.imagined.add(Transition(obs, action, reward, next_obs, terminated.to(reward.dtype)))
             over = terminated | (age >= length)
             obs = torch.where(over.unsqueeze(1), self.real.sample(len(obs)).obs, next_obs)

@@ -104,7 +104,7 @@ class Args(ParallelFlags):
     resampling_noise: NonNegative = 1.0
     """a particle lands within this many standard deviations of the one that it copies"""
     dead: Fraction = 0.05
-    """a particle is dead if its weight stayed below this share of 1 / particles since the last resampling"""
+    """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
     estimator: Estimator = "implicit"
     """gradient of a sampled action, with shac and sac: only straight-through is biased (docs/pfpn.md)"""
     density_floor: NonNegative = 0.01
@@ -354,9 +354,8 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
 
 
 class Resampling(nn.Module):
-    """Keeps which particles have had weight, and moves the others to those (section 3.3). Works in place."""
+    """Keeps the particles' mean weights, and moves those without weight to others (section 3.3). Works in place."""
 
-    largest: Tensor
     total: Tensor
     age: Tensor
     moved: Tensor
@@ -364,8 +363,7 @@ class Resampling(nn.Module):
     def __init__(self, args: Args, head: Head) -> None:
         super().__init__()
         self.args, self.active = args, args.policy == "pfpn"  # the other policies have nothing to move
-        self.register_buffer("largest", torch.zeros(head.shape))  # weight since the last resampling
-        self.register_buffer("total", torch.zeros(head.shape))  # of the weights since then
+        self.register_buffer("total", torch.zeros(head.shape))  # of the weights since the last resampling
         self.register_buffer("age", torch.zeros((), dtype=torch.int64))  # iterations
         self.register_buffer("moved", torch.zeros(()))  # particles, ever
         if self.active and (wrong := [k for k in args.log_particles if k >= head.shape[0]]):
@@ -374,9 +372,7 @@ class Resampling(nn.Module):
     def record(self, acting: Mixture) -> None:
         """Take the weights (..., m, n) with which the policy acts."""
         if self.active:
-            weight = acting.logits.detach().softmax(-1).flatten(0, -3)
-            torch.maximum(self.largest, weight.amax(0), out=self.largest)
-            self.total += weight.sum(0)
+            self.total += acting.logits.detach().softmax(-1).flatten(0, -3).sum(0)
 
     @torch.no_grad()
     def end_iteration(self, head: Head, optimizer: ClippedAdam) -> dict[str, Tensor]:
@@ -387,11 +383,9 @@ class Resampling(nn.Module):
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
         due = self.age % self.args.resampling_interval == 0
-        largest = self.largest.copy_(distributed.stack(self.largest).amax(0))  # ranks decide alike
-        total = distributed.average(self.total)
-        dead = largest < self.args.dead / head.shape[1]  # Eq. 8
-        dead &= ~dead.all(-1, keepdim=True)  # nothing recorded
+        total = distributed.average(self.total)  # ranks decide alike
         weight = total / total.sum(-1, keepdim=True)
+        dead = weight < self.args.dead / head.shape[1]  # Eq. 8, of the mean; none where nothing was recorded
         if self.args.resampling != "none":
             chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
             self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))
@@ -405,8 +399,7 @@ class Resampling(nn.Module):
         for name, values in (("loc", loc), ("weight", weight)):
             for k in self.args.log_particles:
                 found |= {f"particles/{name}_{k}_{i}": value for i, value in enumerate(values[k].unbind())}
-        for seen in (self.largest, self.total):
-            seen *= ~due
+        self.total *= ~due
         return found
 
     def move(self, head: Particles, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:

@@ -29,7 +29,6 @@ from diffsim.tasks import TASKS, Task
 from diffsim.training import (
     ClippedAdam,
     Count,
-    Evaluation,
     Flags,
     NonNegative,
     ObsNormalizer,
@@ -70,8 +69,6 @@ class Args(Flags):
     """learning iterations (per order)"""
     order: Literal[1, 2] = 1
     """of the improvement: 1 follows the gradient of the return, 2 takes Gauss-Newton steps (iLQR)"""
-    early_termination: bool = True
-    """end episodes where the robot falls, as the task says; action sequences have one length, so it must be off"""
     num_envs: Count = 32
     """action sequences N of an iteration (per order)"""
     horizon: Count = 50
@@ -112,7 +109,7 @@ class Args(Flags):
             fail("one process alone: sequences are not shared among ranks")
         if task.timed:
             fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
-        if self.early_termination and task.min_height is not None:
+        if self.early_termination and task.falls():
             fail(f"{self.env} ends episodes early, and all sequences have one length: give --no-early-termination")
         if task.episode_length % self.horizon:
             fail(f"--horizon {self.horizon} does not divide the {task.episode_length} control steps of an episode")
@@ -238,7 +235,6 @@ class PODS:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        env.early_termination = args.early_termination
         self.actor = Actor(args, env.task.obs_dim, env.scene.nu).to(env.device)
         self.policy = self.actor.deterministic()
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.lr)
@@ -342,7 +338,6 @@ class PODS:
 def train(args: Args) -> None:
     run = Run(args)
     env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
-    eval_env.early_termination = args.early_termination
     pods = run.restore(PODS(args, env))
     improve, imitate = run.capture(pods.improve), run.capture(pods.imitate)
     for _ in run:
@@ -351,15 +346,10 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, pods.policy))
 
 
-def assess(pods: PODS) -> Evaluation:
-    """The policy in the environments of --evaluate, which end as those of training."""
-    return evaluate(pods.env, pods.policy)
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:
-        evaluate_checkpoint(args, PODS, assess)
+        evaluate_checkpoint(args)
     else:
         train(args)
 

@@ -28,8 +28,9 @@ from diffsim.training.flags import check_ranges
 
 RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
 OUTPUT = ROOT / "runs" / "benchmarks"
-TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu"]
-TASKS: tuple[TaskName, ...] = get_args(TaskName)  # of the SHAC paper
+TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu", "humanoid_imitation"]
+LEARNT: tuple[TaskName, ...] = get_args(TaskName)
+TASKS = LEARNT[:-1]  # of the SHAC paper
 Tasks = Annotated[tuple[TaskName, ...], tyro.conf.arg(aliases=["--env-id"])]
 F = TypeVar("F", bound="CommonFlags")
 
@@ -84,6 +85,23 @@ class CommonFlags:
         name = name if everywhere or self.directory.name == "cpu" else f"{name}_{self.directory.name}"
         if self.update_results and f"<!-- {name} -->" in (DOCS / page).read_text():
             tables.fill(DOCS / page, name, text)
+
+
+@dataclass
+class CheckpointFlags(CommonFlags):
+    """Of benchmarks of saved policies, which say their task."""
+
+    checkpoints: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
+    ] = ()
+    env: tyro.conf.Suppress[Tasks] = TASKS
+
+    @property
+    def measured(self) -> tuple[Path, ...]:
+        """Those to measure: none with --draw-only. Without any the benchmark ends with one line."""
+        if not (self.checkpoints or self.draw_only):
+            fail("of what? give a checkpoint or the directory of a run")
+        return () if self.draw_only else self.checkpoints
 
 
 class Case(NamedTuple):
@@ -151,7 +169,7 @@ def measured(
         for row in measure(args, env):
             print("  " + ", ".join(f"{column} {tables.digits(value)}" for column, value in row.items()), flush=True)
             args.merge(name, [row], key)
-    return sorted(args.read(name), key=lambda row: TASKS.index(row["task"].split()[0]))
+    return sorted(args.read(name), key=lambda row: LEARNT.index(row["task"].split()[0]))
 
 
 Numbers = Sequence[float] | np.ndarray

@@ -12,11 +12,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import common
 import torch
-import tyro
 from common import Line, Panel, parse, plot
 from tables import markdown
 from torch import Tensor
@@ -36,11 +34,7 @@ KEY = ("task", "learner", "horizon", "stiffness")
 
 
 @dataclass
-class Args(common.CommonFlags):
-    checkpoints: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
-    ] = ()
-    env: tyro.conf.Suppress[common.Tasks] = common.TASKS
+class Args(common.CheckpointFlags):
     num_envs: Count = 256  # environments
     horizons: tuple[Count, ...] = (4, 8, 16, 32, 64)  # control steps of a window
     warmup: Count = 100  # control steps before it
@@ -51,10 +45,8 @@ def grounds(env: DiffEnv) -> dict[str, Tensor]:
     """Factors (len(FACTORS),) of the firm constants, by the name of the ground."""
     soft = torch.tensor([soft_factors(env.scene).get(name, 1.0) for name in FACTORS])
     found = {}
-    for (
-        name,
-        share,
-    ) in GROUNDS.items():  # a limit's damping, which is none where it is soft, goes with the share, as in Variation
+    # A limit's damping, which is none where it is soft, goes with the share, as in Variation.
+    for name, share in GROUNDS.items():
         found[name] = torch.where(soft > 0, soft.clamp(min=1e-30) ** (1 - share), share)
     varied = torch.tensor([name in VARIED["stiffness"] for name in FACTORS])
     return found | {f"{FIRMER:g} x firm": torch.where(varied, FIRMER, 1.0)}
@@ -128,11 +120,9 @@ def measure(path: Path, args: Args) -> None:
 
 
 def main(args: Args) -> None:
-    if not (args.checkpoints or args.draw_only):
-        fail("of what? give a checkpoint or the directory of a run")
     if args.num_envs % GROUPS:
         fail(f"--num-envs {args.num_envs} is not a multiple of {GROUPS}, the groups that are compared")
-    for path in () if args.draw_only else args.checkpoints:
+    for path in args.measured:
         measure(path, args)
     rows = args.read("gradients")
     tasks = [name for name in common.TASKS if any(row["task"] == name for row in rows)]

@@ -23,7 +23,7 @@ from typing import Literal
 
 import common
 import numpy as np
-from common import TASKS, Line, Panel, TaskName, plot
+from common import LEARNT, TASKS, Line, Panel, TaskName, Tasks, plot
 from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, parse, passing, seed, summary
 from tables import ROOT, Row, markdown, read_csv
 
@@ -42,6 +42,7 @@ RETURNS: dict[TaskName, tuple[int, tuple[int, ...], dict[str, int]]] = {
     "ant":          (5000, (5000, 7300, 7661), {"shac": 7661, PPO: 6605}),
     "humanoid":     (5000, (5000, 7000, 8387), {"shac": 8387, PPO: 7293}),
     "humanoid_mtu": (4246, (4246, 6114, 6964), {"shac": 6114, PPO: 4246}),
+    "humanoid_imitation": (500, (),            {}),
 }
 # The best published of any learner, timed for SAPO: AHAC's (Georgiev et al. 2024).
 RECORDS: dict[TaskName, int] = {"ant": 9313, "humanoid": 9845}
@@ -54,8 +55,9 @@ FIRM = ("--contact", "firm")
 SHAC_FIRM = ("shac", *FIRM, "--num-envs", "256")
 PPO_MANY_FIRM = (PPO, *FIRM, *PPO_MANY[3:-2], "--iterations", "1200")
 SAC = "sac_baseline"
-PFPN_PPO = ("pfpn", "--algorithm", "ppo")
-PFPN_SHAC = ("pfpn", "--algorithm", "shac")
+PFPN_PPO = ("pfpn", "--algorithm", "ppo", *PPO_MANY[1:-2], "--iterations", "1200")
+PFPN_SHAC = ("pfpn", "--algorithm", "shac", "--accuracy", "fast")
+PFPN_SAC = ("pfpn", "--algorithm", "sac")
 PRESETS = {  # what the trade of accuracy for speed does to learning
     "shac_fast":           ("shac", "--accuracy", "fast"),
     "shac_accurate":       ("shac", "--accuracy", "accurate"),
@@ -94,9 +96,10 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
     "se_mbpo":            ("mbpo", "--sample-enhance", "4"),
     "pfpn_ppo":           PFPN_PPO,
     "pfpn_shac":          PFPN_SHAC,
-    "pfpn_sac":           ("pfpn", "--algorithm", "sac"),
-    "pfpn_gaussian_ppo":  (*PFPN_PPO, "--policy", "gaussian"),
+    "pfpn_sac":           PFPN_SAC,
+    **{f"pfpn_{p}_ppo":   (*PFPN_PPO, "--policy", p) for p in ("gaussian", "gmm", "discrete")},
     "pfpn_gaussian_shac": (*PFPN_SHAC, "--policy", "gaussian"),
+    "pfpn_gaussian_sac":  (*PFPN_SAC, "--policy", "gaussian"),
     **{f"pfpn_{how}":     (*PFPN_PPO, "--resampling", how) for how in ("uniform", "none")},
     **{f"pfpn_{n}":       (*PFPN_PPO, "--particles", str(n)) for n in (5, 10, 100)},
     "sapo":               SAPO,
@@ -116,7 +119,7 @@ LEARNERS: dict[str, tuple[str, ...]] = {  # script and flags
 }
 Name = Literal[
     "comparison", "environments", "entropy", "horizon", "general", "deterministic", "accuracy", "muscles", "records",
-    "ablation", "firm", "orders", "off_policy", "models", "particles", "resampling",
+    "ablation", "firm", "orders", "off_policy", "models", "particles", "resampling", "imitation",
 ]
 EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  # the others are compared with the first
     "comparison":    ("Figures 4 and 7: the learners", ("shac", PPO, "bptt", "shac_no_critic"), TASKS),
@@ -141,8 +144,11 @@ EXPERIMENTS: dict[Name, tuple[str, tuple[str, ...], tuple[TaskName, ...]]] = {  
     "models":        ("MBPO and SE-MBPO", ("shac", "mbpo", "se_mbpo"), ("cartpole", "ant")),
     "orders":        ("PODS of first and second order", ("pods", "pods_second", "shac", "bptt"), ("cartpole",)),
     "particles":     ("PFPN and a Gaussian policy, by PPO, through the simulator's gradient and off-policy",
-                      ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac"),
+                      ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_shac", "pfpn_gaussian_shac", "pfpn_sac",
+                      "pfpn_gaussian_sac"),
                       ("hopper", "ant", "humanoid")),
+    "imitation":     ("Imitation by the four policies", ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_gmm_ppo",
+                      "pfpn_discrete_ppo", "pfpn_shac", "pfpn_gaussian_shac"), ("humanoid_imitation",)),
     "resampling":    ("PFPN by PPO: its 35 particles, others, and other ways to resample them", ("pfpn_ppo",
                       "pfpn_uniform", "pfpn_none", "pfpn_5", "pfpn_10", "pfpn_100"), ("hopper", "ant", "humanoid")),
     "muscles":       ("humanoid_mtu", ("shac", "shac_256", "shac_1024"), ("humanoid_mtu",)),
@@ -168,6 +174,7 @@ PAGES = {"muscles": ("humanoid_mtu", MUSCLE_COLUMNS), "orders": ("pods", ORDER_C
 
 @dataclass
 class Args(ScriptFlags):
+    env: Tasks = LEARNT  # tasks
     algorithm: str = "shac"  # learner: a script in the repository's root, without .py, or a variant, e.g. shac_1024
     experiment: Name | None = None  # several learners beside each other, among them those of the paper's Figures 4 to 9
     seeds: tuple[int, ...] = (1, 2, 3)  # seeds of each
@@ -183,11 +190,12 @@ def collect(args: Args, learner: str, env: TaskName) -> None:
         returns = np.array([float(row.get("return") or "nan") for row in rows])
         if np.isnan(returns).all():
             continue
+        columns = (*COLUMNS, *(name for name in rows[0] if name.startswith("models_")))
         keep = {*np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).round().astype(int)}
         keep |= {np.nanargmax(returns), *np.flatnonzero(returns >= RETURNS[env][0])[:1]}
         keep |= {k for k, row in enumerate(rows) if row.get("eval_return")}
         for row in (rows[k] for k in sorted(keep)):
-            points.append({"seed": seed(folder)} | {c: row.get(c) and f"{float(row[c]):.6g}" or "" for c in COLUMNS})
+            points.append({"seed": seed(folder)} | {c: row.get(c) and f"{float(row[c]):.6g}" or "" for c in columns})
     args.write(f"{learner}_{env}", points)
     records = {RECORDS[env]} if learner.startswith("sapo") and env in RECORDS else set()
     if found := summary(args.runs / learner, env, sorted({*RETURNS[env][1]} | records)):
@@ -233,6 +241,21 @@ def table(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> lis
             row |= {"target": target, "steps to target": "never" if steps == math.inf else f"{steps / 1e6:.3g} M"}
             words = "" if math.isnan(seconds) else "never" if seconds == math.inf else f"{seconds:.0f}"
             rows.append(row | {"s to target": words})
+    return rows
+
+
+def ratios(args: Args, tasks: Sequence[TaskName]) -> list[Row]:
+    """Of PFPN and the Gaussian policy, by each algorithm: the best return within control steps that all runs made."""
+    rows = list[Row]()
+    for env, algorithm in product(tasks, ("ppo", "shac", "sac")):
+        both = [curves(args, f"{policy}_{algorithm}", env) for policy in ("pfpn", "pfpn_gaussian")]
+        if all(both):
+            end = min(run["control_steps"][-1] for runs in both for run in runs)
+            best = [[np.nanmax(run["return"][run["control_steps"] <= end]) for run in runs] for runs in both]
+            row: dict[str, object] = {"task": env, "algorithm": algorithm, "control steps": f"{end / 1e6:.3g} M"}
+            for policy, values in zip(("PFPN", "Gaussian"), best, strict=True):
+                row[policy] = f"{mean(values):.0f} ± {pstdev(values):.0f}" if len(values) > 1 else f"{values[0]:.0f}"
+            rows.append(row | {"PFPN / Gaussian": f"{mean(best[0]) / mean(best[1]):.2f}"})
     return rows
 
 
@@ -286,13 +309,16 @@ def report(args: Args, name: Name) -> None:
         args.publish("results", markdown(rows, columns), f"{page}.md", everywhere)
         return draw(args, page, learners, tasks)
     rows = table(args, learners, tasks)
-    args.publish(name, f"{markdown(rows)}\n![{title}]({args.link(name)})\n", "experiments.md")
+    of_particles = name in ("particles", "resampling", "imitation")
+    beside = f"{markdown(ratios(args, tasks))}\n" if of_particles else ""
+    page = "pfpn.md" if of_particles else "experiments.md"
+    args.publish(name, f"{markdown(rows)}\n{beside}![{title}]({args.link(name)})\n", page)
     if compared := [env for env in tasks if env in {row["task"] for row in rows}]:
         draw(args, name, learners, compared)
 
 
 def main(args: Args) -> None:
-    _, learners, tasks = EXPERIMENTS[args.experiment] if args.experiment else ("", (args.algorithm,), TASKS)
+    _, learners, tasks = EXPERIMENTS[args.experiment] if args.experiment else ("", (args.algorithm,), LEARNT)
     scripts = {learner: LEARNERS.get(learner, (learner,)) for learner in learners}
     if missing := [script for script, *_ in scripts.values() if not (ROOT / f"{script}.py").is_file()]:
         fail(f"no script {missing[0]}.py in {ROOT}")
@@ -311,9 +337,9 @@ def main(args: Args) -> None:
         report(args, args.experiment)
     else:
         rows = [row for row in args.read("learning") if row["learner"] == args.algorithm]
-        rows.sort(key=lambda row: TASKS.index(row["task"]))
+        rows.sort(key=lambda row: LEARNT.index(row["task"]))
         args.publish("results", markdown(rows, RESULT_COLUMNS), LEARNER_PAGES.get(args.algorithm, "experiments.md"))
-        draw(args, args.algorithm, learners, [env for env in TASKS if curves(args, args.algorithm, env)])
+        draw(args, args.algorithm, learners, [env for env in LEARNT if curves(args, args.algorithm, env)])
 
 
 if __name__ == "__main__":

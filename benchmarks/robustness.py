@@ -23,19 +23,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import common
 import mujoco
 import numpy as np
 import torch
-import tyro
 from common import Case, Line, Panel, load_case, parse, plot
 from tables import digits, markdown
 from torch import Tensor
 
 import diffsim
 from diffsim import DiffEnv, Scene, Simulator
+from diffsim.tasks import HumanoidImitation
 from diffsim.training import Count, NonNegative, Positive, fail
 from diffsim.training.evaluation import SEED
 
@@ -53,11 +53,7 @@ COLUMNS = ("task", "learner", "contact", "seed", "mass", "forward N", "sideways 
 
 
 @dataclass
-class Args(common.CommonFlags):
-    checkpoints: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
-    ] = ()
-    env: tyro.conf.Suppress[common.Tasks] = common.TASKS
+class Args(common.CheckpointFlags):
     num_envs: Count = 64  # robots that begin to walk
     body: str = ""  # the pushed one, by its name in the MJCF (default: the robot's first)
     after: Positive = 3.0  # s from the beginning of the push in which a robot falls, or has survived
@@ -72,6 +68,7 @@ class State(NamedTuple):
     qpos: Tensor  # (n, nq)
     qvel: Tensor  # (n, nv)
     action: Tensor  # (n, nu) the last one, which some tasks observe
+    step: Tensor  # (n,) int64 control step of the task's own time
 
 
 class Walkers:
@@ -97,12 +94,12 @@ class Walkers:
     def walk(self, seconds: float, force: Tensor | None = None, pushed: int = 0) -> Iterator[tuple[State, Tensor]]:
         """The state after each control step, and who has fallen by then (n,); force (n, 3) acts in the first steps."""
         state, fallen = self.start, torch.zeros(len(self.start.qpos), dtype=torch.bool, device=self.sim.device)
-        obs = self.task.observe(*state)
+        obs = self.task.observe_at(*state)
         for step in range(self.steps(seconds)):
             self.sim.forces[:, self.body, :3] = force if force is not None and step < pushed else 0.0
             action = self.policy(obs).clamp(-1.0, 1.0)
-            state = State(*self.sim.step(state.qpos, state.qvel, action), action)
-            obs = self.task.observe(*state)
+            state = State(*self.sim.step(state.qpos, state.qvel, action), action, state.step + 1)
+            obs = self.task.observe_at(*state)
             fallen = fallen | self.task.terminated(obs) | self.sim.nonfinite
             yield state, fallen
 
@@ -120,13 +117,14 @@ def starts(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> State
     """The states of those that still walk after a time of their own within WALK."""
     env.reset(seed=SEED)
     no_action = torch.zeros(env.num_envs, env.scene.nu, dtype=env.dtype, device=env.device)
-    walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action))
+    walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action, env.first_step))
     first, last = map(walkers.steps, WALK)
     at = torch.randint(first, last + 1, (env.num_envs,), generator=torch.Generator().manual_seed(SEED)).to(env.device)
-    found, standing = walkers.start, torch.zeros_like(at, dtype=torch.bool)
+    found, standing = State(*(part.clone() for part in walkers.start)), torch.zeros_like(at, dtype=torch.bool)
     for step, (state, fallen) in enumerate(walkers.walk(WALK[1]), 1):
         now = at == step
-        found = State(*(torch.where(now[:, None], a, b) for a, b in zip(state, found, strict=True)))
+        for part, new in zip(found, state, strict=True):
+            part[now] = new[now]
         standing |= now & ~fallen
     return State(*(part[standing] for part in found))
 
@@ -179,8 +177,10 @@ def load(path: Path, args: Args) -> tuple[Case, int]:
     scene, name = case.env.scene, case.env.task.name
     if "contact" not in scene.features:
         fail(f"{case.path} was trained on {name}, which stands on no ground")
-    if case.env.task.min_height is None:
+    if not case.env.task.falls():
         fail(f"{case.path} was trained on {name}, whose episodes do not end with a fall")
+    if isinstance(case.env.task, HumanoidImitation) and not case.env.task.clip.loop:
+        fail(f"{case.path} tracks a motion that ends, and with it the episode: train with a loop")
     body = mujoco.mj_name2id(scene.mj_model, mujoco.mjtObj.mjOBJ_BODY, args.body) if args.body else 1
     if body < 1:
         names = ", ".join(scene.mj_model.body(k).name for k in range(1, scene.nbody))
@@ -269,9 +269,7 @@ def table(rows: list[dict[str, str]]) -> str:
 
 
 def main(args: Args) -> None:
-    if not (args.checkpoints or args.draw_only):
-        fail("of what? give a checkpoint or the directory of a run")
-    for case, body in [] if args.draw_only else [load(path, args) for path in args.checkpoints]:
+    for case, body in [load(path, args) for path in args.measured]:
         print(f"{case.label}: {case.env.task.name}, {case.saved.script}.py", flush=True)
         measure(case, body, args)
     if rows := args.read("robustness_curves"):

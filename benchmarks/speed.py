@@ -5,6 +5,7 @@
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
     python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
     python benchmarks/speed.py --parts contact                an iteration of SHAC on soft and on firm ground
+    python benchmarks/speed.py --parts policies --env ant     an iteration of pfpn.py with each policy
     python benchmarks/speed.py --parts scene                  links, spheres, limits, dampers, springs, balls, muscles
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
@@ -17,6 +18,7 @@ import dataclasses
 import gc
 import importlib.util
 import json
+import math
 import os
 import subprocess
 import sys
@@ -46,6 +48,9 @@ from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
 from diffsim.training.assess import make_env
 
+sys.path.append(str(ROOT))
+import pfpn  # noqa: E402
+
 SETTING = integration("semi_implicit", 16)
 LINKS = 16  # of the chain to which everything but links is added
 PARTS = {  # counts, the feature that is code of its own, and what gives it to a joint, without a force
@@ -64,7 +69,7 @@ MUSCLE = (  # from a link to the next
 )
 Precision = Literal["float32", "float64"]
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
-Part = Literal["physics", "scaling", "training", "time", "contact", "scene"]
+Part = Literal["physics", "scaling", "training", "time", "contact", "policies", "scene"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; larger settings of the scaling table are left out
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
@@ -335,6 +340,28 @@ def measure_contact(args: Args, name: TaskName) -> Iterator[Row]:
     yield row | {"firm / soft": times["firm"] / times["soft"]}
 
 
+def measure_policies(args: Args, name: TaskName) -> Iterator[Row]:
+    """An iteration of pfpn.py with each policy, each half captured and timed alone, beside a Gaussian's."""
+    for algorithm, learner_class in pfpn.ALGORITHMS.items():
+        policies = ("gaussian", "pfpn", "gmm", *(["discrete"] if algorithm == "ppo" else []))
+        gaussian = math.nan
+        for policy in policies:
+            flags = ["--env", name, "--device", args.device, "--algorithm", algorithm, "--policy", policy]
+            settings = parse_script(pfpn.Args, flags)
+            gc.collect()  # the policy before
+            if args.device != "cpu":
+                torch.cuda.reset_peak_memory_stats()
+            env = make_env(settings, settings.num_envs, settings.horizon)
+            learner = learner_class(settings, env)
+            calls = [graph.capture(learner.interact, env.device, env), graph.capture(learner.learn, env.device)]
+            ms = sum(1e3 * median(timed(call, env.device, warmup=4, calls=20)) for call in calls)
+            gaussian = ms if policy == "gaussian" else gaussian
+            row: dict[str, object] = {"task": name, "algorithm": algorithm, "policy": policy}
+            row |= {"environments": settings.num_envs, "iteration, ms": ms, "of the Gaussian's": ms / gaussian}
+            memory = torch.cuda.max_memory_allocated() / 2**20 if args.device != "cpu" else ""
+            yield row | {"torch's peak memory, MiB": memory}
+
+
 def run_shac(cache: str, directory: Path, arguments: list[str]) -> tuple[float, float]:
     """Seconds from the start of shac.py to the end of its first iteration, and its peak memory in MiB."""
     command = [sys.executable, str(ROOT / "shac.py"), "--run-dir", str(directory), "--quiet", *arguments]
@@ -456,7 +483,9 @@ MEASURES: dict[str, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, 
     "training": (measure_training, ("task", "environments", "device")),
     "time": (measure_time, ("task",)),
     "contact": (measure_contact, ("task",)),
+    "policies": (measure_policies, ("task", "algorithm", "policy")),
 }
+PAGES: dict[Part, str] = {"contact": "transfer.md", "policies": "pfpn.md"}
 
 
 def main(args: Args) -> None:
@@ -464,7 +493,7 @@ def main(args: Args) -> None:
         report_scene(args)
     for part in (part for part in args.parts if part != "scene"):
         rows = measured(args, "time" if part == "time" else f"speed_{part}", *MEASURES[part])
-        args.publish(part, markdown(rows), "transfer.md" if part == "contact" else "experiments.md")
+        args.publish(part, markdown(rows), PAGES.get(part, "experiments.md"))
         if part == "scaling" and rows:
             draw(args, rows)
 

@@ -26,12 +26,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
-from typing import Annotated
 
 import common
 import numpy as np
 import torch
-import tyro
 import worlds
 from common import Case, Line, Panel, load_case, parse, plot
 from tables import Row, digits, markdown
@@ -50,11 +48,7 @@ STYLES = {"here": "C0-", "control": "C1--", "MuJoCo x1": "C2-"}
 
 
 @dataclass
-class Args(common.CommonFlags):
-    checkpoints: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
-    ] = ()
-    env: tyro.conf.Suppress[common.Tasks] = common.TASKS
+class Args(common.CheckpointFlags):
     episodes: Count = 64  # start states, the same in every world
     steps: Count = 1000  # control steps at most
     friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # of MuJoCo, in multiples of the file's mu
@@ -279,8 +273,7 @@ def panels(label: str, env: DiffEnv, motions: dict[str, Motion]) -> list[Panel]:
 
 
 def main(args: Args) -> None:
-    if not (args.checkpoints or args.draw_only):
-        fail("of what? give a checkpoint or the directory of a run")
+    paths = args.measured
     if args.video:
         if len(args.checkpoints) != 1:
             fail("--video shows one checkpoint")
@@ -291,9 +284,8 @@ def main(args: Args) -> None:
             fail(f"--video: {error}")
     if (args.video or args.curves) and 1.0 not in args.friction:
         fail("--video and --curves show MuJoCo at the file's friction: give --friction 1 as well")
-    cases = [] if args.draw_only else [load(path, args) for path in args.checkpoints]
     grid = list[list[Panel]]()
-    for case in cases:
+    for case in [load(path, args) for path in paths]:
         print(f"{case.label}: {case.saved.args['env']}, {case.saved.script}.py", flush=True)
         motions = compare(case, args)
         if args.video:

@@ -22,6 +22,8 @@ from diffsim.tasks import TASKS
 Array = NDArray[np.float64]
 
 ROBOTS = [name for name in TASKS if TASKS[name].asset == f"{name}.xml"]  # one task of each
+# Together these have every feature of a task's robot: a kernel takes seconds to compile.
+DISTINCT = ("half_cheetah", "humanoid", "humanoid_mtu", "swimmer")
 
 # A free sphere of 2 kg; it falls, rolls, slides and rests.
 BALL = """

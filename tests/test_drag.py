@@ -45,9 +45,14 @@ BALL = """
 </mujoco>"""
 
 
-@pytest.fixture(params=ROOTS)
-def fish(request):
-    return parse(FISH.format(root=ROOTS[request.param]))
+def fish(root):
+    return parse(FISH.format(root=ROOTS[root]))
+
+
+# The integrator is nothing to the drag, and each kernel takes seconds to compile.
+every_kind = pytest.mark.parametrize(
+    "root, integrator", [*((root, "semi_implicit") for root in ROOTS), ("floating", "implicit")]
+)
 
 
 def states_of(scene, rng):
@@ -55,30 +60,32 @@ def states_of(scene, rng):
     return qpos, 2 * qvel, ctrl
 
 
-def test_accelerations_are_mujocos(fish, rng):
-    model, data = fish.mj_model, mujoco.MjData(fish.mj_model)
-    states = states_of(fish, rng)
-    for state, qacc in zip(zip(*states, strict=True), acceleration(fish, *states), strict=True):
+@pytest.mark.parametrize("root", ROOTS)
+def test_accelerations_are_mujocos(root, rng):
+    scene = fish(root)
+    model, data, states = scene.mj_model, mujoco.MjData(scene.mj_model), states_of(scene, rng)
+    for state, qacc in zip(zip(*states, strict=True), acceleration(scene, *states), strict=True):
         data.qpos[:], data.qvel[:], data.ctrl[:] = state
         mujoco.mj_forward(model, data)
         assert np.abs(data.qfrc_fluid).min() > 1e-3
         np.testing.assert_allclose(qacc, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
 
 
-@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
-def test_steps_are_the_references(fish, integrator, rng):
-    states = states_of(fish, rng)
-    integration = Integration(integrator, 4)
-    q, v = run(fish, *states, integration=integration)
+@every_kind
+def test_steps_are_the_references(root, integrator, rng):
+    scene, integration = fish(root), Integration(integrator, 4)
+    states = states_of(scene, rng)
+    q, v = run(scene, *states, integration=integration)
     for e, state in enumerate(zip(*states, strict=True)):
-        expected = reference.step(fish, *state, 1 / 60, integration)
+        expected = reference.step(scene, *state, 1 / 60, integration)
         np.testing.assert_allclose(q[e], expected[0], atol=1e-10)
         np.testing.assert_allclose(v[e], expected[1], atol=1e-10)
 
 
-@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
-def test_gradient_is_that_of_differences(fish, integrator, rng):
-    check_gradients(fish, states_of(fish, rng), rng, integration=Integration(integrator, 8))
+@every_kind
+def test_gradient_is_that_of_differences(root, integrator, rng):
+    scene = fish(root)
+    check_gradients(scene, states_of(scene, rng), rng, integration=Integration(integrator, 8))
 
 
 def test_gradient_at_rest_is_the_viscous_one(rng):

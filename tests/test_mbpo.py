@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from learners import read_progress, refusal, run
+from learners import assert_same, read_progress, refusal, run
+from problems import Problem, assert_bandit_learnt, assert_system_controlled
 from test_scripts import Waits
 from torch import Tensor
 from torch.distributions import Normal, TransformedDistribution
@@ -78,40 +78,13 @@ def test_elites_predict_and_no_others() -> None:
     torch.testing.assert_close(reward, own + 37.0, atol=2e-3, rtol=0)
 
 
-class Problem:
-    """An environment without simulator, whose optimum is known; of the linear one the models can learn the noise."""
-
-    device, num_envs, episode_length = torch.device("cpu"), 20, 10**9
-    scene = SimpleNamespace(nu=1)
-    sim = SimpleNamespace(nonfinite_gradients=torch.zeros(20, dtype=torch.int32))
-
-    def __init__(self, bandit: bool) -> None:
-        self.bandit, self.x = bandit, torch.zeros(20, 1)
-        self.task = SimpleNamespace(obs_dim=1, terminated=lambda obs: torch.full((len(obs),), bandit))
-
-    def detach(self) -> Tensor:
-        return self.x
-
-    def step(self, action: Tensor) -> tuple[Any, ...]:
-        """The bandit pays for a = 0.3; the linear system x' = 0.8 x + a + noise costs x^2 + a^2."""
-        no = torch.zeros(20, dtype=torch.bool)
-        if self.bandit:
-            reward, next_obs, terminated = -4 * (action - 0.3).square().squeeze(1), self.x, ~no
-        else:
-            reward = -(self.x.square() + action.square()).squeeze(1)
-            next_obs, terminated = 0.8 * self.x + action + 0.3 * torch.randn(20, 1), no
-        self.x = next_obs
-        info = {"final_obs": next_obs, "nonfinite": no, "episode": {"r": reward, "l": torch.ones(20)}}
-        return next_obs, reward, terminated, no, info
-
-
 def learner_of(bandit: bool, flags: str, monkeypatch: pytest.MonkeyPatch) -> mbpo.MBPO:
     monkeypatch.setattr(mbpo, "episode_metrics", lambda *_: {})
     torch.manual_seed(0)
     common = "--hidden 32 32 --model-hidden 32 32 --num-envs 20 --steps 8 --batch-size 128 --actor-lr 3e-3"
     common += " --gamma 0.9 --temperature-lr 1e-12 --tau 0.05 --model-lr 3e-3 --model-updates 20"
     common += " --model-batch-size 64 --branches 50"
-    learner = build(*common.split(), *flags.split(), env=Problem(bandit))
+    learner = build(*common.split(), *flags.split(), env=Problem(bandit, 20))
     for _ in range(10):
         learner.explore()
     return learner
@@ -190,6 +163,15 @@ def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatc
         torch.testing.assert_close(rows.next_obs, rows.obs + 1)
         torch.testing.assert_close(rows.terminated, (rows.obs == 2).squeeze(1).float())
         torch.testing.assert_close(rows.reward, rows.action.squeeze(1))
+
+
+def test_without_early_termination_no_rollout_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = learner_of(False, "--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5", monkeypatch)
+    learner.env.task.terminated = lambda obs: torch.ones_like(obs[:, 0], dtype=torch.bool)
+    for early in (True, False):
+        learner.args.early_termination = early
+        learner.imagine()
+        assert (learner.imagined.split(learner.imagined.rows).terminated == early).all()
 
 
 def test_the_mixture_has_its_share_of_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -328,24 +310,11 @@ def learnt(bandit: bool, temperature: float, iterations: int, monkeypatch: pytes
 
 
 def test_a_bandit_is_learnt_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The soft optimum is proportional to exp(r / alpha): here the Gaussian of mean 0.3 and variance alpha / 8."""
-    learner = learnt(True, 0.05, 60, monkeypatch)
-    action, _ = learner.actor(torch.zeros(4000, 1))
-    assert action.mean().item() == pytest.approx(0.3, abs=0.05)
-    assert action.std().item() == pytest.approx(math.sqrt(0.05 / 8), rel=0.25)
+    assert_bandit_learnt(learnt(True, 0.05, 60, monkeypatch).actor, 0.05, 0.05)
 
 
 def test_a_linear_quadratic_system_is_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The optimal gain is that of the discounted Riccati equation; entropy shows more actions."""
-    learner = learnt(False, 0.1, 80, monkeypatch)
-    p = 1.0
-    for _ in range(200):
-        p = 1 + 0.9 * 0.64 * p - (0.9 * 0.8 * p) ** 2 / (1 + 0.9 * p)
-    gain = 0.9 * 0.8 * p / (1 + 0.9 * p)
-    x = torch.linspace(-0.6, 0.6, 13).unsqueeze(1)
-    action = learner.policy(x).detach()
-    slope = ((x * action).sum() / x.square().sum()).item()
-    assert slope == pytest.approx(-gain, rel=0.2)
+    assert_system_controlled(learnt(False, 0.1, 80, monkeypatch).policy)
 
 
 # Runs -----------------------------------------------------------------------------------------------------------------
@@ -371,10 +340,7 @@ def test_a_run_resumes_bitwise_with_its_buffers(enhance: str, tmp_path: Path) ->
     whole = run(mbpo, tmp_path / "whole", *flags.split())
     run(mbpo, tmp_path / "part", *flags.split(), "--stop-after", 5)
     part = run(mbpo, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
-    for name, module in whole["modules"].items():
-        for key, value in module.items():
-            other = part["modules"][name][key]
-            assert torch.equal(value, other) if isinstance(value, Tensor) else str(value) == str(other), (name, key)
+    assert_same(part["modules"], whole["modules"])
     sizes = [len(whole["modules"][name]["_extra_state"]) for name in ("real", "unseen", "imagined")]
     assert sizes == [300 if enhance == "2" else 192, 30, 400]
     first, *_, last = read_progress(tmp_path / "part")

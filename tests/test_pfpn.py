@@ -207,17 +207,20 @@ def test_resampling_leaves_the_policy_as_it_is(algorithm: str, resampling: str) 
     assert alone.any() and all(torch.equal(x[alone], was[alone]) for x, was in zip(views, old, strict=True))
     for moment, was in zip(moments, old_moments, strict=True):
         assert not moment[dead].any() and was[dead].any() and torch.equal(moment[~dead], was[~dead])
-    assert not moving.largest.any() and not moving.total.any()
+    assert not moving.total.any()
 
 
 def test_weights_below_the_threshold_bound_the_change() -> None:
-    """Of particles that are almost dead the policy changes, in total variation, by no more than their weight."""
+    """Of particles that are almost dead the policy changes, in total variation, by no more than their weight.
+
+    Their mean weight counts: in some state each has more than the threshold.
+    """
     own, moving, optimizer, features = head()
-    kill(own, [(0, 1), (1, 2), (1, 3)], bias=-6.0)
+    kill(own, [(0, 1), (1, 2), (1, 3)], bias=-3.3)
     before = own(features)
     moving.record(before)
     lost = before.log_weight.exp()[:, [0, 1, 1], [1, 2, 3]]
-    assert lost.max() < 0.05 / 6 and lost.min() > 1e-7
+    assert lost.mean(0).max() < 0.05 / 6 < lost.amax(0).min()
     x = torch.linspace(-12, 12, 20_001, dtype=torch.float64)
     densities = []
     for _ in range(2):
@@ -267,7 +270,7 @@ def test_nothing_is_moved(case: str, flags: str, dead: int) -> None:
     before = [x.clone() for x in state]
     metrics = moving.end_iteration(own, optimizer)
     assert all(torch.equal(x, was) for x, was in zip(state, before, strict=True))
-    assert moving.moved == 0 and bool(moving.largest.any()) == (case == "not due")
+    assert moving.moved == 0 and bool(moving.total.any()) == (case == "not due")
     assert metrics["particles/dead"].item() == pytest.approx(dead / 18)
 
 

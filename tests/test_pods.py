@@ -18,7 +18,7 @@ from torch import Tensor
 import diffsim
 import pods
 from diffsim.simulator import Simulator
-from diffsim.training import parse
+from diffsim.training import export_policy, parse
 
 SMALL = (
     "--env cartpole --num-envs 3 --horizon 80 --iterations 6 --candidates 4 --batch-size 100 --hidden 16 --device cpu "
@@ -271,8 +271,10 @@ def test_tasks_without_early_termination(tmp_path: Path, capsys: pytest.CaptureF
         "--env ant --no-early-termination --num-envs 2 --horizon 4 --iterations 2 --hidden 16 --candidates 2 --quiet"
     )
     run(pods, tmp_path, *flags.split(), "--eval-every", 0, "--eval-episodes", 2, "--stop-after", 1)
-    pods.main(["--evaluate", str(tmp_path / "checkpoint.pt"), "--no-finer", "--eval-episodes", "2"])
-    assert "length 1000.0" in capsys.readouterr().out
+    export_policy(tmp_path / "checkpoint.pt", tmp_path / "policy.pt")
+    for name in ("checkpoint.pt", "policy.pt"):
+        pods.main(["--evaluate", str(tmp_path / name), "--no-finer", "--eval-episodes", "2"])
+        assert "length 1000.0" in capsys.readouterr().out
 
 
 REFUSED: list[tuple[str, str]] = [

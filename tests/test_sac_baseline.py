@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from learners import refusal, run
+from learners import assert_same, refusal, run
+from problems import Problem, assert_bandit_learnt, assert_system_controlled
 from torch import Tensor
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
@@ -99,39 +98,12 @@ def test_targets_and_losses(redq: bool, monkeypatch: pytest.MonkeyPatch) -> None
     torch.testing.assert_close(losses[1], 0.3 * (8 - density.mean().detach()))
 
 
-class Problem:
-    """An environment without simulator, whose soft optimum is known."""
-
-    device, num_envs, episode_length = torch.device("cpu"), 16, 10**9
-    scene = SimpleNamespace(nu=1)
-    task = SimpleNamespace(obs_dim=1)
-    sim = SimpleNamespace(nonfinite_gradients=torch.zeros(16, dtype=torch.int32))
-
-    def __init__(self, bandit: bool) -> None:
-        self.bandit, self.x = bandit, torch.zeros(16, 1)
-
-    def detach(self) -> Tensor:
-        return self.x
-
-    def step(self, action: Tensor) -> tuple[Any, ...]:
-        """The bandit pays for a = 0.3; the linear system x' = 0.8 x + a + noise costs x^2 + a^2."""
-        no = torch.zeros(16, dtype=torch.bool)
-        if self.bandit:
-            reward, next_obs, terminated = -4 * (action - 0.3).square().squeeze(1), self.x, ~no
-        else:
-            reward = -(self.x.square() + action.square()).squeeze(1)
-            next_obs, terminated = 0.8 * self.x + action + 0.3 * torch.randn(16, 1), no
-        self.x = next_obs
-        info = {"final_obs": next_obs, "nonfinite": no, "episode": {"r": reward, "l": torch.ones(16)}}
-        return next_obs, reward, terminated, no, info
-
-
 def learnt(bandit: bool, temperature: float, iterations: int, monkeypatch: pytest.MonkeyPatch) -> sac.SAC:
     monkeypatch.setattr(sac, "episode_metrics", lambda *_: {})
     torch.manual_seed(0)
     rates = f"--actor-lr 3e-3 --critic-lr 3e-3 --temperature-lr 1e-12 --initial-temperature {temperature} --gamma 0.9"
     flags = "--hidden 32 32 --num-envs 16 --steps 8 --batch-size 128 --tau 0.05 --buffer-size 5000"
-    learner = build(*rates.split(), *flags.split(), env=Problem(bandit))
+    learner = build(*rates.split(), *flags.split(), env=Problem(bandit, 16))
     for _ in range(10):
         learner.explore()
     for _ in range(iterations):
@@ -140,24 +112,11 @@ def learnt(bandit: bool, temperature: float, iterations: int, monkeypatch: pytes
 
 
 def test_a_bandit_is_learnt_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The soft optimum is proportional to exp(r / alpha): here the Gaussian of mean 0.3 and variance alpha / 8."""
-    learner = learnt(True, 0.05, 60, monkeypatch)
-    action, _ = learner.actor(torch.zeros(4000, 1))
-    assert action.mean().item() == pytest.approx(0.3, abs=0.03)
-    assert action.std().item() == pytest.approx(math.sqrt(0.05 / 8), rel=0.25)
+    assert_bandit_learnt(learnt(True, 0.05, 60, monkeypatch).actor, 0.05, 0.03)
 
 
 def test_a_linear_quadratic_system_is_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The optimal gain is that of the discounted Riccati equation; entropy shows more actions."""
-    learner = learnt(False, 0.1, 300, monkeypatch)
-    p = 1.0
-    for _ in range(200):
-        p = 1 + 0.9 * 0.64 * p - (0.9 * 0.8 * p) ** 2 / (1 + 0.9 * p)
-    gain = 0.9 * 0.8 * p / (1 + 0.9 * p)
-    x = torch.linspace(-0.6, 0.6, 13).unsqueeze(1)
-    action = learner.policy(x).detach()
-    slope = ((x * action).sum() / x.square().sum()).item()
-    assert slope == pytest.approx(-gain, rel=0.2)
+    assert_system_controlled(learnt(False, 0.1, 75, monkeypatch).policy)
 
 
 def test_a_run_resumes_bitwise_with_its_buffer(tmp_path: Path) -> None:
@@ -166,10 +125,7 @@ def test_a_run_resumes_bitwise_with_its_buffer(tmp_path: Path) -> None:
     whole = run(sac, tmp_path / "whole", *flags.split())
     run(sac, tmp_path / "part", *flags.split(), "--stop-after", 5)
     part = run(sac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
-    for name, module in whole["modules"].items():
-        for key, value in module.items():
-            other = part["modules"][name][key]
-            assert torch.equal(value, other) if isinstance(value, Tensor) else str(value) == str(other), (name, key)
+    assert_same(part["modules"], whole["modules"])
     assert whole["modules"]["buffer"]["_extra_state"].shape[0] == 100
 
 

@@ -5,7 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from scenes import CRANE, ROBOTS, leg_scene, parse, task_scene
+from scenes import CRANE, DISTINCT, ROBOTS, leg_scene, parse, task_scene
+
+
+def test_distinct_robots_have_every_feature() -> None:
+    some, every = (set().union(*(task_scene(name).features for name in names)) for names in (DISTINCT, ROBOTS))
+    assert some == every
 
 
 @pytest.mark.parametrize("name", ROBOTS)

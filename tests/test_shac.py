@@ -142,7 +142,7 @@ def test_learning_rates_decay_linearly() -> None:
     [
         "--num-envs 1 --horizon 1",
         "--num-envs 3 --horizon 5 --critic-minibatches 7 --deterministic-policy --general-hyperparameters",
-        "--num-envs 2 --integrator implicit --substeps 2 --eval-every 2 --threads 1",
+        "--num-envs 2 --integrator extrapolated --substeps 2 --eval-every 2 --threads 1",
     ],
 )
 def test_unusual_settings_train(arguments: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

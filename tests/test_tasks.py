@@ -341,6 +341,11 @@ def test_camera_follows_the_robot(name: str) -> None:
 # The tasks, each against a loop over the environments
 
 
+def test_which_robots_cannot_fall() -> None:
+    standing = {name for name, task in TASKS.items() if not task.falls()}
+    assert standing == {"cartpole", "half_cheetah", "swimmer", "walker"}
+
+
 @every_task
 def test_sizes(name: str) -> None:
     task, model = TASKS[name], load(name)

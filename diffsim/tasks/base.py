@@ -99,6 +99,11 @@ class Task:
             raise ValueError(f"task {cls.name!r} has no firm contact; choose soft")
         return cls.firm.penalty
 
+    @classmethod
+    def falls(cls) -> bool:
+        """Whether episodes end where the robot falls, and not by their time alone."""
+        return cls.min_height is not None or cls.terminated is not Task.terminated
+
     @property
     def mirror(self) -> Mirror:
         """How the task looks with left and right exchanged.

@@ -36,6 +36,7 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **opti
             contact=args.contact,
             penalty=parse_penalty(args.penalty),
             threads=args.threads or None,
+            early_termination=args.early_termination,
             clip=args.clip,
             **options,
         )

@@ -89,6 +89,8 @@ class SimulatorFlags:
     """constants of contact and limits (docs/transfer.md): the paper's, or such as another simulator agrees with"""
     penalty: tuple[str, ...] = ()
     """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
+    early_termination: bool = True
+    """end episodes where the robot falls, as the task says; otherwise only their time ends them"""
     clip: ClipFile = None
     """motion that humanoid_imitation tracks (docs/imitation.md): an .npz file, or the name of a shipped one"""
     threads: Natural = 0

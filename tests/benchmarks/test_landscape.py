@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import landscape
 import numpy as np
 import pytest
 import torch
+from runner import parse
 from tables import read_csv
 
 import diffsim
@@ -67,11 +67,15 @@ def test_rewards_after_the_end_of_an_episode_do_not_count(
     assert look.losses("bptt", look.make_env(1, 1), {}).tolist() == [-(1 + 3 + 2) / 8]
 
 
-def test_the_command_trains_measures_and_draws(tmp_path: Path) -> None:
+def test_the_command_trains_measures_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(landscape, "WARMUP", 2)
     flags = "--env cartpole --iterations 2 --trajectories 2 --points 5 --side 3 --horizon 40 --device cpu".split()
-    command = [sys.executable, landscape.__file__, *flags, "--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]
-    result = subprocess.run(command, check=True, capture_output=True, text=True)
+    places = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [landscape.__file__, *flags, *places])
+    landscape.main(parse(landscape.Args, None))
     for name, count in (("gradients", 1), ("weight", 5), ("surface", 9)):
         assert len(read_csv(tmp_path / f"landscape_cartpole_{name}.csv")) == count
         assert (tmp_path / f"landscape_cartpole_{name}.png").stat().st_size > 5_000
-    assert "landscape_cartpole_surface.png" in result.stdout
+    assert "landscape_cartpole_surface.png" in capsys.readouterr().out

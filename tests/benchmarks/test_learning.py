@@ -36,6 +36,19 @@ def write_run(folder: Path, returns: np.ndarray, steps: int, seconds: float, fin
         writer.writerows(rows)
 
 
+def test_curves_keep_the_errors_of_models(tmp_path: Path) -> None:
+    write_run(tmp_path / "mbpo" / "ant__1", np.arange(3.0), 16, 0.5)
+    path = tmp_path / "mbpo" / "ant__1" / "progress.csv"
+    header, *lines = path.read_text().splitlines()
+    text = [header + ",models_mse,losses_actor", *(f"{line},0.{k},7" for k, line in enumerate(lines))]
+    path.write_text("\n".join(text))
+    args = learning.Args(runs=tmp_path, output=tmp_path / "results")
+    learning.collect(args, "mbpo", "ant")
+    rows = args.read("mbpo_ant")
+    assert list(rows[0]) == ["seed", *runner.COLUMNS, "models_mse"]
+    assert [row["models_mse"] for row in rows] == ["0", "0.1", "0.2"]
+
+
 def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SHAC passes 5,000 at iteration 501, PPO at 2,501 of ten times the steps; BPTT never, and has not finished."""
     runs, output = tmp_path / "runs", tmp_path / "results" / "cpu"
@@ -70,6 +83,27 @@ def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.Mon
     assert (shac["return"], shac["explicit, substeps x4"], shac["in the reference"]) == ("7090", "6990", "6990")
     assert (shac["kept"], shac["falls per episode"]) == ("0.986", "0.50 0.50")
     assert shac["return passes"] == "5000 after 250 s; 7300 not; 7661 not"
+
+
+def test_policies_are_compared_within_the_control_steps_that_all_made(tmp_path: Path) -> None:
+    """At 3,100 steps, where a Gaussian run ends: 30 and 60 of PFPN, 15 and 30 of the Gaussian policy."""
+    for policy, slopes in {"pfpn": (1.0, 2.0), "pfpn_gaussian": (0.5, 1.0)}.items():
+        for seed, slope in enumerate(slopes):
+            count = 31 if (policy, seed) == ("pfpn_gaussian", 1) else 50
+            write_run(tmp_path / f"{policy}_ppo" / f"ant__{seed}", slope * np.arange(float(count)), 100, 0.5)
+    write_run(tmp_path / "pfpn_sac" / "ant__1", np.arange(9.0), 100, 0.5)
+    args = learning.Args(runs=tmp_path, output=tmp_path)
+    for learner in ("pfpn_ppo", "pfpn_gaussian_ppo", "pfpn_sac"):
+        learning.collect(args, learner, "ant")
+    (row,) = learning.ratios(args, ("ant", "hopper"))
+    assert row == {
+        "task": "ant",
+        "algorithm": "ppo",
+        "control steps": "0.0031 M",
+        "PFPN": "45 ± 15",
+        "Gaussian": "22 ± 8",
+        "PFPN / Gaussian": "2.00",
+    }
 
 
 def test_runs_that_shared_their_machine_have_no_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

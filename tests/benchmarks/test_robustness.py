@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 import robustness
 import torch
-from common import parse
+from common import Case, parse
 from learners import refusal
 from scenes import parse as scene_of
 from tables import read_csv
 from torch import Tensor
 
 import diffsim
-from diffsim import DiffEnv, Integration
-from diffsim.tasks.base import Task
+from diffsim import Clip, DiffEnv, Integration, read_clip
+from diffsim.tasks import Task
+from diffsim.training import SavedPolicy
+from diffsim.training.evaluation import SEED
 
 POLICIES = Path(diffsim.__file__).parent / "policies"
 # A puck of 2 kg in space, and a cart of 3 kg from which a pendulum of 2 kg hangs.
@@ -59,7 +61,7 @@ def pucks() -> robustness.Walkers:
     scene = scene_of(PUCK)
     env = DiffEnv(Puck(), scene, 1, integration=Integration(substeps=4))
     qpos = torch.tensor(scene.qpos0).float().expand(3, -1)
-    state = robustness.State(qpos, torch.zeros(3, 6), torch.zeros(3, 0))
+    state = robustness.State(qpos, torch.zeros(3, 6), torch.zeros(3, 0), torch.zeros(3, dtype=torch.int64))
     return robustness.Walkers(env, lambda obs: torch.zeros(len(obs), 0), 1, state)
 
 
@@ -99,7 +101,8 @@ def test_what_nothing_fells() -> None:
 def test_a_cube_meets_the_mass_behind_the_trunk() -> None:
     """Neither cart nor bob resists a push on the other one: the rod between them is upright."""
     scene = scene_of(CART)
-    state = robustness.State(torch.zeros(2, 2), torch.tensor([[4.0, 0.0], [-1.0, 0.0]]), torch.zeros(2, 0))
+    qvel = torch.tensor([[4.0, 0.0], [-1.0, 0.0]])
+    state = robustness.State(torch.zeros(2, 2), qvel, torch.zeros(2, 0), torch.zeros(2, dtype=torch.int64))
     hit = robustness.target(scene, state, 1)
     np.testing.assert_allclose(hit.mass, 3.0, rtol=1e-5)
     np.testing.assert_allclose(hit.velocity, [4.0, -1.0])
@@ -107,6 +110,44 @@ def test_a_cube_meets_the_mass_behind_the_trunk() -> None:
     # Of 6 kg against 3 at 5 m/s together: all of it moves on at 4 - 10 / 3 m/s. The other one is out of reach.
     np.testing.assert_allclose(robustness.impulse(hit, 6.0, 1.0, 0.0), [-10.0, 0.0], rtol=1e-5)
     np.testing.assert_allclose(robustness.impulse(hit, 6.0, 1.0, 1.0), [-20.0, 0.0], rtol=1e-5)
+
+
+class Clock(Puck):
+    """Observes the time, which starts anywhere within 100 control steps, and falls at 190."""
+
+    num_random, timed = 1, True
+
+    def first_step(self, rand: Tensor) -> Tensor:
+        return (100 * rand[..., 0]).long()
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        raise ValueError
+
+    def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
+        return torch.stack((step, qvel[..., 0]), -1)
+
+    def terminated(self, obs: Tensor) -> Tensor:
+        return obs[..., 0] == 190
+
+
+def test_a_timed_task_keeps_its_clock() -> None:
+    """Robots start at the phases of an evaluation, and are pushed at those that they have reached."""
+    env, seen = DiffEnv(Clock(), scene_of(PUCK), 64, integration=Integration(substeps=4)), list[Tensor]()
+
+    def policy(obs: Tensor) -> Tensor:
+        seen.append(obs[:, 0].long())
+        return torch.zeros(len(obs), 0)
+
+    first = env.reset(seed=SEED)[0][:, 0].long()
+    state = robustness.starts(env, policy, 1)
+    assert torch.equal(torch.stack(seen), first + torch.arange(240)[:, None])
+    reached = first + torch.randint(120, 241, (64,), generator=torch.Generator().manual_seed(SEED))
+    assert torch.equal(state.step, reached[reached < 190]) and 5 < len(state.step) < 60
+    walkers = robustness.Walkers(env, policy, 1, state)
+    for _ in range(2):  # a push after the other
+        seen.clear()
+        walkers.endure(0.1, torch.zeros(3), 1)
+        assert torch.equal(torch.stack(seen), state.step + torch.arange(6)[:, None])
 
 
 def test_the_command_writes_pushes_and_curves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,3 +182,18 @@ def test_what_cannot_be_pushed_over(arguments: str, message: str, capsys: pytest
     args = parse(robustness.Args, None, arguments.split())
     args.checkpoints = tuple(POLICIES / path for path in args.checkpoints)
     assert message in refusal(lambda: robustness.main(args), capsys)
+
+
+def test_a_motion_that_ends_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its end would count as a fall. A loop is welcome."""
+    args = parse(robustness.Args, None, ["imitation.pt"])
+    for clip in (whole := read_clip("humanoid_run")), Clip("once", whole.qpos, loop=False):
+        env = diffsim.make("humanoid_imitation", 1, clip=clip)
+        case = Case("run", Path("imitation.pt"), SavedPolicy(torch.nn.Sequential(), "shac", {}, 1), env)
+        monkeypatch.setattr(robustness, "load_case", lambda *_, case=case: case)
+        if clip.loop:
+            assert robustness.load(args.checkpoints[0], args) == (case, 1)
+    line = refusal(lambda: robustness.main(args), capsys)
+    assert "imitation.pt tracks a motion that ends, and with it the episode: train with a loop" in line

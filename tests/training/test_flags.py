@@ -233,6 +233,17 @@ def test_a_checkpoint_with_flags_that_the_script_lacks_is_refused(capsys: pytest
     assert line == f"script.py: {path} was written by a shac.py with other flags: --old-flag"
 
 
+def test_a_checkpoint_older_than_a_flag_has_its_default() -> None:
+    args = parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"])
+    path = save(args)
+    state = torch.load(path)
+    del state["args"]["early_termination"]
+    torch.save(state, path)
+    older = parse(shac.Args, ["--evaluate", str(path)])
+    assert (older.early_termination, older.gamma) == (True, 0.9)
+    assert not make_env(parse(shac.Args, ["--evaluate", str(path), "--no-early-termination"]), 1).early_termination
+
+
 # Help -----------------------------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import time
 from pathlib import Path
 
 import pytest
@@ -108,7 +109,7 @@ def test_episode_statistics_are_of_the_newest_windows_with_a_hundred_episodes() 
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], quiet: bool) -> None:
+def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, quiet: bool) -> None:
     log = ProgressLog(tmp_path, 0, 0, {"gamma": 0.99, "hidden": (64, 64)}, total=4, quiet=quiet)
     for k in range(1, 4):
         log.write(k, 10 * k, 0.12345 * k, {"losses/actor": 1 / 3, "charts/episodic_return": 12.34})
@@ -124,6 +125,8 @@ def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], quiet: bool) ->
     else:
         assert "a line\n" in out and "3/4" in out and "it/s" in out and "return 12.3" in out
 
+    later = time.time() + 10  # files of one second would be read in the order of a counter's text, 10 before 9
+    monkeypatch.setattr(time, "time", lambda: later)
     resumed = ProgressLog(tmp_path, 2, 20, {}, total=4, quiet=True)
     resumed.write(3, 30, 1.0, {"losses/actor": 0.5})
     resumed.close()
