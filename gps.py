@@ -50,15 +50,15 @@ LESSONS, REACH = 20_000, 0.5  # of feedback: states of a fit; standard deviation
 GUIDED = "full", "feedback", "unregularized"  # those with guides in S
 # fmt: off
 COLUMNS = ("variant", "horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight",
-           "attitude_weight", "window", "hidden", "noise")
+           "attitude_weight", "window", "tracking", "spread", "hidden", "noise")
 PER_TASK = {
-    "cartpole":     ("full",     240, "native", 1e-3, 0.0, 0.0,   0.0, 0.0,  0,  50, 0.10),
-    "hopper":       ("feedback", 500, "target", 1e-1, 1.5, 1.25, 10.0, 1.0, 50,  50, 0.10),
-    "half_cheetah": ("feedback", 500, "target", 1e-1, 3.0, 0.8,   1.0, 0.1, 50,  50, 0.10),
-    "ant":          ("feedback", 500, "target", 1e-2, 3.0, 0.75, 10.0, 0.1, 50, 100, 0.10),
-    "humanoid":     ("feedback", 500, "target", 1e-2, 2.5, 1.3,  10.0, 0.1, 50, 200, 0.01),
-    "swimmer":      ("feedback", 500, "target", 1e-2, 2.0, 0.0,   0.0, 0.0, 80,  50, 0.10),
-    "walker":       ("feedback", 500, "target", 1e-1, 1.2, 1.35, 10.0, 0.0, 50,  50, 0.10),
+    "cartpole":     ("full",     240, "native", 1e-3, 0.0, 0.0,   0.0,  0.0,  0, 5e-2, 1.0,  50, 0.10),
+    "hopper":       ("feedback", 500, "target", 1e-1, 1.5, 1.25, 10.0,  1.0, 50, 5e-4, 3.0,  50, 0.10),
+    "half_cheetah": ("feedback", 500, "target", 1e-1, 3.0, 0.8,   1.0,  0.1, 50, 5e-4, 3.0,  50, 0.10),
+    "ant":          ("feedback", 500, "target", 1e-2, 3.0, 0.75, 10.0,  0.1, 50, 5e-4, 3.0, 100, 0.10),
+    "humanoid":     ("feedback", 500, "target", 1e-2, 2.5, 1.3,  10.0,  0.1, 50, 5e-4, 3.0, 200, 0.01),
+    "swimmer":      ("feedback", 500, "target", 1e-2, 2.0, 0.0,   0.0,  0.0, 80, 5e-4, 1.0,  50, 0.01),
+    "walker":       ("feedback", 500, "target", 1e-1, 1.2, 1.35, 10.0, 10.0, 50, 5e-4, 3.0,  50, 0.10),
 }
 # fmt: on
 
@@ -101,9 +101,9 @@ class Args(Flags):
     ilqr_iterations: Count = 300
     """further iLQR iterations of the best"""
     tracking: NonNegative = 5e-4
-    """weight of the squared deviation from the example in the initial guiding distributions (Section 6; paper: 0.05)"""
+    """weight of the squared deviation from the example in the initial guiding distributions (Section 6; per task)"""
     spread: Positive = 3.0
-    """standard deviation of the guiding actions, relative to the policy's: sets the temperature of exp(reward)"""
+    """standard deviation of the guiding actions relative to the policy's: the temperature of exp(reward) (per task)"""
     guiding_samples: Count = 40
     """trajectories drawn from the guiding distributions"""
     adaptive: Natural = 0
@@ -223,7 +223,7 @@ class Search:
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
         if args.variant == "feedback":
-            self.learn(guiding.pick(slice(0, None, 8)))
+            self.learn(guiding)
             self.learn(own)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides

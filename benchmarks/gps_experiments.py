@@ -35,7 +35,7 @@ import numpy as np
 import torch
 import tyro
 from common import DOCS, OUTPUT, RESULTS
-from tables import ROOT, fill, markdown, read_csv, write_csv
+from tables import ROOT, fill, markdown, origins, read_csv, write_csv
 from torch import Tensor
 
 import diffsim
@@ -53,16 +53,21 @@ import matplotlib.pyplot as plt  # noqa: E402
 CASES: dict[str, str] = {variant: f"--variant {variant}" for variant in get_args(gps.Variant)}
 CASES |= {"adaptive": "--variant full --adaptive 10 --adaptive-iterations 10"}
 ABLATIONS = {"only": "--imitation 1000", "unbounded": "--bound 100", "tail": "--tail 0", "narrow": "--spread 1"}
-ABLATIONS |= {"stiff": "--tracking 0.05", "few": "--samples 4 --guiding-samples 10 --active 40"}
+ABLATIONS |= {
+    "stiff": "--tracking 0.05",
+    "short": "--horizon 160",
+    "few": "--samples 4 --guiding-samples 10 --active 40",
+}
 CASES |= {f"feedback-{name}": f"--variant feedback {flags}" for name, flags in ABLATIONS.items()}
+ABLATED = [f"feedback-{name}" for name in ABLATIONS]
 FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
-PLAN = "--ilqr-iterations 40 --demonstration benchmarks/plans/"
+PLAN = "--ilqr-iterations 2 --demonstration benchmarks/plans/"
 # What docs/gps.md shows, per task: seeds, cases, flags
 SUITE: dict[str, tuple[tuple[int, ...], tuple[str, ...], str]] = {
-    "cartpole": ((1, 2, 3, 4, 5), tuple(FIGURE_2), "--iterations 60"),
-    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), f"--iterations 30 {PLAN}hopper.npz"),
-    "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--iterations 40 {PLAN}walker.npz"),
-    "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--iterations 30 {PLAN}swimmer.npz"),
+    "cartpole": ((1, 2, 3, 4, 5), tuple(FIGURE_2), "--iterations 30"),
+    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), f"--iterations 24 {PLAN}hopper_500.npz"),
+    "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--iterations 24 {PLAN}walker_500.npz"),
+    "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--iterations 24 {PLAN}swimmer_500.npz"),
 }
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
@@ -70,7 +75,7 @@ KEPT = (  # columns of progress.csv
     "gps_guides gps_guides_std gps_fit eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
-PLANNED = "full", "feedback"  # cases whose generalisation is measured
+PLANNED = "full", "feedback", "feedback-short"  # cases whose generalisation is measured
 TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (250, 400)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
 COLOURS = {case: f"C{i}" for i, case in enumerate(CASES)}
@@ -165,10 +170,7 @@ def train(directory: Path, flags: Sequence[str], count: int) -> str:
         code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT).returncode
     if code:
         return f"{directory.name}: exit code {code}, see {log.name}"
-    if case in PLANNED:
-        search = load_search(path)
-        write_csv(directory / "generalisation.csv", generalisation(search, count))
-        write_csv(directory / "paths.csv", paths(search))
+    measure(directory, count)
     return f"{directory.name}: done"
 
 
@@ -225,6 +227,14 @@ def load_search(path: Path) -> gps.Search:
     search = gps.Search(gps.Args(**state["args"]), environment(path))
     checkpoint.restore(search, state)
     return search
+
+
+def measure(directory: Path, count: int) -> None:
+    """Where a finished run's trajectories go and, in a case of PLANNED, what perturbations do to them."""
+    search = load_search(directory / "checkpoint.pt")
+    write_csv(directory / "paths.csv", paths(search))
+    if directory.name.split("__")[1] in PLANNED:
+        write_csv(directory / "generalisation.csv", generalisation(search, count))
 
 
 def controllers(search: gps.Search) -> dict[str, Act]:
@@ -293,6 +303,7 @@ def grouped(rows: Iterable[dict[str, str]], *keys: str) -> dict[tuple[str, ...],
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
     tables: dict[str, list[Row]] = {"runs": [], "generalisation": [], "paths": []}
+    older = set[str]()
     for directory in sorted(path for path in args.runs.glob("*__*__*") if (path / "progress.csv").is_file()):
         run = dict(zip(RUN, directory.name.split("__"), strict=True))
         horizon = json.loads((directory / "args.json").read_text())["horizon"]
@@ -301,6 +312,7 @@ def collect(args: Args) -> None:
             tables["runs"].append(run | dict(horizon=horizon) | kept)
         for name in ("generalisation", "paths"):
             tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
+            older |= {line.rpartition("; ")[0] + "; --list\n" for line in origins(directory / f"{name}.csv")}
     first: dict[str, tuple[str, ...]] = {}  # one run a task is drawn, every fourth step
     drawn = [
         r for r in tables["paths"] if (r["variant"], r["seed"]) == first.setdefault(r["env"], (r["variant"], r["seed"]))
@@ -309,35 +321,47 @@ def collect(args: Args) -> None:
     for name, rows in tables.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
         rows += [row for row in read_csv(args.table(name)) if tuple(row[key] for key in RUN) not in here]
-        write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)))
+        known = older | {line for line in origins(args.table(name)) if line.endswith("; --list\n")}
+        write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)), older=sorted(known))
 
 
-def summarise(run: tuple[str, ...], rows: list[dict[str, str]]) -> Row:
-    first, last, half = rows[0], rows[-1], rows[len(rows) // 2 :]
-    final = next((row for row in reversed(rows) if row["eval_objective"]), dict.fromkeys(KEPT, ""))
-    objective, plan = number(final["eval_objective"]), number(first["gps_plan"])
-    return dict(zip(("task", "variant", "seed"), run, strict=True)) | {
-        "T": first["horizon"],
-        "plan": f"{plan:.1f}",
-        "guides": f"{number(first['gps_guides']):.1f} ± {number(first['gps_guides_std']):.1f}",
-        "fit": f"{number(first['gps_fit']):.2f}",
-        "pretrained": f"{number(first['gps_objective']):.1f}",
-        "iterations": last["iteration"],
-        "accepted": sum(number(row["gps_accepted"]) == 1 for row in rows),
-        "proposals, last half": f"{mean(number(row['gps_objective']) for row in half):.1f}",
-        "final policy": f"{objective:.1f} ± {number(final['eval_objective_std']):.1f}",
-        "reaches plan": "yes" if objective >= plan else "no",
-        "own return": final["eval_return"],
-        "speed": final["eval_speed"],
-        "control steps": f"{number(last['control_steps']):,.0f}",
-        "of planning": f"{number(last['sim_model_steps']):,.0f}",
-        "seconds": f"{number(last['seconds']):.0f}",
+def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
+    """One row of a case: means over its seeds, and each seed's end. In the band: at least the guides' mean - 2 std."""
+    ends = [[row for row in rows if row["eval_objective"]][-1:] for rows in seeds]
+    final = [number(end[0]["eval_objective"]) if end else math.nan for end in ends]
+    low = [number(rows[0]["gps_guides"]) - 2 * number(rows[0]["gps_guides_std"]) for rows in seeds]
+
+    def average(column: str, place: int = 0) -> float:
+        return mean(number(rows[place].get(column, "")) for rows in seeds)
+
+    def spoken(column: str) -> str:
+        values = [number(end[0][column]) for end in ends if end and end[0].get(column)]
+        return f"{mean(values):.2f}" if values else ""
+
+    return {
+        "task": env,
+        "case": case,
+        "T": seeds[0][0]["horizon"],
+        "guides": f"{average('gps_guides'):.1f} ± {average('gps_guides_std'):.1f}",
+        "pretrained": f"{average('gps_objective'):.0f}",
+        "end, each seed": ", ".join(f"{value:.1f}" for value in final),
+        "in band": f"{sum(a >= b for a, b in zip(final, low, strict=True))} of {len(seeds)}",
+        "m/s": spoken("eval_speed"),
+        "steps until a fall": spoken("eval_length"),
+        "iterations": f"{min(int(rows[-1]['iteration']) for rows in seeds)}",
+        "control steps": f"{average('control_steps', -1):,.0f}",
+        "of planning": f"{average('sim_model_steps', -1):,.0f}",
+        "seconds": f"{average('seconds', -1):.0f}",
     }
 
 
 def tabulate(args: Args) -> dict[str, str]:
     """The tables of docs/gps.md, by the names of their places."""
     runs, kept = grouped(read_csv(args.table("runs")), *RUN), []
+    cases: dict[tuple[str, str], list[list[dict[str, str]]]] = {}
+    for (env, case, _), rows in runs.items():
+        cases.setdefault((env, case), []).append(rows)
+    table = [summarise(env, case, seeds) for (env, case), seeds in cases.items()]
     for (env, variant, kind), rows in grouped(read_csv(args.table("generalisation")), "env", "variant", "kind").items():
         cells = dict.fromkeys(map(str, sorted({*STARTS, *PUSHES})), "")
         for (size,), own in grouped(rows, "size").items():
@@ -345,7 +369,8 @@ def tabulate(args: Args) -> dict[str, str]:
             cells[size] = " / ".join(f"{share:.0%}" for share in shares)
         kept.append({"task": env, "variant": variant, "perturbed": kind} | cells)
     return {
-        "runs": markdown([summarise(run, rows) for run, rows in runs.items()]),
+        "runs": markdown([row for row in table if row["case"] not in ABLATED]),
+        "ablation": markdown([row for row in table if row["case"] in ABLATED]),
         "diagnosis": markdown(diagnose(runs)),
         "generalisation": markdown(kept),
         "samples": markdown(compare(args)),

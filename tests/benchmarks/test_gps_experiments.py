@@ -26,7 +26,9 @@ SMALL = (
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs")
-    run(gps, directory / "cartpole__full__1", *SMALL)
+    path = directory / "cartpole__full__1"
+    run(gps, path, *SMALL)
+    experiments.measure(path, 4)
     return directory
 
 
@@ -40,7 +42,7 @@ def test_tables_and_pictures(runs: Path, tmp_path: Path) -> None:
     plan = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt").plan_return
     ddp = next(row for row in rows if row["controller"] == "ddp" and float(row["size"]) == 0)
     assert float(ddp["mean"]) == pytest.approx(plan, rel=1e-9)  # unperturbed, it repeats the plan
-    assert "| cartpole | full | 1 | 12 |" in (docs / "gps.md").read_text()
+    assert "| cartpole | full | 12 |" in (docs / "gps.md").read_text()
     before = {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
     experiments.main([*options, "--runs", str(tmp_path / "nowhere")])
     assert before == {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
@@ -61,14 +63,14 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
     lines = capsys.readouterr().out.splitlines()
     part = "--env hopper --cases adaptive --seeds 2 --runs there --train-only -- --horizon 160"
     assert len(lines) == 4 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
-    assert experiments.CASES["adaptive"] == "--adaptive 40"
+    assert experiments.CASES["adaptive"].startswith("--variant full --adaptive")
     for flags in experiments.CASES.values():
         gps.parse(gps.Args, ["--env", "hopper", *flags.split()])
 
 
 def test_a_finished_run_is_kept(runs: Path) -> None:
     before = (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns
-    assert experiments.train(runs / "cartpole__full__1", []) == "cartpole__full__1: done before"
+    assert experiments.train(runs / "cartpole__full__1", [], 4) == "cartpole__full__1: done before"
     assert (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns == before
 
 
