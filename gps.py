@@ -223,7 +223,7 @@ class Search:
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
         if args.variant == "feedback":
-            self.learn(guiding)
+            self.learn(guiding.pick(slice(args.samples)))  # more would outweigh what the policy visits
             self.learn(own)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides
