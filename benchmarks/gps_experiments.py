@@ -8,9 +8,9 @@
     python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
 
 Writes gps_runs.csv (every iteration of every run), gps_generalisation.csv (the policy, the DDP controller
-and that of the nearest step, from perturbed starts and under pushes), gps_paths.csv (where the root went) and
-gps_time.csv (one iteration of iLQR), their tables in gps.md, and the pictures figures/gps_variants.png, gps_paths.png
-and gps_generalisation.png: Figures 2, 1 and 3 of the paper. An interrupted run is resumed.
+and that of the nearest step, from perturbed starts and under pushes), gps_paths.csv (where the root went), their
+tables in gps.md, and the pictures figures/gps_variants.png, gps_paths.png and gps_generalisation.png: Figures 2, 1 and
+3 of the paper. An interrupted run is resumed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import math
 import shlex
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -39,7 +38,7 @@ from tables import ROOT, fill, markdown, origins, read_csv, write_csv
 from torch import Tensor
 
 import diffsim
-from diffsim.planning import REAL, ilqr, nearest_feedback
+from diffsim.planning import REAL, nearest_feedback
 from diffsim.training import checkpoint, fail, load_policy, parse_penalty
 
 sys.path.append(str(ROOT))
@@ -53,11 +52,8 @@ import matplotlib.pyplot as plt  # noqa: E402
 CASES: dict[str, str] = {variant: f"--variant {variant}" for variant in get_args(gps.Variant)}
 CASES |= {"adaptive": "--variant full --adaptive 10 --adaptive-iterations 10"}
 ABLATIONS = {"only": "--imitation 1000", "unbounded": "--bound 100", "tail": "--tail 0", "narrow": "--spread 1"}
-ABLATIONS |= {
-    "stiff": "--tracking 0.05",
-    "short": "--horizon 160",
-    "few": "--samples 4 --guiding-samples 10 --active 40",
-}
+ABLATIONS |= {"stiff": "--tracking 0.05", "before": "--bound 100 --tail 0 --spread 1 --tracking 0.05"}
+ABLATIONS |= {"short": "--horizon 160", "few": "--samples 4 --guiding-samples 10 --active 40"}
 CASES |= {f"feedback-{name}": f"--variant feedback {flags}" for name, flags in ABLATIONS.items()}
 ABLATED = [f"feedback-{name}" for name in ABLATIONS]
 FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
@@ -76,8 +72,10 @@ KEPT = (  # columns of progress.csv
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
 PLANNED = "full", "feedback", "feedback-short"  # cases whose generalisation is measured
-TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (250, 400)}  # returns to which learners are compared
+COMPARED = "full", "feedback", "feedback-few"  # cases whose samples are
+TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (600, 1200)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
+DRAWN = (*FIGURE_2, "feedback-short")
 COLOURS = {case: f"C{i}" for i, case in enumerate(CASES)}
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 STYLES = {"plan": ("k", 2.0, 3), "guides": ("0.6", 0.8, 1), "policy": ("C0", 0.8, 2)}  # colour, width, order
@@ -201,24 +199,6 @@ def commands(args: Args) -> Iterator[str]:
         yield shlex.join(["python", "benchmarks/gps_experiments.py", *flags, *rest])
 
 
-def time_ilqr(env: str = "hopper", horizon: int = 500, repeats: int = 5) -> list[Row]:
-    """Seconds of an iLQR iteration of one trajectory: Jacobians and quadratics, backward pass, line search."""
-    rows = []
-    for threads in (1, 0):
-        flags = ["--env", env, "--horizon", str(horizon), "--device", "cpu", "--threads", str(threads)]
-        search = gps.Search(gps.parse(gps.Args, flags), diffsim.make(env, 1))
-        system, rng = search.system, torch.Generator().manual_seed(1)
-        u = 0.1 * torch.randn(1, horizon, system.nu, generator=rng, dtype=REAL)
-        x, _, _ = system.rollout(system.start(), horizon, lambda t, _, u=u: u[:, t])  # type: ignore[misc]
-        ilqr(system, search.cost, x, u, 1)  # compiles
-        wall, cpu = time.perf_counter(), time.process_time()  # the second is not disturbed by other work on the machine
-        ilqr(system, search.cost, x, u, repeats)
-        wall, cpu = (time.perf_counter() - wall) / repeats, (time.process_time() - cpu) / repeats
-        seconds = {"seconds": round(wall, 3), "seconds of CPU": round(cpu, 3)}
-        rows.append(dict(env=env, horizon=horizon, threads=threads or "all cores") | seconds)
-    return rows
-
-
 # Generalisation -------------------------------------------------------------------------------------------------------
 
 
@@ -325,10 +305,16 @@ def collect(args: Args) -> None:
         write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)), older=sorted(known))
 
 
+def final_return(rows: list[dict[str, str]]) -> float:
+    """Of the best policy's last evaluation; of a run that was stopped before one, its own estimate."""
+    evaluated = [row["eval_objective"] for row in rows if row["eval_objective"]]
+    return number(evaluated[-1] if evaluated else rows[-1]["gps_best_estimate"])
+
+
 def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
     """One row of a case: means over its seeds, and each seed's end. In the band: at least the guides' mean - 2 std."""
     ends = [[row for row in rows if row["eval_objective"]][-1:] for rows in seeds]
-    final = [number(end[0]["eval_objective"]) if end else math.nan for end in ends]
+    final = [final_return(rows) for rows in seeds]
     low = [number(rows[0]["gps_guides"]) - 2 * number(rows[0]["gps_guides_std"]) for rows in seeds]
 
     def average(column: str, place: int = 0) -> float:
@@ -374,26 +360,22 @@ def tabulate(args: Args) -> dict[str, str]:
         "diagnosis": markdown(diagnose(runs)),
         "generalisation": markdown(kept),
         "samples": markdown(compare(args)),
-        "time": markdown(read_csv(args.table("time"))),
+        "swimmer": markdown(read_csv(args.table("swimmer"))),
     }
 
 
 def diagnose(runs: dict[tuple[str, ...], list[dict[str, str]]]) -> list[Row]:
-    """Why a search does or does not learn: per task, T and case, means over the last half of the iterations and seeds.
-
-    Overestimate: of the best policy's value on the active set, above the mean return of its evaluation at the end.
-    """
+    """Why a search does or does not learn: a row a case, means over the last half of the iterations and the seeds."""
     table, cases = [], dict[tuple[str, ...], list[list[dict[str, str]]]]()
     for (env, case, _), rows in runs.items():
         cases.setdefault((env, rows[0]["horizon"], case), []).append(rows)
     for (env, horizon, case), seeds in cases.items():
         late = [row for rows in seeds for row in rows[len(rows) // 2 :]]
-        ends = [number(rows[-1]["eval_objective"]) for rows in seeds]
-        over = [number(rows[-1].get("gps_best_estimate", "")) - end for rows, end in zip(seeds, ends, strict=True)]
+        ends = [final_return(rows) for rows in seeds]
         cells = {"nats": "gps_guide_nats", "guide share": "gps_guide_share", "ESS": "gps_ess", "near": "gps_near"}
         row = {"task": env, "T": horizon, "case": case, "seeds": len(seeds)}
         row["pretrained"] = f"{mean(number(rows[0]['gps_objective']) for rows in seeds):.1f}"
-        row |= {"end": f"{mean(ends):.1f}", "worst end": f"{min(ends):.1f}", "overestimate": f"{mean(over):.1f}"}
+        row["end"] = f"{mean(ends):.1f}"
         row["accepted"] = f"{mean(sum(number(row['gps_accepted']) == 1 for row in rows) for rows in seeds):.1f}"
         table.append(row | {k: f"{mean(number(row.get(name, '')) for row in late):.3g}" for k, name in cells.items()})
     return table
@@ -406,7 +388,7 @@ def compare(args: Args) -> list[Row]:
     """
     runs, table = grouped(read_csv(args.table("runs")), *RUN), []
     for env, targets in TARGETS.items():
-        own = {case: [rows for (e, c, _), rows in runs.items() if (e, c) == (env, case)] for case in PLANNED}
+        own = {case: [rows for (e, c, _), rows in runs.items() if (e, c) == (env, case)] for case in COMPARED}
         learners = {f"gps, {case}": seeds for case, seeds in own.items() if seeds}
         if not learners:
             continue
@@ -434,23 +416,19 @@ def first_pass(rows: list[dict[str, str]], target: float, T: float) -> float:
 
 
 def draw_variants(ax: plt.Axes, env: str, runs: dict[tuple[str, ...], list[dict[str, str]]]) -> None:
-    """Mean return of the proposals: thin, each run; bold, their median; grey, two deviations of the guiding samples."""
-    low, high = list[float](), list[float]()
-    for variant in sorted({v for e, v, _ in runs if e == env}):
-        seeds = [rows for (e, v, _), rows in runs.items() if (e, v) == (env, variant)]
-        curves = [[number(row["gps_objective"]) for row in rows] for rows in seeds]
-        for rows, curve in zip(seeds, curves, strict=True):
+    """Mean cost of the proposals: thin, each run; bold, their median; grey, two deviations of the guiding samples."""
+    for variant in dict.fromkeys(case for e, case, _ in runs if e == env and case in DRAWN):
+        seeds = [rows for (e, case, _), rows in runs.items() if (e, case) == (env, variant)]
+        curves = [[-number(row["gps_objective"]) for row in rows] for rows in seeds]
+        for curve in curves:
             ax.plot(range(len(curve)), curve, color=COLOURS[variant], lw=0.6, alpha=0.5)
-            plan, guides = number(rows[0]["gps_plan"]), number(rows[0]["gps_guides"])
-            low, high = [*low, plan, guides, np.percentile(curve, 20)], [*high, plan, *curve]
-        guides, std = (number(seeds[0][0][key]) for key in ("gps_guides", "gps_guides_std"))
-        ax.axhspan(guides - 2 * std, guides + 2 * std, color="0.6", alpha=0.4, lw=0)
         length = min(map(len, curves))
         middle = np.median([curve[:length] for curve in curves], 0)
-        ax.plot(range(length), middle, color=COLOURS[variant], lw=2, label=variant)
-    bottom, top = min(low), max(high)
-    ax.set_ylim(bottom - 0.3 * (top - bottom), top + 0.1 * (top - bottom))
-    ax.set(title=env, xlabel="iteration", ylabel="mean return of the proposed policy")
+        ax.plot(range(length), middle, color=COLOURS[variant], lw=2, label=f"{variant}, T = {seeds[0][0]['horizon']}")
+        guides, std = (number(seeds[0][0][key]) for key in ("gps_guides", "gps_guides_std"))
+        ax.axhspan(-guides - 2 * std, -guides + 2 * std, color="0.6", alpha=0.3, lw=0)
+    ax.set(title=env, xlabel="iteration", ylabel="minus the return of the proposed policy", yscale="log")
+    ax.invert_yaxis()
 
 
 def draw_paths(ax: plt.Axes, env: str, rows: list[dict[str, str]]) -> None:
@@ -474,7 +452,9 @@ def draw(args: Args) -> None:
     runs, tracks = grouped(read_csv(args.table("runs")), *RUN), grouped(read_csv(args.table("paths")), "env")
     groups = grouped(read_csv(args.table("generalisation")), "env", "variant", "kind")
     pictures: dict[str, list[list[Callable[[plt.Axes], None]]]] = {
-        "variants": [[partial(draw_variants, env=env, runs=runs) for env in sorted({env for env, _, _ in runs})]],
+        "variants": [
+            [partial(draw_variants, env=env, runs=runs) for env in SUITE if any(env == e for e, _, _ in runs)]
+        ],
         "paths": [[partial(draw_paths, env=env, rows=rows) for (env,), rows in tracks.items()]],
         "generalisation": [
             [
@@ -521,8 +501,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         train_all(args)
     if args.train_only:
         return
-    if not args.draw_only:
-        write_csv(args.table("time"), time_ilqr())
     collect(args)
     draw(args)
     for name, text in tabulate(args).items():

@@ -1,6 +1,6 @@
 """What bounds the swimmer: the fastest undulation of bodies and motors, and the trajectory that iLQR makes of it.
 
-    python benchmarks/gps_undulation.py                   writes gps_swimmer.csv (seven minutes on one core)
+    python benchmarks/gps_undulation.py                   writes gps_swimmer.csv (ten minutes on one core)
     python benchmarks/gps_undulation.py --plan benchmarks/plans/swimmer_500.npz     a demonstration for gps.py
 
 The joints follow sinusoids of one frequency by proportional-derivative control. Seven numbers (amplitude, its ratio,
@@ -37,7 +37,7 @@ MEAN, STD = (0.7, 4.0, -1.2, 0.0, 0.5, 0.0, 0.0), (0.3, 1.5, 0.8, 0.4, 0.8, 1.0,
 
 @dataclass
 class Args:
-    horizon: int = 240
+    horizon: int = 160
     """control steps"""
     population: int = 300
     """undulations of a generation"""
@@ -64,6 +64,7 @@ def make_search(radius: str, torque: int, horizon: int) -> gps.Search:
         finally:
             task.asset = before
     flags = ["--env", "swimmer", "--device", "cpu", "--threads", "1", "--horizon", str(horizon)]
+    flags += ["--ilqr-iterations", "60", "--screening", "20"]
     return gps.Search(gps.parse(gps.Args, flags), env)
 
 
