@@ -87,7 +87,6 @@ class Args(Flags):
     """w_h of the paper's reward (per task)"""
     attitude_weight: NonNegative = 0.0
     """weight of the trunk's squared rotation, beside the paper's three terms (per task)"""
-
     demonstration: Path | None = None
     """start from this trajectory instead of --restarts: an .npz with qpos (T+1, nq), qvel (T+1, nv), action (T, nu)"""
     restarts: Count = 16
@@ -110,7 +109,6 @@ class Args(Flags):
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
     adaptive_iterations: Count = 50
     """iLQR iterations of an adaptation"""
-
     hidden: Count = 50
     """units of the policy's hidden layer (per task)"""
     noise: Positive = 0.1
@@ -133,9 +131,6 @@ class Args(Flags):
     """feedback: the last so many steps of a guide teach nothing, as what comes after them costs nothing"""
     bound: Positive = 2.0
     """feedback: actions before tanh that are taught are within this"""
-    step: Positive = 0.1
-    """policy-gradient: length of a step along the normalised gradient"""
-
     eval_every: Natural = 10
     """evaluate the best policy every this many iterations (0: only at the end)"""
     eval_episodes: Count = 50
@@ -234,8 +229,7 @@ class Search:
         if args.variant in ("policy-gradient", "dagger"):
             return policy_gradient(self) if args.variant == "policy-gradient" else dagger(self)
         active = S.choose(args.active, args.samples)  # line 6: choose S_k
-        # line 7: theta_k <- arg max Phi
-        imitating = args.variant == "feedback" and iteration <= args.imitation
+        imitating = args.variant == "feedback" and iteration <= args.imitation  # line 7: theta_k <- arg max Phi
         theta, metrics = self.imitate() if imitating else self.optimise(S.samples.pick(active))
         source, before = len(S.generators), len(S.samples.u)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
@@ -283,8 +277,8 @@ class Search:
         self.nonfinite += int((~finite[:, -1]).sum())
         reward = torch.where(finite, self.reward(x[:, 1:], u), self.floor).clamp(min=self.floor)
         native = torch.where(finite, self.system.reward(x[:, 1:], u), 0.0)
-        sources = torch.full((len(u),), source, device=u.device)
-        return Samples(x, self.system.observe(x[:, :-1]), u, reward, native, sources, u.mT[:, :0])
+        sources, log_q = torch.full((len(u),), source, device=u.device), u.mT[:, :0]
+        return Samples(x, self.system.observe(x[:, :-1]), u, reward, native, sources, log_q)
 
     def roll_out(self, theta: Tensor, noise: Tensor, source: int = -1, start: Tensor | None = None) -> Samples:
         """Trajectories of a policy with standard normal noise (m, T, nu), from the fixed start or from (m, nx)."""
@@ -434,9 +428,6 @@ def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
         if iteration % 10 == 9:
             say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
 
-    def ahead(end: int, costs: Tensor) -> None:
-        say(f"planning, window up to step {end}: cost {costs.min():.2f}")
-
     try:
         if args.demonstration:
             example = load_demonstration(system, args.demonstration, T)
@@ -445,7 +436,8 @@ def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
             first = min(args.window or T, T)
             u = starting_actions(args.restarts, first, system.nu, system.control_dt, search.rng).to(system.device)
             x, u = best_of_random_starts(system, search.cost, system.start()[0], u, args.guides, args.screening, show)
-            x, u = receding_horizon(system, search.cost, x, u, T, max(first // 5, 1), 8, search.rng, ahead)
+            say(f"planning the rest by windows of {first} steps")
+            x, u = receding_horizon(system, search.cost, x, u, T, max(first // 5, 1), 8, search.rng)
     except ValueError as error:
         fail(error)
     return ilqr(system, search.cost, x, u, args.ilqr_iterations, show=show)
@@ -461,8 +453,7 @@ def make_guides(search: Search, plan: Plan, say: Callable[[str], None]) -> list[
     for guide in guides:
         if guide.mu > 1e-2:
             say(f"warning: a guide's Q_uu needed mu = {guide.mu:.1e}; it is far from an optimum")
-    every = args.horizon // 16 or 1
-    error = system.check_jacobians(plan.x[0, :-1:every], plan.u[0, ::every])
+    error = system.check_jacobians(plan.x[0, : -1 : args.horizon // 16 or 1], plan.u[0, :: args.horizon // 16 or 1])
     say(f"Jacobians against central differences: relative error {error.median():.1e}, worst {error.max():.1e}")
     if not error.median() < 1e-3:
         fail("the simulator's Jacobians are not those of its steps")
@@ -646,7 +637,7 @@ def policy_gradient(search: Search) -> dict[str, float]:
     theta = policy.theta.clone().requires_grad_()
     log_pi = policy.log_prob(theta, new.obs, new.u)
     (gradient,) = torch.autograd.grad(((to_go - to_go.mean(0)) * log_pi).sum(), theta)
-    policy.theta = policy.theta + search.args.step * gradient / gradient.norm().clamp(min=1e-12)
+    policy.theta = policy.theta + 0.1 * gradient / gradient.norm().clamp(min=1e-12)
     return search.metrics(new)
 
 

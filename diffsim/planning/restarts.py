@@ -75,7 +75,6 @@ def receding_horizon(
     advance: int,
     iterations: int,
     rng: torch.Generator,
-    show: Callable[[int, Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Continues R trajectories window by window, each of which begins `advance` steps after the one before.
 
@@ -89,7 +88,6 @@ def receding_horizon(
         advance: control steps of a window that are kept, at most W / 2.
         iterations: of iLQR, a window.
         rng: of the noise, on the CPU.
-        show: gets the control steps done and the windows' costs (R,).
 
     Returns:
         x (R, T + 1, nx), u (R, T, nu).
@@ -105,6 +103,4 @@ def receding_horizon(
         total = torch.where(finite.all(1), plan.cost, math.inf).view(4, R)
         best = total.argmin(0) * R + torch.arange(R, device=u.device)
         x, u = plan.x[best], plan.u[best]
-        if show:
-            show(done + W, plan.cost[best])
     return torch.cat((*xs, x), 1)[:, : steps + 1], torch.cat((*us, u), 1)[:, :steps]
