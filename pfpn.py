@@ -105,7 +105,7 @@ class Args(ParallelFlags):
     """a particle lands within this many standard deviations of the one that it copies"""
     dead: Fraction = 0.05
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
-    estimator: Estimator = "implicit"
+    estimator: Estimator = "straight-through"
     """gradient of a sampled action, with shac and sac: only straight-through is biased (docs/pfpn.md)"""
     density_floor: NonNegative = 0.01
     """the implicit gradient divides by the action's density, at least by this; 0: no bias, no bound either"""

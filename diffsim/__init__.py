@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode
+from numpy.typing import ArrayLike
 
 from diffsim.clip import Clip, read_clip
 from diffsim.env import DiffEnv
@@ -61,6 +62,7 @@ def make(
     factors: bool = False,
     forces: bool = False,
     clip: Clip | Path | str | None = None,
+    terrain: ArrayLike | None = None,
 ) -> DiffEnv:
     """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
 
@@ -74,6 +76,9 @@ def make(
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         factors: let constants differ between environments: `env.sim.factors`, see Simulator.
         forces: let external forces act on the bodies: `env.sim.forces`, see Simulator.
+        terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
+            of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
+            observes, rewards and ends by are then those over the ground below the root.
         clip: the motion that humanoid_imitation tracks, or its .npz file, see read_clip; default the shipped run.
 
     Raises:
@@ -91,9 +96,10 @@ def make(
     else:
         raise ValueError(f"task {name!r} tracks no clip; {HumanoidImitation.name} does")
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
+    scene = scene.with_penalty(task.penalty(contact) | dict(penalty or {}))
     return DiffEnv(
         task,
-        scene.with_penalty(task.penalty(contact) | dict(penalty or {})),
+        scene if terrain is None else scene.with_terrain(terrain),
         num_envs,
         integration=task.integration(accuracy, contact).replaced(integrator, substeps, theta),
         seed=seed,

@@ -19,6 +19,7 @@ from diffsim.scene import Scene
 from diffsim.screen import RENDER_MODES, Frames, RenderMode, Screen
 from diffsim.simulator import Simulator, check_device
 from diffsim.tasks import Task
+from diffsim.terrain import Elevation
 
 
 def check_seed(seed: int) -> int:
@@ -42,7 +43,8 @@ class DiffEnv(VectorEnv):
 
     Args:
         task: task on the simulator's device and dtype.
-        scene: its robot.
+        scene: its robot. On a terrain, heights that the task knows (of start, observation, reward and end) are those
+            over the ground straight below the root; `qpos` remains the world's.
         integration: default the task's "default".
         num_envs, horizon, threads, factors, forces: see Simulator; env.sim has the factors and the forces.
         seed: of the random start states.
@@ -105,6 +107,7 @@ class DiffEnv(VectorEnv):
             forces=forces,
         )
         self.device, self.dtype = self.sim.device, dtype
+        self._elevation = None if scene.terrain is None else Elevation(scene, self.device, dtype)
         real = np.float32 if dtype == torch.float32 else np.float64
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.obs_dim,), real)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (scene.nu,), real)
@@ -219,7 +222,7 @@ class DiffEnv(VectorEnv):
         Returns:
             obs (N, obs_dim) of all environments.
         """
-        first, *starts = self._start_states(rand)
+        first, *starts = self._start_states(rand, rows)
         self.first_step.index_copy_(0, rows, first)
         self.qpos, self.qvel, self._obs = (
             whole.index_copy(0, rows, part)
@@ -300,6 +303,8 @@ class DiffEnv(VectorEnv):
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor, elapsed: int = 0) -> Tensor:
         """What the task observes (N, obs_dim) of states on the episodes' clocks, `elapsed` control steps from now."""
+        if self._elevation is not None:
+            qpos = self._elevation.lower(qpos)
         if not self.task.timed:
             return self.task.observe(qpos, qvel, action)
         return self.task.observe_at(qpos, qvel, action, self.first_step + self.episode_step + elapsed)
@@ -360,13 +365,14 @@ class DiffEnv(VectorEnv):
         return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
 
     @torch.no_grad()
-    def _start_states(self, rand: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The first step (...), qpos, qvel and obs (..., each) of rand (..., num_random)."""
+    def _start_states(self, rand: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The first step (...), qpos, qvel and obs (..., each) of rand (..., num_random), of all or of rows."""
         if not self.stochastic_init:
             rand = torch.full_like(rand, 0.5)
         first, (qpos, qvel) = self.task.first_step(rand), self.task.reset(rand)
         action = self._no_action[0].expand(*rand.shape[:-1], -1)
-        return first, qpos, qvel, self.task.observe_at(qpos, qvel, action, first)
+        obs = self.task.observe_at(qpos, qvel, action, first)
+        return first, qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs
 
     def _show(self) -> None:
         if self.render_mode == "human":

@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.scene import Scene
+from diffsim.terrain import slabs
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
 
 AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.1, 1.0])  # colours of a muscle
+GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
 SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
 VIDEO_FPS = 30.0  # at most
@@ -54,6 +56,8 @@ class Renderer:
     ) -> None:
         loaded = scene.mj_model if isinstance(scene, Scene) else mujoco.MjModel.from_xml_path(os.fspath(scene))
         self.model = model = copy.copy(loaded)
+        self._terrain = scene.terrain if isinstance(scene, Scene) else None
+        self._material = hide_planes(model) if self._terrain is not None else -1
         self.width, self.height = width, height
         self._view = _camera(model, camera)
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
@@ -67,12 +71,13 @@ class Renderer:
         if self._fast:
             self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
 
-    def draw(self, qpos: ArrayLike, ctrl: ArrayLike | None = None) -> Frame:
+    def draw(self, qpos: ArrayLike, ctrl: ArrayLike | None = None, profile: int = 0) -> Frame:
         """The frame (height, width, 3) of one configuration.
 
         Args:
             qpos: (nq,).
             ctrl: (nu,) in [-1, 1]; colours muscles by their activation, blue at rest, red at full force.
+            profile: of which environment's terrain, if each has its own.
 
         Raises:
             ValueError: an argument of another shape.
@@ -88,7 +93,9 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, self._option, self._perturb, self._view, everything, self._scene)
-        if self._fast:
+        if self._terrain is not None:
+            add_terrain(self._scene, self._terrain[profile % len(self._terrain)], self._material)
+        elif self._fast:
             _add_shadows(model, data, self._scene)
         mujoco.mjr_render(self._area, self._scene, self._context)
         frame = np.empty((self.height, self.width, 3), dtype=np.uint8)
@@ -108,6 +115,23 @@ class Renderer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def hide_planes(model: mujoco.MjModel) -> int:
+    """Leave a model's planes undrawn; returns the material of the first, or -1."""
+    planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    material = int(model.geom_matid[planes[0]]) if len(planes) else -1
+    model.geom_matid[planes], model.geom_rgba[planes] = -1, 0.0
+    return material
+
+
+def add_terrain(scene: mujoco.MjvScene, profile: NDArray[np.float64], material: int) -> None:
+    """Add a terrain (K, 2) to what is drawn, of this material of the model, or plain if it is -1."""
+    for size, centre, rotation in slabs(profile)[: scene.maxgeom - scene.ngeom]:
+        box = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(box, mujoco.mjtGeom.mjGEOM_BOX, size, centre, rotation.ravel(), GROUND)
+        box.matid = material
+        scene.ngeom += 1
 
 
 def lower_quality(model: mujoco.MjModel) -> None:

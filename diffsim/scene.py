@@ -8,9 +8,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from diffsim.integration import is_real
+from diffsim.terrain import check_terrain
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -37,7 +38,7 @@ class SceneError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """One articulated robot over a ground plane, in MuJoCo's conventions: SI units, z up.
+    """One articulated robot over the ground, in MuJoCo's conventions: SI units, z up.
 
     Link 0 is the base: the floating body, or the world if the base is fixed. Each further link has one degree of
     freedom, in MuJoCo's order; bodies with several joints become several links, welded bodies are merged. A link's
@@ -65,6 +66,7 @@ class Scene:
             floating scene's world holds, and its centre of mass in that link's frame.
         k_n, k_d, k_t, mu: stiffness, damping and friction of contact (Eq. 3).
         density, viscosity: of the fluid around the robot, kg/m^3 and kg/(m s).
+        terrain: None, or the ground in the plane's place: (1 or num_envs, K, 2) vertices, see with_terrain.
         approximations: what the file asks for and is simulated only roughly, a sentence each.
     """
 
@@ -113,6 +115,7 @@ class Scene:
     mu: float
     density: float = 0.0
     viscosity: float = 0.0
+    terrain: Array | None = None
     approximations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -168,6 +171,7 @@ class Scene:
             "slide": bool(self.slide[1:].any()),
             "ball": self.nball > 0,
             "contact": self.ncontact > 0,
+            "terrain": self.ncontact > 0 and self.terrain is not None,
             "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0))).any()),
             "stiffness": bool(self.stiffness.any()),
             "damping": bool(self.damping.any()),
@@ -233,6 +237,22 @@ class Scene:
             name: np.full(self.nlink, value) if name.endswith("_limit") else value for name, value in constants.items()
         }
         return dataclasses.replace(self, **changes)
+
+    def with_terrain(self, vertices: ArrayLike) -> Scene:
+        """A copy whose ground is a profile z(x), the same at every y, in place of the plane.
+
+        Args:
+            vertices: (x, z) in the world [m], joined by straight segments whose first and last go on for ever:
+                (K, 2) for all environments, or (num_envs, K, 2). K is 2 or more. Of two vertices of equal x the
+                segment is a wall.
+
+        Raises:
+            ValueError: another shape, numbers that are not finite, x that decreases, walls at an end or back to back,
+                or a robot that touches no ground.
+        """
+        if not self.ncontact:
+            raise ValueError(f"{self.name} touches no ground, so it has no terrain")
+        return dataclasses.replace(self, terrain=check_terrain(vertices), ground_height=0.0)
 
     def without(self, *features: str) -> Scene:
         """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping", "muscle", "drag".

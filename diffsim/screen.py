@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.render import Renderer
+from diffsim.render import Renderer, add_terrain, hide_planes
 from diffsim.scene import Scene
 
 RenderMode = Literal["rgb_array", "human"]
@@ -56,7 +56,7 @@ class Screen:
         if self.mode == "rgb_array":
             if self._renderer is None:
                 self._renderer = Renderer(self._scene, *FRAME_SIZE)
-            return tuple(map(self._renderer.draw, qpos))
+            return tuple(self._renderer.draw(row, profile=k) for k, row in enumerate(qpos))
         if self._window is None:
             self._open()
         with self._window.lock():
@@ -88,6 +88,7 @@ class Screen:
         if not ready:
             raise RuntimeError("render_mode 'human' opens a window, but there is no display; take 'rgb_array'")
         self._model = copy.copy(self._scene.mj_model)
+        material = hide_planes(self._model) if self._scene.terrain is not None else -1
         self._data = mujoco.MjData(self._model)
         others = {*threading.enumerate()}
         self._window = mujoco.viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
@@ -95,3 +96,5 @@ class Screen:
         with self._window.lock():
             self._window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
             self._window.cam.trackbodyid = min(1, self._model.nbody - 1)
+            if self._scene.terrain is not None:
+                add_terrain(self._window.user_scn, self._scene.terrain[0], material)

@@ -21,7 +21,7 @@ class Simulator:
     its steps are overwritten (asserted). Steps that need no gradient store nothing.
 
     Args:
-        scene: what is simulated.
+        scene: what is simulated; a terrain of one profile for all copies, or of one for each.
         num_envs: number of copies N.
         integration: integrator, substeps and theta.
         control_dt: seconds of one control step.
@@ -75,6 +75,8 @@ class Simulator:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
         if dtype not in WARP_DTYPE:
             raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
+        if scene.terrain is not None and len(scene.terrain) not in (1, num_envs):
+            raise ValueError(f"terrain has {len(scene.terrain)} profiles, must have 1 or one for each of {num_envs}")
         self.device = check_device(device)
         width, bodies = len(FACTORS) if factors else 0, scene.nbody if forces else 0
         numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width + 6 * bodies)

@@ -15,7 +15,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffsim.render import GROUND
 from diffsim.scene import Scene
+from diffsim.terrain import slabs
 
 MAX_BYTES = 700_000  # of poses; what is longer keeps every second control step, or fewer
 HIDDEN_GROUP = 3  # geoms from this group on are not drawn, as in MuJoCo
@@ -69,8 +71,8 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
         "dt": stride * control_dt,
         "frames": len(poses),
         "bodies": model.nbody,
-        "floor": float(model.geom_pos[planes[0], 2]) if len(planes) else None,
-        "geoms": [_geom(model, k) for k in range(model.ngeom) if _is_drawn(model, k)],
+        "floor": float(model.geom_pos[planes[0], 2]) if len(planes) and scene.terrain is None else None,
+        "geoms": [_geom(model, k) for k in range(model.ngeom) if _is_drawn(model, k)] + _terrain(scene),
         "muscles": [_muscle(model, model.actuator_trnid[k, 0]) for k in muscles],
         "camera": orbit(model),
         "poses": _base64(poses.astype("<f4")),
@@ -115,6 +117,17 @@ def _geom(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
         "quat": _rounded(model.geom_quat[geom]),
         "rgba": _rounded(_rgba(model, geom)),
     }
+
+
+def _terrain(scene: Scene) -> list[dict[str, Any]]:
+    """The first profile, of boxes on the world."""
+    boxes = []
+    for size, centre, rotation in [] if scene.terrain is None else slabs(scene.terrain[0]):
+        quat = np.empty(4)
+        mujoco.mju_mat2Quat(quat, rotation.ravel())
+        places = {"size": _rounded(size), "pos": _rounded(centre), "quat": _rounded(quat)}
+        boxes.append({"type": "box", "body": 0, **places, "rgba": _rounded(GROUND)})
+    return boxes
 
 
 def _muscle(model: mujoco.MjModel, tendon: int) -> dict[str, Any]:

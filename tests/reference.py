@@ -7,6 +7,7 @@ joint acceleration, and the accelerations from `numpy.linalg.solve`. Vectors are
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,20 +175,70 @@ def contact_law(scene: Scene, depth: float, velocity: Array, h: float = 0.0, the
     return force, h * np.array([viscosity, viscosity, theta * h * scene.k_n - scene.k_d * depth])
 
 
-def lowest_points(scene: Scene, links: list[Link]) -> list[tuple[Link, Array, float]]:
-    """The link, the lowest point (from the link's origin) and its signed depth, of each contact sphere."""
-    points = []
-    for i, centre, radius in zip(scene.contact_link, scene.contact_position, scene.contact_radius, strict=True):
-        lowest = links[i].rotation @ centre - np.array([0.0, 0.0, radius])
-        points.append((links[i], lowest, links[i].position[2] + lowest[2] - scene.ground_height))
-    return points
+class Touch(NamedTuple):
+    link: Link
+    lowest: Array  # (3,) the point of the contact sphere nearest to the ground, from the link's origin
+    depth: float  # signed
+    frame: Array  # (3, 3) columns: along the ground in the plane of its profile, y, the ground's normal
+
+
+def touches(scene: Scene, links: list[Link], profile: int = 0) -> list[Touch]:
+    """Of each contact sphere."""
+    found = []
+    for i, place, radius in zip(scene.contact_link, scene.contact_position, scene.contact_radius, strict=True):
+        centre = links[i].rotation @ place
+        x, _, z = links[i].position + centre
+        depth, normal = z - radius - scene.ground_height, np.array([0.0, 1.0])
+        if scene.terrain is not None:
+            depth, normal = clearance(scene.terrain[profile], np.array([x, z]), radius)
+        n = np.array([normal[0], 0.0, normal[1]])
+        frame = np.stack([np.cross([0.0, 1.0, 0.0], n), [0.0, 1.0, 0.0], n], 1)
+        found.append(Touch(links[i], centre - radius * n, depth, frame))
+    return found
+
+
+def clearance(vertices: Array, centre: Array, radius: float) -> tuple[float, Array]:
+    """How far a disc is from touching a profile, or minus its shortest way out, and the direction (2,) away from it.
+
+    By trying all places where the centre of a disc that touches can be nearest.
+    """
+    far = 1e4 * np.diff(vertices[[0, 1, -2, -1]], axis=0)[[0, 2]]
+    corners = np.concatenate([vertices[:1] - far[:1], vertices, vertices[-1:] + far[1:]])
+    starts, runs = corners[:-1], np.diff(corners, axis=0)
+    normals = np.stack([-runs[:, 1], runs[:, 0]], 1) / np.linalg.norm(runs, axis=1, keepdims=True)
+
+    def feet(point: Array) -> Array:
+        part = ((point - starts) * runs).sum(1) / (runs**2).sum(1)
+        return starts + np.clip(part, 0, 1)[:, None] * runs
+
+    def above(point: Array) -> bool:
+        right = np.searchsorted(corners[:, 0], point[0], "right")
+        (a, b), (c, d) = corners[right - 1], corners[right]
+        return point[1] > b + (d - b) * (point[0] - a) / (c - a)
+
+    away = centre - feet(centre)
+    distance = np.linalg.norm(away, axis=1)
+    if above(centre) and distance.min() >= radius:
+        nearest = distance.argmin()
+        return distance[nearest] - radius, away[nearest] / distance[nearest]
+    ways = [(foot - centre) + radius * n for foot, n in zip(feet(centre), normals, strict=True)]
+    ways += [(way - centre) * (1 - radius / np.linalg.norm(way - centre)) for way in vertices if radius > 0]
+    for v, m, n in zip(vertices, normals, normals[1:], strict=False):
+        ways.append(v + radius * (m + n) / (1 + m @ n) - centre)
+    ways.sort(key=lambda way: way @ way)
+    for way in ways:
+        end = centre + (1 + 1e-9) * way  # a hair beyond, for rounding
+        if above(end) and np.linalg.norm(end - feet(end), axis=1).min() >= radius:
+            return -np.linalg.norm(way), way / np.linalg.norm(way)
+    raise ValueError("no way out")
 
 
 def contacts(scene: Scene, qpos: Array, qvel: Array) -> tuple[Array, Array]:
     """Signed depths (nc,) and velocities (nc, 3) of the lowest points of all contact spheres."""
-    points = lowest_points(scene, kinematics(scene, qpos, qvel))
-    depths = np.array([depth for _, _, depth in points])
-    return depths, np.array([link.point(lowest)[0] for link, lowest, _ in points]).reshape(-1, 3)
+    found = touches(scene, kinematics(scene, qpos, qvel))
+    depths = np.array([touch.depth for touch in found])
+    velocities = [touch.link.point(touch.lowest)[0] for touch in found]
+    return depths, np.array(velocities).reshape(-1, 3)
 
 
 def acceleration(
@@ -198,10 +249,12 @@ def acceleration(
     h: float = 0.0,
     theta: float = 0.0,
     forces: Array | None = None,
+    profile: int = 0,
 ) -> Array:
     """qacc of mass @ qacc = forces - bias. The implicit step has forces that are linear in it: f - resistance * a.
 
-    h is the substep of the implicit integrator, 0 for the explicit one; theta how far ahead stiffness is evaluated.
+    h is the substep of the implicit integrator, 0 for the explicit one; theta how far ahead stiffness is evaluated;
+    profile says which environment's terrain it is.
     """
     links = kinematics(scene, qpos, qvel)
     mass, bias = mass_and_bias(scene, links)
@@ -210,11 +263,13 @@ def acceleration(
     force = force + muscle_forces(scene, links, ctrl)
     if forces is not None:
         force = force + external_forces(scene, links, forces)
-    for link, lowest, depth in lowest_points(scene, links):
+    for link, lowest, depth, frame in touches(scene, links, profile):
         velocity, jacobian, drift = link.point(lowest)
-        push, resistance = contact_law(scene, depth + theta * h * velocity[2], velocity, h, theta)
+        # The law acts along the ground and along its normal.
+        local, jacobian = frame.T @ velocity, frame.T @ jacobian
+        push, resistance = contact_law(scene, depth + theta * h * local[2], local, h, theta)
         # The law resists the change of the velocity field at a fixed place, so w x v of the moving point is not in it.
-        drift = drift - np.cross(link.angular_velocity, velocity)
+        drift = frame.T @ (drift - np.cross(link.angular_velocity, velocity))
         mass = mass + jacobian.T @ np.diag(resistance) @ jacobian
         force = force + jacobian.T @ (push - resistance * drift)
     return np.linalg.solve(mass, force + fluid_forces(scene, links))
@@ -288,13 +343,14 @@ def step(
     control_dt: float,
     integration: Integration,
     forces: Array | None = None,
+    profile: int = 0,
 ) -> tuple[Array, Array]:
     """One control step of one environment."""
     integrator, substeps, theta = integration
     h = control_dt / substeps
     for _ in range(substeps):
         implicit = h if integrator == "implicit" else 0.0
-        qvel = qvel + h * acceleration(scene, qpos, qvel, ctrl, implicit, theta, forces)
+        qvel = qvel + h * acceleration(scene, qpos, qvel, ctrl, implicit, theta, forces, profile)
         qpos = integrate(scene, qpos, qvel, h)
     return qpos, qvel
 

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -20,6 +21,7 @@ from diffsim.kernels.spec import kernel_spec
 from diffsim.launcher import default_division
 from diffsim.scene import FACTORS
 from diffsim.simulator import Simulator
+from diffsim.terrain import rough
 
 HORIZON = 32
 
@@ -53,8 +55,8 @@ def test_kernels_compile_for_a_gpu_without_one(name: str) -> None:
             assert (function in code) == (feature in scene.features), function
 
 
-def test_kernels_with_factors_and_forces_compile_for_a_gpu_without_one() -> None:
-    scene = task_scene("ant")
+def test_kernels_with_factors_forces_and_terrain_compile_for_a_gpu_without_one() -> None:
+    scene = task_scene("ant").with_terrain(rough(0))
     spec = kernel_spec(scene, divide(scene, 4), wp.float32, implicit=True, env_last=True, varied=True, forced=True)
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
         compiled(kernel.module, arch=90)
@@ -65,7 +67,7 @@ def episode(
 ) -> dict[str, torch.Tensor]:
     """The state after 32 control steps of random actions, and the gradients of a random function of it.
 
-    With `integration` every environment has factors and external forces of its own, else there are none.
+    With `integration` every environment has factors, external forces and terrain of its own, else there are none.
     """
     n, kwargs = 8, dict(dtype=torch.float64)
     start = diffsim.make(name, num_envs=n, seed=0, **kwargs)
@@ -77,9 +79,12 @@ def episode(
         parts.append(torch.rand(n, len(FACTORS), generator=generator, **kwargs) + 0.5)
         parts.append(torch.randn(n, start.scene.nbody, 6, generator=generator, **kwargs))
     inputs = [x.to(device).detach().requires_grad_() for x in parts]
-    division = divide(start.scene, *team) if team else None
+    scene = start.scene
+    if integration:
+        scene = scene.with_terrain(np.stack([rough(seed, degrees=4.0, start=-2.5) for seed in range(n)]))
+    division = divide(scene, *team) if team else None
     kwargs |= dict(device=device, division=division, **dict.fromkeys(("factors", "forces"), integration is not None))
-    sim = Simulator(start.scene, n, integration or start.sim.integration, start.control_dt, HORIZON, **kwargs)
+    sim = Simulator(scene, n, integration or start.sim.integration, start.control_dt, HORIZON, **kwargs)
     qpos, qvel, steps, *optional = inputs
     if optional:
         sim.factors, sim.forces = optional
@@ -99,7 +104,7 @@ def episode(
     + [(name, Integration("implicit", 16, 0.5)) for name in ("ant", "humanoid_mtu")],
 )
 def test_gpu_agrees_with_cpu(name: str, integration: Integration | None) -> None:
-    """Without factors and forces, and with them and the gradient in them."""
+    """Without factors, forces and terrain, and with them and the gradient in the first two."""
     reference = episode(name, "cpu", integration=integration)
     for team in [(1, 1), (2, 1), (4, 1), (8, 4)]:
         ours = episode(name, "cuda", team, integration)

@@ -479,7 +479,7 @@ def test_a_run_resumes_bitwise_with_its_particles(algorithm: str, tmp_path: Path
 
 @pytest.mark.parametrize(
     "flags", ["gmm --algorithm ppo", "gmm --algorithm shac", "gaussian --algorithm sac", "discrete --algorithm ppo",
-              "discrete --algorithm shac --estimator straight-through"]
+              "discrete --algorithm shac"]
 )  # fmt: skip
 def test_other_policies_train(flags: str, tmp_path: Path) -> None:
     checkpoint = run(pfpn, tmp_path, *f"{SMALL} --iterations 2 --policy {flags}".split())
@@ -535,7 +535,7 @@ def test_settings_are_those_of_the_other_scripts(algorithm: str, script: ModuleT
         ("--particles 1", "--particles 1: --policy pfpn needs at least 2"),
         ("--dead 1", "--dead 1: with equal weights all particles would be dead"),
         ("--policy discrete --algorithm sac", "--policy discrete has no density"),
-        ("--policy discrete --algorithm shac", "choose --estimator straight-through or mixed"),
+        ("--policy discrete --algorithm shac --estimator implicit", "choose --estimator straight-through or mixed"),
         ("--algorithm sac --estimator mixed", "--estimator mixed needs the rewards of a window"),
         ("--algorithm sac --buffer-size 10", "--buffer-size 10 holds no window of 32 steps of 128"),
         ("--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),

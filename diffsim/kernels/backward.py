@@ -33,13 +33,15 @@ from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec, module_options
+from diffsim.kernels.terrain import terrain_contact
 from diffsim.scene import FACTORS
 
 
 @cache
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
-    T, vec3, vec6, mat3, quat, Model, Law = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model, t.Law
+    T, vec2, vec3, vec6, mat3, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
+    Model, Law, Place = t.Model, t.Law, kin.Place
     vec6s, array = wp.array(dtype=vec6), t.array
     join, force_at, point_velocity, momentum = sp.join, sp.force_at, sp.point_velocity, sp.momentum
     exp_quat, exp_adjoint, log_adjoint = sp.exp_quat, sp.exp_adjoint, sp.log_adjoint
@@ -53,6 +55,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     muscle = muscle_law(spec, adjoint=True)
     measure, add_pull_adjoint, hill = muscle.measure, muscle.add_pull_adjoint, hill_law(T).hill
     uses = spec.features
+    sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in uses
     joint, law_of, VARIED = joint_law(spec), environment_law(spec), spec.varied
     passive_gain, limit_constants_gain = joint.passive_gain, joint.limit_constants_gain
     DRAG, drag = "drag" in uses, drag_law(T)
@@ -102,7 +105,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         V: vec6,
         A: vec6,
         W: vec6,
-        height: T,
+        place: Place,
         h: T,
         theta: T,
         g_factors: array,  # written if varied only
@@ -127,16 +130,23 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             adj_v = adj_v + drag_adjoint(m, k, R, com, V, W)
         if wp.static(CONTACT):
             for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-                p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)
+                if wp.static(TERRAIN):
+                    p, v, depth, E, curvature = sphere_on_terrain(m, law.profile, c, R, x, V, place, h, theta)
+                else:
+                    p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
                 if touches(law, depth, v):
                     fc = contact_force(law, depth, v)
                     f = vec3(fc[0], fc[1], fc[2])
                     g_f = -point_velocity(W, p)
+                    if wp.static(TERRAIN):  # the law and its adjoint act in the frame E
+                        g_f = wp.transpose(E) * g_f
                     a = vec3()
                     hi = T(0.0)
                     if wp.static(IMPLICIT):
                         hi = h
                         a = point_velocity(A, p) + m.gravity
+                        if wp.static(TERRAIN):
+                            a = wp.transpose(E) * a
                         B = contact_resistance(law, depth, fc[3], h, theta)
                         f = f - wp.cw_mul(B, a)
                     g = contact_adjoint(law, depth, v, a, g_f, hi, theta)
@@ -147,12 +157,21 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         g_factors[K_T] = g_factors[K_T] + m.k_t * gk[2]
                         g_factors[MU] = g_factors[MU] + m.mu * gk[3]
                     g_v = vec3(g[0], g[1], g[2])
+                    if wp.static(TERRAIN):
+                        g_turn = wp.cross(g_v, v)[1] - wp.cross(g_f, f)[1]  # adjoint of the angle of E
+                        f = E * f
+                        g_v = E * g_v
                     wrench = force_at(p, f)
                     G = force_at(p, g_v)
                     g_p = vec3(T(0.0), T(0.0), g[3])
+                    if wp.static(TERRAIN):
+                        g_p = E * g_p
                     g_p = g_p + wp.cross(g_v, wp.spatial_top(V)) - wp.cross(f, wp.spatial_top(W))
                     if wp.static(IMPLICIT):
                         g_a = -wp.cw_mul(B, g_f)
+                        if wp.static(TERRAIN):
+                            g_turn = g_turn + wp.cross(g_a, a)[1]
+                            g_a = E * g_a
                         GA = force_at(p, g_a)
                         g_p = g_p + wp.cross(g_a, wp.spatial_top(A))
                         adj_a = adj_a + GA
@@ -161,7 +180,13 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     adj_w = adj_w - wrench
                     adj_v = adj_v + G
                     # The lowest point follows the sphere's centre, not the body's material.
-                    centre = p + vec3(T(0.0), T(0.0), m.contact_radius[c])
+                    if wp.static(TERRAIN):
+                        radius = m.contact_radius[c]
+                        tangent = E * vec3(T(1.0), T(0.0), T(0.0))
+                        centre = p + radius * E * vec3(T(0.0), T(0.0), T(1.0))
+                        g_p = g_p + curvature * (g_turn - radius * wp.dot(tangent, g_p)) * tangent
+                    else:
+                        centre = p + vec3(T(0.0), T(0.0), m.contact_radius[c])
                     adj_p = adj_p + force_at(centre, g_p)
                     adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
         return adj_a, adj_v, adj_w, adj_p
@@ -281,7 +306,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         for sub in range(substeps):
             row = row0 + substeps - 1 - sub
             # 1. the state of this substep, and the adjoint of the integrator
-            height = m.carrier_height
+            if wp.static(TERRAIN):
+                place = vec2(m.carrier_along, m.carrier_height)
+            else:
+                place = m.carrier_height
             A[0] = join(vec3(), -m.gravity)
             for i in range(1, n):
                 q[i] = load(ck_q, row, qpos_adr(m, at + i), e)
@@ -307,11 +335,14 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 gv = gv + h * gp
                 gw = gw + h * g_turn
                 gr = gr_start
-                height = height + load(ck_q, row, 2, e)
+                if wp.static(TERRAIN):
+                    place = place + vec2(load(ck_q, row, 0, e), load(ck_q, row, 2, e))
+                else:
+                    place = place + load(ck_q, row, 2, e)
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
                 A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v))
-            height = place_links(m, at, n, q, R, x, S, height)
+            place = place_links(m, at, n, q, R, x, S, place)
             for i in range(1, n):
                 k = at + i
                 p = m.parent[k]
@@ -356,7 +387,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 adj_w[i] = vec6()
                 adj_p[i] = vec6()
             for i in range(FIRST, n):
-                la, lv, lw, lp = link_adjoint(m, law, at + i, R[i], x[i], V[i], A[i], W[i], height, h, theta, g_factors)
+                la, lv, lw, lp = link_adjoint(m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, h, theta, g_factors)
                 adj_a[i] = la
                 adj_v[i] = lv
                 adj_w[i] = lw

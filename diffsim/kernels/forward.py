@@ -24,12 +24,14 @@ from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import MAX_SPEED, KernelSpec, module_options
+from diffsim.kernels.terrain import terrain_contact
 
 
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
-    T, vec3, vec6, mat3, mat6, quat, Model, Law = spec.dtype, t.vec3, t.vec6, t.mat3, t.mat6, t.quat, t.Model, t.Law
+    T, vec2, vec3, vec6, mat3, mat6, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.mat6, t.quat
+    Model, Law, Place = t.Model, t.Law, kin.Place
     mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
     join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
     store, place_links, sphere_state = kin.store, kin.place_links, kin.sphere_state
@@ -37,6 +39,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     contact = contact_law(T)
     touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
     uses = spec.features
+    sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in uses
     joint, law_of, VARIED = joint_law(spec), environment_law(spec), spec.varied
     passive_force, passive_resistance = joint.passive_force, joint.passive_resistance
     muscle = muscle_law(spec, adjoint=False)
@@ -53,7 +56,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
 
     @wp.func
-    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
+    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, h: T, theta: T):
         """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
         com = x + R * m.com[k]
         inertia = R * m.inertia[k] * wp.transpose(R)
@@ -69,14 +72,23 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             F = F - drag_wrench(m, k, R, com, V)
         if wp.static(CONTACT):
             for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-                p, v, depth = sphere_state(m, c, R, x, V, height, h, theta)
+                if wp.static(TERRAIN):
+                    p, v, depth, E, _ = sphere_on_terrain(m, law.profile, c, R, x, V, place, h, theta)
+                else:
+                    p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
                 if touches(law, depth, v):
                     fc = contact_force(law, depth, v)
                     f = vec3(fc[0], fc[1], fc[2])
+                    if wp.static(TERRAIN):
+                        f = E * f
                     if wp.static(IMPLICIT):
                         B = contact_resistance(law, depth, fc[3], h, theta)
-                        f = f - wp.cw_mul(B, m.gravity)
-                        D = wp.diag(B)
+                        if wp.static(TERRAIN):
+                            D = E * wp.diag(B) * wp.transpose(E)
+                            f = f - D * m.gravity
+                        else:
+                            f = f - wp.cw_mul(B, m.gravity)
+                            D = wp.diag(B)
                         PB = wp.skew(p) * D
                         Ia = Ia - PB * wp.skew(p)
                         Ib = Ib + PB
@@ -216,11 +228,17 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
 
         for sub in range(substeps):
             row = row0 + sub
-            height = m.carrier_height
+            if wp.static(TERRAIN):
+                place = vec2(m.carrier_along, m.carrier_height)
+            else:
+                place = m.carrier_height
             if wp.static(FLOATING):
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
-                height = height + pos[2]
+                if wp.static(TERRAIN):
+                    place = place + vec2(pos[0], pos[2])
+                else:
+                    place = place + pos[2]
                 if record == 1:
                     for k in range(3):
                         store(ck_q, row, k, e, pos[k])
@@ -231,7 +249,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             # 1. outward: poses, velocities, velocity products, inertias and bias forces
             if wp.static(NBALL > 0):
                 place_balls(m, lane, turn, R, q)
-            height = place_links(m, at, n, q, R, x, S, height)
+            place = place_links(m, at, n, q, R, x, S, place)
             for i in range(1, n):
                 k = at + i
                 V[i] = V[m.parent[k]] + S[i] * qd[i]
@@ -255,7 +273,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 Id[i] = mat3()
                 P[i] = vec6()
             for i in range(FIRST, n):
-                ia, ib, id, force = link_inertia(m, law, at + i, R[i], x[i], V[i], height, h, theta)
+                ia, ib, id, force = link_inertia(m, law, at + i, R[i], x[i], V[i], place, h, theta)
                 Ia[i] = ia
                 Ib[i] = ib
                 Id[i] = id

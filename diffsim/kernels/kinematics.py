@@ -13,7 +13,8 @@ from diffsim.kernels.spec import KernelSpec
 @cache
 def kinematics(spec: KernelSpec) -> SimpleNamespace:
     t = types(spec.dtype)
-    T, vec3, vec6, mat3, quat, Model, array = spec.dtype, t.vec3, t.vec6, t.mat3, t.quat, t.Model, t.array
+    T, vec2, vec3, vec6, mat3, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
+    Model, array = t.Model, t.array
     sp = spatial(T)
     join, point_velocity, log_quat, quat_of = sp.join, sp.point_velocity, sp.log_quat, sp.quat_of
     mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
@@ -21,6 +22,9 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     BALL, STIFFNESS = "ball" in spec.features, "stiffness" in spec.features
     HINGE, SLIDE = "hinge" in spec.features, "slide" in spec.features
     IMPLICIT, ENV_LAST, THREADS_PER_ENV = spec.implicit, spec.env_last, spec.threads_per_env
+    # Where the carrier is: its height over the ground, or with a terrain (x, z).
+    TERRAIN = "terrain" in spec.features
+    Place = vec2 if TERRAIN else T
 
     @wp.func
     def load(a: t.array3, row: int, k: int, e: int):
@@ -68,8 +72,8 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                 q[i + 2] = r[2]
 
     @wp.func
-    def place_links(m: Model, at: int, n: int, q: array, R: mat3s, x: vec3s, S: vec6s, height: T):
-        """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's height.
+    def place_links(m: Model, at: int, n: int, q: array, R: mat3s, x: vec3s, S: vec6s, place: Place):
+        """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's place.
 
         R[i] of a ball joint's first link comes with the joint's own turn.
         """
@@ -98,10 +102,13 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                 # The massless slides up to the carrier move its origin: nothing reads where they are.
                 if i <= CARRIER:
                     xi = vec3()
-                    height = height + a[2] * q[i]
+                    if wp.static(TERRAIN):
+                        place = place + q[i] * vec2(a[0], a[2])
+                    else:
+                        place = place + a[2] * q[i]
             x[i] = xi
             S[i] = Si
-        return height
+        return place
 
     @wp.func
     def sphere_state(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
@@ -117,6 +124,7 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     return SimpleNamespace(
         load=load,
         store=store,
+        Place=Place,
         link_of=link_of,
         qpos_adr=qpos_adr,
         load_quat=load_quat,

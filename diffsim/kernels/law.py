@@ -19,7 +19,7 @@ K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))
 def environment_law(spec: KernelSpec) -> wp.Function:
     t = types(spec.dtype)
     Model, Law = t.Model, t.Law
-    NU, CONTACT, VARIED = spec.nu, "contact" in spec.features, spec.varied
+    NU, CONTACT, VARIED, TERRAIN = spec.nu, "contact" in spec.features, spec.varied, "terrain" in spec.features
 
     @wp.func
     def law_of(m: Model, ctrl: t.array2, e: int):
@@ -39,6 +39,8 @@ def environment_law(spec: KernelSpec) -> wp.Function:
             law.d_limit = ctrl[e, NU + D_LIMIT]
             law.mass = ctrl[e, NU + MASS]
             law.motor = ctrl[e, NU + MOTOR]
+        if wp.static(TERRAIN):
+            law.profile = e % m.terrain.shape[0]
         return law
 
     return law_of

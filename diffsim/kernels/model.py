@@ -15,7 +15,8 @@ from diffsim.scene import Scene
 @cache
 def types(dtype: type) -> SimpleNamespace:
     """Warp's vector types of one precision, and the struct of a scene's numbers."""
-    vec3, mat3, vec9 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype), wp.types.vector(9, dtype)
+    vec3, vec4, vec9 = (wp.types.vector(n, dtype) for n in (3, 4, 9))
+    mat3 = wp.types.matrix((3, 3), dtype)
 
     @wp.struct
     class Model:
@@ -74,6 +75,10 @@ def types(dtype: type) -> SimpleNamespace:
         drag_viscous: wp.array(dtype=vec3)  # (a, c, 0)
         drag_force: wp.array(dtype=vec3)
         drag_torque: wp.array(dtype=vec3)
+        # read in scenes with a terrain only: a row of each profile, or one for all environments, whose vertices are
+        # (x, z, unit vector along the segment that begins there)
+        terrain: wp.array2d(dtype=vec4)
+        carrier_along: dtype  # x at q = 0
         gravity: vec3
         carrier_height: dtype  # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
         k_n: dtype
@@ -92,12 +97,14 @@ def types(dtype: type) -> SimpleNamespace:
         d_limit: dtype
         mass: dtype
         motor: dtype
+        profile: int  # row of Model.terrain, read where there is one only
 
     return SimpleNamespace(
         dtype=dtype,
+        vec2=wp.types.vector(2, dtype),
         vec3=vec3,
         mat3=mat3,
-        vec4=wp.types.vector(4, dtype),
+        vec4=vec4,
         vec6=wp.types.vector(6, dtype),
         vec9=vec9,
         mat6=wp.types.matrix((6, 6), dtype),
@@ -175,11 +182,12 @@ class _Writer:
             outboard=(self.slot[self.lane, last[link]], int),
         )
         # Along the chain of slides that ends at the carrier nothing turns, so the offsets add up as they are.
-        frame, height = np.eye(3), 0.0
+        frame, place = np.eye(3), np.zeros(3)
         for i in range(1, scene.carrier + 1):
-            height += (frame @ position[i])[2]
+            place += frame @ position[i]
             frame = frame @ r[i]
-        self.model.carrier_height = self.dtype(height - scene.ground_height)
+        self.model.carrier_along = self.dtype(place[0])
+        self.model.carrier_height = self.dtype(place[2] - scene.ground_height)
         self.model.gravity = t.vec3(*scene.gravity)
 
     def put_masses(self) -> None:
@@ -240,6 +248,10 @@ class _Writer:
         )
         for name in ("k_n", "k_d", "k_t", "mu"):
             setattr(self.model, name, self.dtype(getattr(scene, name)))
+        vertices = np.zeros((1, 1, 2)) if scene.terrain is None else scene.terrain
+        along = np.diff(vertices, axis=1, append=vertices[:, -1:])
+        along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), np.finfo(float).tiny)
+        self.model.terrain = wp.array(np.concatenate([vertices, along], 2), dtype=self.t.vec4, device=self.device)
 
     def put_bodies(self) -> None:
         """Bodies by lane, then by slot; each is on the lane that carries its link's mass."""

@@ -128,11 +128,11 @@ class Gait:
 
 
 def describe(evaluation: Evaluation) -> Gait | None:
-    """The gait of an evaluation's first episodes; None without ground contact, or if none lasts over a second."""
+    """The gait of an evaluation's first episodes; None without contact with a plane, or if none lasts over a second."""
     scene, dt, first = evaluation.scene, evaluation.control_dt, round(SETTLING / evaluation.control_dt)
     lengths = evaluation.lengths[:EPISODES].tolist()
     episodes = [k for k, length in enumerate(lengths) if length > first + 1]
-    if "contact" not in scene.features or not episodes:
+    if "contact" not in scene.features or scene.terrain is not None or not episodes:
         return None
     model, bodies = scene.mj_model, contact_bodies(scene)
     qpos = [evaluation.qpos[first : lengths[k], k].double().cpu().numpy() for k in episodes]

@@ -1,0 +1,147 @@
+"""Contact of a sphere with a piecewise-linear ground z(x), and where it is: what of contact.py's plane is not the same.
+
+A sphere of radius r touches where its centre is nearer to the ground than r. Signed distance d, normal n and curvature
+k of the centre's distance field are those of the nearest feature:
+
+    a segment         d = (c - a) . n - r                           k = 0
+    a ridge           d = |c - v| - r,   n = (c - v) / |c - v|      k = 1 / |c - v|
+    a valley          d = -|c - w|,      n = (w - c) / |c - w|      k = -1 / |c - w|
+
+where w is the centre of the sphere that rests in the valley, touching both sides: a centre below it is pushed there
+by both. So d and n are continuous, d's gradient is n, and dn = k t (t . dc) with the tangent t. They jump only where
+two features are equally near: for a centre that is itself below a ridge, which is a depth of r or more, and in a notch
+that the sphere does not fit into.
+
+The law of contact acts in the frame E = (t, y, n) of the feature. Its adjoint gains what turns that frame.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from diffsim.kernels.model import types
+from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
+
+
+@cache
+def terrain_contact(spec: KernelSpec) -> wp.Function:
+    t, sp = types(spec.dtype), spatial(spec.dtype)
+    T, vec2, vec3, vec4, vec6, mat3, Model = spec.dtype, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3, t.Model
+    point_velocity, IMPLICIT = sp.point_velocity, spec.implicit
+
+    @wp.func
+    def length_of(m: Model, row: int, i: int):
+        """Of segment i; the first and the last one have no end."""
+        a = m.terrain[row, i]
+        b = m.terrain[row, i + 1]
+        length = (b[0] - a[0]) * a[2] + (b[1] - a[1]) * a[3]
+        if i == 0 or i + 2 == m.terrain.shape[1]:
+            length = T(wp.inf)
+        return length
+
+    @wp.func
+    def segment_below(m: Model, row: int, x: T):
+        low = int(0)
+        high = m.terrain.shape[1] - 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            if m.terrain[row, middle][0] <= x:
+                low = middle
+            else:
+                high = middle
+        return low
+
+    @wp.func
+    def in_valley(m: Model, row: int, i: int, x: T, z: T, r: T, otherwise: vec4):
+        """(d, n_x, n_z, k) of a centre that both sides of the valley at vertex i push, or what it is otherwise."""
+        result = otherwise
+        if i > 0 and i + 1 < m.terrain.shape[1]:
+            a = m.terrain[row, i - 1]
+            b = m.terrain[row, i]
+            sine = a[2] * b[3] - a[3] * b[2]
+            cosine = a[2] * b[2] + a[3] * b[3]
+            fits = r * sine <= (T(1.0) + cosine) * wp.min(length_of(m, row, i - 1), length_of(m, row, i))
+            if sine > T(0.0) and fits:
+                scale = r / (T(1.0) + cosine)
+                wx = b[0] - scale * (a[3] + b[3]) - x
+                wz = b[1] + scale * (a[2] + b[2]) - z
+                away = wp.sqrt(wx * wx + wz * wz)
+                if wx * a[2] + wz * a[3] < T(0.0) and wx * b[2] + wz * b[3] > T(0.0) and away > T(0.0):
+                    result = vec4(-away, wx / away, wz / away, T(-1.0) / away)
+        return result
+
+    @wp.func
+    def nearest(m: Model, row: int, x: T, z: T, r: T, reach: T):
+        """(d, n_x, n_z, k) of the centre (x, z); over the ground exact for centres nearer than `reach` only."""
+        last = m.terrain.shape[1] - 1
+        below = segment_below(m, row, x)
+        a = m.terrain[row, below]
+        above = z - a[1] - (x - a[0]) * a[3] / a[2]
+        result = vec4(above - r, T(0.0), T(1.0), T(0.0))
+        # The nearest point is no farther than the one straight below or above: nor is it so in x.
+        bound = wp.abs(above)
+        if above > T(0.0):
+            bound = wp.min(above, reach)
+        i = below
+        while i > 0 and m.terrain[row, i][0] > x - bound:
+            i = i - 1
+        best = bound * bound
+        found = int(-1)
+        end = int(0)  # -1, 1: the nearest point of the segment is where it begins, where it ends
+        while i < last and (i <= below or m.terrain[row, i][0] < x + bound):
+            b = m.terrain[row, i]
+            dx = x - b[0]
+            dz = z - b[1]
+            s = dx * b[2] + dz * b[3]
+            length = length_of(m, row, i)
+            at = int(0)
+            if s < T(0.0) and i > 0:
+                s = T(0.0)
+                at = -1
+            elif s > length:
+                s = length
+                at = 1
+            dx = dx - s * b[2]
+            dz = dz - s * b[3]
+            if dx * dx + dz * dz <= best:
+                best = dx * dx + dz * dz
+                found = i
+                end = at
+            i = i + 1
+        if found >= 0:
+            b = m.terrain[row, found]
+            if end == 0:
+                result = vec4((z - b[1]) * b[2] - (x - b[0]) * b[3] - r, -b[3], b[2], T(0.0))
+                result = in_valley(m, row, found, x, z, r, result)
+                result = in_valley(m, row, found + 1, x, z, r, result)
+            else:
+                vertex = found + wp.max(end, 0)
+                b = m.terrain[row, vertex]
+                away = wp.where(above > T(0.0), wp.sqrt(best), -wp.sqrt(best))
+                if best > T(0.0):
+                    result = vec4(away - r, (x - b[0]) / away, (z - b[1]) / away, T(1.0) / away)
+                result = in_valley(m, row, vertex, x, z, r, result)
+        return result
+
+    @wp.func
+    def sphere_on_terrain(m: Model, row: int, c: int, R: mat3, x: vec3, V: vec6, place: vec2, h: T, theta: T):
+        """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
+        theta h ahead if implicit), E and the curvature k."""
+        centre = x + R * m.contact_position[c]
+        r = m.contact_radius[c]
+        reach = r
+        if wp.static(IMPLICIT):
+            fastest = wp.length(point_velocity(V, centre)) + r * wp.length(wp.spatial_top(V))
+            reach = r + theta * h * fastest
+        hit = nearest(m, row, place[0] + centre[0], place[1] + centre[2], r, reach)
+        n = vec3(hit[1], T(0.0), hit[2])
+        E = mat3(n[2], T(0.0), n[0], T(0.0), T(1.0), T(0.0), -n[0], T(0.0), n[2])
+        p = centre - r * n
+        v = wp.transpose(E) * point_velocity(V, p)
+        depth = hit[0]
+        if wp.static(IMPLICIT):
+            depth = depth + theta * h * v[2]
+        return p, v, depth, E, hit[3]
+
+    return sphere_on_terrain

@@ -1,0 +1,376 @@
+"""Terrain: contact with a piecewise-linear ground, against the plane, tilted gravity, NumPy and differences."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+import reference
+import torch
+from scenes import BALL, PENDULUM, acting_states, parse, run, task_scene, unit
+from test_accuracy import source
+from test_gradient import check_gradients, gradients
+
+import diffsim
+from diffsim import render, web
+from diffsim.integration import Integration
+from diffsim.planning.system import System
+from diffsim.scene import Scene
+from diffsim.simulator import Simulator
+from diffsim.terrain import Elevation, incline, rough, slabs, step
+
+IMPLICIT = Integration("implicit", 8, 0.5)  # of the ball; the hopper is explicit, so that two kernels do for all
+# A valley, a ridge, a wall and a short segment; a ball of 0.1 m fits between all of them.
+HILLS = np.array([[-1.0, 0.2], [0.0, 0.0], [1.0, 0.4], [2.0, 0.1], [2.5, 0.1], [2.5, 0.5], [3.0, 0.5], [3.25, 0.6]])
+PLANE = np.array([[0.0, 0.0], [1.0, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def ball() -> Scene:
+    return parse(BALL).with_terrain(HILLS)
+
+
+def pressed(scene: Scene, x: np.ndarray, rng: np.random.Generator):
+    """Balls at these x, up to 3 cm deep in the ground; every other one nearly at rest."""
+    qpos = np.zeros((len(x), 7))
+    for row, along in zip(qpos, x, strict=True):
+        z, depth = 2.0, rng.uniform(0, 0.03)
+        while (d := reference.clearance(scene.terrain[0], np.array([along, z]), 0.1)[0]) > -depth:
+            z -= max(d + depth, 1e-4)
+        row[:3] = along, rng.normal(), z
+    qpos[:, 3:] = unit(rng.normal(size=(len(x), 4)))
+    qvel = rng.normal(size=(len(x), 6))
+    qvel[::2] *= 0.02
+    return qpos, qvel, np.zeros((len(x), 0))
+
+
+def everywhere(rng: np.random.Generator) -> np.ndarray:
+    """Places on the hills, most of them near a vertex."""
+    return np.concatenate([rng.uniform(-1.5, 3.5, 16), *(rng.uniform(x - 0.05, x + 0.05, 6) for x in HILLS[:, 0])])
+
+
+def hopping(vertices: np.ndarray, count: int, rng: np.random.Generator):
+    """Hoppers with joints beyond their limits, all over the hills, 1 cm deep in the ground."""
+    qpos, qvel, ctrl = acting_states(task_scene("hopper"), count, rng)
+    scene = task_scene("hopper").with_terrain(vertices)
+    qpos[:, 0] = rng.uniform(-1.0, 3.5, count)
+    for _ in range(3):
+        qpos[:, 1] -= [reference.contacts(scene, *state)[0].min() + 0.01 for state in zip(qpos, qvel, strict=True)]
+    return scene, (qpos, qvel, ctrl)
+
+
+def check_steps(scene, states, integration, tolerance=1e-9):
+    ends = run(scene, *states, integration=integration)
+    for e, start in enumerate(zip(*states, strict=True)):
+        profile = e % len(scene.terrain)
+        for value, end in zip(ends, reference.step(scene, *start, 1 / 60, integration, profile=profile), strict=True):
+            np.testing.assert_allclose(value[e], end, rtol=tolerance, atol=tolerance)
+
+
+# Contact --------------------------------------------------------------------------------------------------------------
+
+
+def test_steps_of_a_ball_are_the_references(ball, rng):
+    states = pressed(ball, everywhere(rng), rng)
+    check_steps(ball, states, IMPLICIT)
+    normals = np.array([reference.clearance(HILLS, q[[0, 2]], 0.1)[1] for q in states[0]])
+    runs = np.diff(HILLS, axis=0)
+    slopes = np.stack([-runs[:, 1], runs[:, 0]], 1) / np.linalg.norm(runs, axis=1, keepdims=True)
+    between = ~np.isclose(normals[:, None], slopes, atol=1e-6).all(2).any(1)
+    assert between.sum() > 5  # in valleys and on ridges
+
+
+def test_steps_of_the_hopper_are_the_references(rng):
+    """Each on a profile of its own."""
+    profiles = np.stack([HILLS + [0.1 * k, 0.0] for k in range(16)])
+    scene, states = hopping(HILLS, 16, rng)
+    check_steps(scene.with_terrain(profiles), states, Integration(substeps=8))
+
+
+def test_gradients_of_a_ball_are_those_of_differences(ball, rng):
+    """On slopes and ridges, in valleys and at the wall."""
+    check_gradients(ball, pressed(ball, everywhere(rng), rng), rng, integration=IMPLICIT)
+
+
+def test_gradients_of_the_hopper_are_those_of_differences(rng):
+    scene, states = hopping(HILLS, 16, rng)
+    check_gradients(scene, states, rng, integration=Integration(substeps=8))
+
+
+def test_gradients_across_a_ridge_and_a_valley_are_those_of_differences(ball, rng):
+    """Of balls that roll over a vertex within the step."""
+    states = pressed(ball, np.array([-0.05, 0.97, 1.97, 3.22]), rng)
+    states[1][:] = np.array([4.0, 0.5, 0.0, 0.0, 30.0, 0.0])
+    before, after = states[0][:, 0], run(ball, *states, integration=IMPLICIT)[0][:, 0]
+    vertices = np.array([0.0, 1.0, 2.0, 3.25])
+    assert ((before < vertices) & (vertices < after)).all()
+    check_gradients(ball, states, rng, integration=IMPLICIT)
+
+
+@pytest.mark.parametrize("vertices", [PLANE, np.stack([np.linspace(-9, 9, 40), np.zeros(40)], 1)])
+def test_a_level_terrain_is_the_plane(vertices, rng):
+    flat = parse(BALL)
+    states = pressed(flat.with_terrain(PLANE), np.linspace(-3, 3, 32), rng)
+    w = [np.arange(1.0, 8.0), np.arange(1.0, 7.0)]
+    ends = [run(scene, *states, 4, integration=IMPLICIT) for scene in (flat, flat.with_terrain(vertices))]
+    slopes = [gradients(scene, states, w, integration=IMPLICIT) for scene in (flat, flat.with_terrain(vertices))]
+    for value, expected in zip((*ends[1], *slopes[1]), (*ends[0], *slopes[0]), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("degrees", [-25.0, 12.0])
+def test_an_incline_is_a_plane_under_tilted_gravity(degrees, rng):
+    """The same robot on the same ground, seen from axes that are turned about y."""
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+    slope = [[0.0, 0.0], [np.cos(angle), np.sin(angle)]]
+    settings = {"ball": IMPLICIT, "hopper": Integration(substeps=8)}
+    for name, integration in settings.items():
+        flat = parse(BALL) if name == "ball" else task_scene(name)
+        tilted = dataclasses.replace(flat, gravity=turn.T @ flat.gravity)
+        states = acting_states(flat, 16, rng)
+        states[1][:] *= 0.2
+
+        def turned(qpos, qvel, name=name):
+            qpos, qvel = qpos.copy(), qvel.copy()
+            if name == "ball":
+                qpos[:, :3], qvel[:, :3] = qpos[:, :3] @ turn.T, qvel[:, :3] @ turn.T
+                half = np.array([np.cos(angle / 2), 0, -np.sin(angle / 2), 0])
+                qpos[:, 3:7] = [reference.quaternion_product(half, q) for q in qpos[:, 3:7]]
+            else:
+                up = [0.0, 1.25]  # where the root is at qpos 0
+                plane = turn[np.ix_([0, 2], [0, 2])]
+                qpos[:, :2] = (qpos[:, :2] + up) @ plane.T - up
+                qpos[:, 2] -= angle
+                qvel[:, :2] = qvel[:, :2] @ plane.T
+            return qpos, qvel
+
+        ends = run(flat.with_terrain(slope), *turned(*states[:2]), states[2], 6, integration=integration)
+        expected = turned(*run(tilted, *states, 6, integration=integration))
+        for value, end in zip(ends, expected, strict=True):
+            np.testing.assert_allclose(value, end, rtol=1e-8, atol=1e-8)
+
+
+def test_the_force_is_continuous_along_the_ground(ball):
+    """Also over a valley and a ridge: a tenth of the way changes it by a tenth, of a ball 1 cm below where it rests."""
+
+    def steepest(step):
+        x = np.arange(-0.3, 1.3, step)
+        qpos = np.zeros((len(x), 7))
+        qpos[:, 0], qpos[:, 2], qpos[:, 3] = x, np.interp(x, HILLS[:, 0], HILLS[:, 1]) + 0.09, 1.0
+        still = np.zeros((len(x), 6)), np.zeros((len(x), 0))
+        qvel = run(ball, qpos, *still, control_dt=1e-3, integration=Integration("implicit", 1, 0.5))[1]
+        assert np.linalg.norm(qvel, axis=1).min() > 0.05
+        return np.linalg.norm(np.diff(qvel, axis=0), axis=1).max()
+
+    assert steepest(1e-4) < 0.12 * steepest(1e-3)
+
+
+def test_spikes_high_steps_and_narrow_notches_stay_finite(rng):
+    """Nothing fits into the notches; gradients are finite, too."""
+    x = np.repeat(np.arange(0.0, 4.0, 0.04), 2)
+    walls = np.stack([x, np.resize([0.0, 0.3, 0.3, 0.0], len(x))], 1)
+    needles = np.stack([np.arange(0, 4, 0.01), np.resize([0.0, 0.5], 400)], 1)
+    for vertices in (np.concatenate([[[-1.0, 0.0]], walls, [[5.0, 0.0]]]), needles):
+        scene = parse(BALL).with_terrain(vertices)
+        qpos = np.zeros((64, 7))
+        qpos[:, 0], qpos[:, 2], qpos[:, 3] = rng.uniform(-1, 5, 64), rng.uniform(-0.5, 1.0, 64), 1.0
+        qvel = 5 * rng.normal(size=(64, 6))
+        sim = Simulator(scene, 64, IMPLICIT, horizon=8, dtype=torch.float64)
+        q, v = (torch.tensor(a, requires_grad=True) for a in (qpos, qvel))
+        a, b = q, v
+        for _ in range(8):
+            a, b = sim.step(a, b, torch.zeros(64, 0, dtype=torch.float64))
+            assert not sim.nonfinite.any()
+        slopes = torch.autograd.grad(a.sum() + b.sum(), (q, v))
+        assert all(slope.isfinite().all() for slope in slopes) and not sim.nonfinite_gradients.any()
+
+
+def test_the_twin_and_the_drawn_boxes_are_where_mujoco_has_them(rng):
+    """Distances of spheres that do not touch."""
+    spec = mujoco.MjSpec()
+    for size, centre, rotation in slabs(HILLS):
+        quat = np.empty(4)
+        mujoco.mju_mat2Quat(quat, rotation.ravel())
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=centre, quat=quat)
+    spec.worldbody.add_body(mocap=True).add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for x in np.linspace(-1.5, 3.5, 41):
+        z = np.interp(x, HILLS[:, 0], HILLS[:, 1]) + rng.uniform(0.12, 0.4)
+        data.mocap_pos[0] = x, 0.3, z
+        mujoco.mj_kinematics(model, data)
+        found = min(mujoco.mj_geomDistance(model, data, k, model.ngeom - 1, 5.0, None) for k in range(model.ngeom - 1))
+        expected = reference.clearance(HILLS, np.array([x, z]), 0.1)[0]
+        assert expected <= 0 or abs(found - expected) < 1e-6
+
+
+def test_kernels_of_a_plane_do_not_know_terrain():
+    scene = task_scene("hopper")
+    plain, hilly = source(scene), source(scene.with_terrain(HILLS))
+    for name in ("(var_m).terrain", "(var_m).carrier_along", "sphere_on_terrain"):
+        assert name in hilly and name not in plain
+
+
+# Tasks ----------------------------------------------------------------------------------------------------------------
+
+
+def hoppers(terrain, count=2, **arguments):
+    return diffsim.make("hopper", count, dtype=torch.float64, terrain=terrain, seed=0, substeps=8, **arguments)
+
+
+def test_heights_are_those_over_the_ground():
+    """Of the start, the observation, the reward and the end."""
+    env, flat = hoppers(np.stack([incline(-20.0), incline(10.0)])), hoppers(None)
+    torch.testing.assert_close(env.reset(seed=1)[0], flat.reset(seed=1)[0])  # level where episodes start
+    torch.testing.assert_close(env.qpos, flat.qpos)
+    qpos = flat.qpos.clone()
+    qpos[:, 0] = 6.0
+    there = qpos.clone()
+    there[:, 1] += 5 * torch.tensor([-20.0, 10.0]).double().deg2rad().tan()  # were z its height, one would have fallen
+    obs = env.set_state(there, flat.qvel)
+    torch.testing.assert_close(obs, flat.set_state(qpos, flat.qvel))
+    assert not env.step(torch.zeros(2, 3).double())[2].any()
+
+    raised = hoppers(incline(10.0, start=-3.0))
+    obs, _ = raised.reset(seed=1)
+    torch.testing.assert_close(obs, flat.reset(seed=1)[0])
+    slope = np.tan(np.radians(10.0))
+    torch.testing.assert_close(raised.qpos[:, 1], flat.qpos[:, 1] + slope * (flat.qpos[:, 0] + 3.0))
+    raised.reset(options={"reset_mask": torch.tensor([False, True])})
+    assert raised.qpos[1, 1] > 0.4
+
+
+def test_each_environment_has_its_own_profile():
+    profiles = np.stack([rough(seed, start=-5.0, length=10.0, degrees=20.0) for seed in range(3)])
+    together, action = hoppers(profiles, 3), torch.full((3, 3), 0.3).double()
+    start = together.qpos.clone(), together.qvel.clone()
+    for _ in range(60):
+        together.step(action)
+    assert not torch.allclose(together.qpos[0], together.qpos[1])
+    for e in range(3):
+        alone = hoppers(profiles[e], 1)
+        alone.set_state(*(x[e : e + 1] for x in start))
+        for _ in range(60):
+            alone.step(action[:1])
+        assert torch.equal(alone.qpos[0], together.qpos[e])
+
+
+def test_the_elevation_is_that_of_the_profile(rng):
+    for scene in (task_scene("hopper"), task_scene("ant")):
+        elevation = Elevation(scene.with_terrain(HILLS), "cpu", torch.float64)
+        qpos = torch.tensor(rng.uniform(-2.0, 4.0, (5, 7, scene.nq)))
+        x = qpos[..., 0].numpy()
+        ends = 0.2 - 0.2 * (x + 1), 0.6 + 0.4 * (x - 3.25)
+        expected = np.select([x < -1, x > 3.25], ends, np.interp(x, HILLS[:, 0], HILLS[:, 1]))
+        np.testing.assert_allclose(elevation.height(qpos), expected, atol=1e-12)
+        up = 2 if scene.floating else 1
+        assert torch.equal(elevation.lift(qpos)[..., up], qpos[..., up] + elevation.height(qpos))
+        torch.testing.assert_close(elevation.lower(elevation.lift(qpos)), qpos)
+        assert torch.autograd.gradcheck(elevation.lower, qpos[0].requires_grad_())
+
+
+def test_a_window_is_differentiable_over_terrain():
+    """Rewards, which see heights, included."""
+    profile = rough(3, start=-5.0, length=10.0, degrees=20.0)
+
+    def total(action):
+        env = hoppers(profile, 2, horizon=30)
+        with torch.set_grad_enabled(action.requires_grad):
+            return sum(env.step(action)[1].sum() for _ in range(30))
+
+    start = torch.full((2, 3), 0.2).double()
+    (slope,) = torch.autograd.grad(total(leaf := start.clone().requires_grad_()), leaf)
+    offsets = 1e-6 * torch.eye(6).double().view(6, 2, 3)
+    expected = torch.stack([(total(start + d) - total(start - d)) / 2e-6 for d in offsets]).view(2, 3)
+    torch.testing.assert_close(slope, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_planning_sees_the_terrain():
+    env = hoppers(incline(15.0, start=-2.0), 1, stochastic_init=False)
+    system = System(env)
+    torch.testing.assert_close(system.start(), torch.cat((env.qpos, env.qvel), 1))
+    torch.testing.assert_close(system.observe(system.start()), env.reset()[0])
+    u = torch.full((1, 3), 0.1).double()
+    x, _, _ = system.rollout(system.start(), 40, lambda t, _: u)
+    for t in range(1, 41):
+        obs, reward, *_ = env.step(torch.tanh(u))
+        torch.testing.assert_close(system.reward(x[:, t], u), reward)
+        torch.testing.assert_close(system.observe(x[:, t]), obs)
+    assert system.check_jacobians(x[0, 30:40:3], u.expand(4, -1)).max() < 1e-4
+    with pytest.raises(ValueError, match="terrain has 2 profiles, must have 1"):
+        System(hoppers(np.stack([PLANE, PLANE])))
+
+
+# Input and pictures ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "vertices, message",
+    [
+        ("hills", "must be numbers in an array"),
+        ([[0, 0], [1]], "must be numbers in an array"),
+        ([0.0, 1.0], r"has shape \(2,\), must be \(K, 2\) or \(environments, K, 2\) with K of 2 or more"),
+        ([[0.0, 0.0]], r"has shape \(1, 2\), must be"),
+        (np.zeros((0, 3, 2)), r"has shape \(0, 3, 2\), must be"),
+        ([[0, 0], [1, np.nan]], r"vertex 1 \(1, nan\) is not finite"),
+        ([[0, 0], [2, 5], [1, 0]], r"vertex 1 \(2, 5\) has a larger x than the next one; x must ascend"),
+        ([PLANE, PLANE[::-1]], r"vertex 0 of environment 1 \(1, 0\) has a larger x"),
+        ([[0, 0], [1, 2], [1, 2], [2, 0]], r"vertex 1 \(1, 2\) equals the next one"),
+        ([[0, 0], [0, 1], [2, 0]], r"vertex 0 \(0, 0\) begins a wall at an end"),
+        ([[0, 0], [1, 1], [1, 0]], r"vertex 1 \(1, 1\) begins a wall at an end"),
+        ([[0, 0], [1, 1], [1, 3], [1, 2], [2, 0]], r"vertex 2 \(1, 3\) ends one wall and begins another"),
+    ],
+)
+def test_wrong_terrain_is_refused(vertices, message):
+    with pytest.raises(ValueError, match=message):
+        task_scene("hopper").with_terrain(vertices)
+
+
+def test_what_cannot_have_a_terrain_says_so():
+    with pytest.raises(ValueError, match="robot touches no ground, so it has no terrain"):
+        parse(PENDULUM).with_terrain(PLANE)
+    with pytest.raises(ValueError, match="terrain has 2 profiles, must have 1 or one for each of 3"):
+        diffsim.make("hopper", 3, terrain=[PLANE, PLANE])
+    with pytest.raises(ValueError, match="hopper has no terrain"):
+        Elevation(task_scene("hopper"), "cpu", torch.float64)
+
+
+def test_generated_profiles():
+    np.testing.assert_allclose(incline(-45.0, start=2.0), [[1, 0], [2, 0], [3, -1]], atol=1e-12)
+    np.testing.assert_allclose(step(-0.3), [[0, 0], [1, 0], [1, -0.3], [2, -0.3]])
+    profile = rough(7, segment=2.0, degrees=15.0, length=20.0, start=3.0)
+    x, z = profile.T
+    assert profile.shape == (13, 2)
+    np.testing.assert_allclose(x, [2.0, *np.arange(3.0, 24.0, 2.0), 24.0])
+    angles = np.degrees(np.arctan(np.diff(z) / np.diff(x)))
+    assert angles[0] == angles[-1] == 0 and 5 < abs(angles).max() < 15
+    assert np.array_equal(profile, rough(7, 2.0, 15.0, 20.0, 3.0)) and not np.array_equal(
+        profile, rough(8, 2.0, 15.0, 20.0, 3.0)
+    )
+    for make, message in (
+        (lambda: incline(90.0), "degrees is 90.0, must lie between -90 and 90"),
+        (lambda: incline(1.0, start=np.inf), "start is inf, must be finite"),
+        (lambda: step(0.0), "height is 0.0, must be finite and not 0"),
+        (lambda: rough(0, segment=0.0), "segment is 0.0, must be positive and finite"),
+        (lambda: rough(0, segment=4.0, length=1.0), "length is 1.0, must be at least one segment of 4.0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+
+
+def test_pictures_show_it():
+    scene = task_scene("hopper").with_terrain(HILLS)
+    page = web.describe(scene, np.zeros((2, scene.nq)), 1 / 60)
+    boxes = [geom for geom in page["geoms"] if geom["body"] == 0]
+    assert len(boxes) == len(HILLS) - 1 and page["floor"] is None
+    try:
+        render.check_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    profiles = np.stack([HILLS, HILLS + [0.0, 0.4]])
+    with render.Renderer(scene.with_terrain(profiles), 160, 120) as renderer:
+        low, high = (renderer.draw(np.zeros(scene.nq), profile=k) for k in range(2))
+    assert (low != high).any(-1).mean() > 0.1
