@@ -60,10 +60,10 @@ FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
 PLAN = "--ilqr-iterations 2 --demonstration benchmarks/plans/"
 # What docs/gps.md shows, per task: seeds, cases, flags
 SUITE: dict[str, tuple[tuple[int, ...], tuple[str, ...], str]] = {
-    "cartpole": ((1, 2, 3, 4, 5), tuple(FIGURE_2), "--iterations 30"),
-    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), f"--iterations 24 {PLAN}hopper_500.npz"),
-    "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--iterations 24 {PLAN}walker_500.npz"),
-    "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--iterations 24 {PLAN}swimmer_500.npz"),
+    "cartpole": ((1, 2, 3, 4, 5), tuple(FIGURE_2), "--iterations 24"),
+    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), f"--imitation 14 --iterations 19 {PLAN}hopper_500.npz"),
+    "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--imitation 28 --iterations 31 {PLAN}walker_500.npz"),
+    "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--horizon 160 --iterations 24 {PLAN}swimmer_500.npz"),
 }
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
@@ -397,7 +397,7 @@ def compare(args: Args) -> list[Row]:
         for name in ("shac", "ppo_baseline"):
             learners[name] = list(grouped(read_csv(args.results / f"{name}_{env}.csv"), "seed").values())
         for target in targets:
-            cells = {}
+            cells = {f"gps, {case}": "" for case in COMPARED}
             for name, seeds in learners.items():
                 steps = [first_pass(rows, target, T) for rows in seeds]
                 reached = [count for count in steps if count < math.inf]
@@ -468,10 +468,12 @@ def draw(args: Args) -> None:
     for name, grid in pictures.items():
         if not grid[0]:
             continue
-        figure, axes = plt.subplots(len(grid), len(grid[0]), figsize=(4 * len(grid[0]), 3 * len(grid)), squeeze=False)
+        figure, axes = plt.subplots(
+            len(grid), len(grid[0]), figsize=(4.5 * len(grid[0]), 3.6 * len(grid)), squeeze=False
+        )
         for ax, panel in zip(axes.flat, chain(*grid), strict=True):
             panel(ax)
-            ax.legend(fontsize=7)
+            ax.legend(fontsize=5)
         figure.tight_layout()
         (args.docs / "figures").mkdir(parents=True, exist_ok=True)
         figure.savefig(args.docs / "figures" / f"gps_{name}.png", dpi=110)
