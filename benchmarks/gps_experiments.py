@@ -294,9 +294,10 @@ def collect(args: Args) -> None:
             tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
             older |= {line.rpartition("; ")[0] + "; --list\n" for line in origins(directory / f"{name}.csv")}
     first: dict[str, tuple[str, ...]] = {}  # one run a task is drawn, every fourth step
-    drawn = [
-        r for r in tables["paths"] if (r["variant"], r["seed"]) == first.setdefault(r["env"], (r["variant"], r["seed"]))
+    learned = [
+        row for case in ("feedback", "feedback-short", "full") for row in tables["paths"] if row["variant"] == case
     ]
+    drawn = [r for r in learned if (r["variant"], r["seed"]) == first.setdefault(r["env"], (r["variant"], r["seed"]))]
     tables["paths"] = [row | {k: f"{float(row[k]):.4g}" for k in "xy"} for row in drawn if int(row["step"]) % 4 == 0]
     for name, rows in tables.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
