@@ -260,6 +260,7 @@ class Search:
         cost = args.action_cost * u.square().sum(-1)
         if args.reward == "native":
             return system.reward(x, u) - cost
+        x = system.over_ground(x)
         if system.scene.floating:
             height, attitude = x[..., 2], 4.0 * x[..., 4:7].square().sum(-1)
         else:
@@ -408,10 +409,8 @@ class Search:
         for name in self.NUMBERS:
             setattr(self, name, state[name])
         device = self.system.device
-        stored = (
-            [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[key]] for key in ("guides", "adapted")
-        )
-        self.guides, self.adapted = stored
+        for name in ("guides", "adapted"):
+            setattr(self, name, [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[name]])
         self.lessons = tuple(tensor.to(device) for tensor in state["lessons"])
         self.student = state["student"].to(device)
         self.rng.set_state(state["rng"])

@@ -19,6 +19,7 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.planning import LinearGaussian
+from diffsim.terrain import incline
 from diffsim.training import evaluate, load_policy
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.lbfgs import maximise
@@ -206,6 +207,19 @@ def test_reward_of_the_paper() -> None:
     native = make_search("hopper", "--reward native --action-cost 0.01")
     x, u = native.system.start(), torch.ones(1, 3, dtype=torch.float64)
     torch.testing.assert_close(native.reward(x, u), native.system.reward(x, u) - 0.03)
+
+
+def test_reward_counts_the_height_over_the_ground() -> None:
+    """On a slope of 10 degrees, which has risen by 0.18 m a metre after its start."""
+    args = gps.parse(gps.Args, ["--env", "hopper", "--device", "cpu"])
+    search = gps.Search(args, diffsim.make("hopper", 1, terrain=incline(10.0, start=1.0)))
+    flat, system, u = make_search("hopper"), search.system, torch.ones(3).double()
+    x = system.start()[0] + 0.1
+    uphill = x.clone()
+    uphill[0] = 2.0
+    uphill[1] += math.tan(math.radians(10.0))
+    torch.testing.assert_close(search.reward(uphill, u), flat.reward(x, u))
+    assert search.reward(x, u) == flat.reward(x, u)
 
 
 def test_policy_has_the_papers_1256_parameters() -> None:
