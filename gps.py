@@ -32,6 +32,7 @@ from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
 from diffsim.tasks import TASKS
+from diffsim.terrain import incline
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.checkpoint import Stateful
@@ -67,7 +68,7 @@ PER_TASK = {
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples")
+    FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples", "slope")
 
     variant: Variant = "feedback"
     """the algorithm (full), after imitation of the guides' feedback (ours), or one of Figure 2's others (per task)"""
@@ -105,6 +106,8 @@ class Args(Flags):
     """standard deviation of the guiding actions relative to the policy's: the temperature of exp(reward) (per task)"""
     guiding_samples: Count = 40
     """trajectories drawn from the guiding distributions"""
+    slope: Finite = 0.0
+    """train on an incline of so many degrees that begins at x = 1 m; the policy does not see it"""
     adaptive: Natural = 0
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
     adaptive_iterations: Count = 50
@@ -167,7 +170,7 @@ class Search:
     NUMBERS = "w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.args, self.system = args, System(env, args.threads or None)
+        self.args, self.system = args, System(env, args.threads or None, incline(args.slope) if args.slope else None)
         self.cost = AfterStep(self.system, lambda x, u: -self.reward(x, u))
         self.rng = torch.Generator().manual_seed(args.seed)  # on the CPU: the same numbers for every device
         self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn
@@ -333,8 +336,7 @@ class Search:
         starts = policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)
         ends = [maximise(objective, theta, iterations) for theta in starts]
         start = int(ends[1][1] > ends[0][1])
-        theta, value = ends[start]
-        return theta, {"gps/phi": value, "gps/start": start}
+        return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
 
     def learn(self, samples: Samples) -> float:
         """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share.
@@ -391,11 +393,10 @@ class Search:
         log_w = log_weights(log_pi[0], mixture)
         weights = torch.softmax(log_w, 0)
         guided = S.source < self.S.initial
-        ess = 1.0 / weights.square().sum(0)
         return values[0] > values[1], {
             "gps/estimate": values[0],
             "gps/best_estimate": values[1],
-            "gps/ess": ess.mean().item(),
+            "gps/ess": (1.0 / weights.square().sum(0)).mean().item(),
             "gps/guide_share": (weights[guided].sum() / weights.sum()).item(),
             "gps/guide_nats": -log_w[guided, -1].mean().item() if self.S.initial else math.nan,
         }

@@ -65,6 +65,7 @@ SUITE: dict[str, tuple[tuple[int, ...], tuple[str, ...], str]] = {
     "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--imitation 28 --iterations 31 {PLAN}walker_500.npz"),
     "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--horizon 160 --iterations 24 {PLAN}swimmer_500.npz"),
 }
+CASES["feedback-slope"] = "--variant feedback --horizon 160 --slope 10"  # needs a plan up it, see docs/gps.md
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "

@@ -26,6 +26,7 @@ from gps_experiments import CONTROLLERS, RUN, controllers, environment, grouped,
 from tables import ROOT, Row, digits, markdown
 from torch import Tensor
 
+from diffsim import DiffEnv
 from diffsim.planning import System
 from diffsim.terrain import Array, incline, rough, step
 
@@ -62,9 +63,9 @@ def until_fall(x: Tensor, height: int) -> tuple[Tensor, Tensor]:
     return up[..., -1].bool(), (x[..., 0].gather(-1, last) - x[..., :1, 0]).squeeze(-1)
 
 
-def rollout(search: gps.Search, path: Path, profile: Array) -> tuple[Tensor, Tensor, Tensor]:
+def rollout(search: gps.Search, env: DiffEnv, profile: Array) -> tuple[Tensor, Tensor, Tensor]:
     """Each controller from the guide's start: states over the ground, actions, whether finite; see Dynamics.rollout."""
-    system, acts = System(environment(path, terrain=profile), threads=1), list(controllers(search).values())
+    system, acts = System(env, 1, profile), list(controllers(search).values())
 
     def act(t: int, x: Tensor) -> Tensor:
         own = system.over_ground(x).split(1)
@@ -77,10 +78,12 @@ def rollout(search: gps.Search, path: Path, profile: Array) -> tuple[Tensor, Ten
 
 def measure(path: Path) -> Iterator[Row]:
     """One row for each terrain, size and controller."""
-    run, search = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path)
+    run, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
+    search.guides = [guide._replace(x=search.system.over_ground(guide.x)) for guide in search.guides]
+    search.system = System(env, 1)  # to which all states here belong: they are over the ground
     guides, height = search.guide_return[0], 2 if search.system.scene.floating else 1
     for terrain, size in ((terrain, size) for terrain, sizes in SIZES.items() for size in sizes):
-        parts = zip(*(rollout(search, path, profile) for profile in profiles(terrain, size)), strict=True)
+        parts = zip(*(rollout(search, env, profile) for profile in profiles(terrain, size)), strict=True)
         for name, x, u, finite in zip(CONTROLLERS, *(torch.stack(part, 1) for part in parts), strict=True):
             returns, (up, distance) = search.measure(x, u, finite).returns, until_fall(x, height)
             standing = up & finite.all(-1)

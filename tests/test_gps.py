@@ -19,7 +19,6 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.planning import LinearGaussian
-from diffsim.terrain import incline
 from diffsim.training import evaluate, load_policy
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.lbfgs import maximise
@@ -211,8 +210,7 @@ def test_reward_of_the_paper() -> None:
 
 def test_reward_counts_the_height_over_the_ground() -> None:
     """On a slope of 10 degrees, which has risen by 0.18 m a metre after its start."""
-    args = gps.parse(gps.Args, ["--env", "hopper", "--device", "cpu"])
-    search = gps.Search(args, diffsim.make("hopper", 1, terrain=incline(10.0, start=1.0)))
+    search = make_search("hopper", "--slope 10")
     flat, system, u = make_search("hopper"), search.system, torch.ones(3).double()
     x = system.start()[0] + 0.1
     uphill = x.clone()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from diffsim.env import DiffEnv
@@ -18,18 +19,20 @@ class System(Dynamics):
     Args:
         env: its robot, integration and device are taken, its state is not. Of terrains it has one for all environments.
         threads: see Simulator.
+        terrain: profile (K, 2) in place of the environment's; see diffsim.terrain.
 
     Raises:
-        ValueError: a terrain for each of several environments.
+        ValueError: a terrain for each of several environments; see Scene.with_terrain.
 
     Attributes:
         observed: (obs_dim,) 1 where an observation is of the state, 0 where it is of the action before.
     """
 
-    def __init__(self, env: DiffEnv, threads: int | None = None) -> None:
-        super().__init__(env.scene, env.sim.integration, env.control_dt, device=env.device, threads=threads)
+    def __init__(self, env: DiffEnv, threads: int | None = None, terrain: ArrayLike | None = None) -> None:
+        scene = env.scene if terrain is None else env.scene.with_terrain(terrain)
+        super().__init__(scene, env.sim.integration, env.control_dt, device=env.device, threads=threads)
         self.task = type(env.task)(self.device, REAL)
-        self._elevation = None if env.scene.terrain is None else Elevation(env.scene, self.device, REAL)
+        self._elevation = None if scene.terrain is None else Elevation(scene, self.device, REAL)
         self._no_action = torch.zeros(self.nu, dtype=REAL, device=self.device)
         start = self.start()
         still, moved = (self._observe(start, action.unsqueeze(0)) for action in (self._no_action, self._no_action + 1))
