@@ -98,7 +98,7 @@ def main(args: common.CheckpointFlags) -> None:
         for row in measure((path / "checkpoint.pt" if path.is_dir() else path).resolve()):
             print(", ".join(digits(value) for value in row.values()), flush=True)
             args.merge("gps_terrain", [row], KEY)
-    table, grid = list[Row](), dict[str, list[Panel]]()
+    table, grid = list[Row](), dict[tuple[str, str], list[Panel]]()
     for (env, variant, terrain), rows in grouped(args.read("gps_terrain"), *RUN[:2], "terrain").items():
         shares = dict[str, dict[float, float]]()  # kept, by controller and size
         for (size,), own in grouped(rows, "size").items():
@@ -111,7 +111,9 @@ def main(args: common.CheckpointFlags) -> None:
             cells["m until a fall"] = " / ".join(f"{value:.1f}" for value in means["distance"])
             table.append({"task": env, "case": variant, "terrain": terrain, "size": size} | cells)
         lines = [Line(list(s), list(s.values()), f"{CONTROLLERS[name]}o-", name) for name, s in shares.items()]
-        grid.setdefault(env, []).append(Panel(lines, f"{env}, {variant}", terrain, "kept (%)", zero=True))
+        sizes = list(shares["policy"])
+        lines.append(Line(sizes, [100.0] * len(sizes), "k:", width=0.5))
+        grid.setdefault((env, variant), []).append(Panel(lines, f"{env}, {variant}", terrain, "kept (%)", zero=True))
     plot(args.picture("gps_terrain"), list(grid.values()) or [[]])
     args.publish("gps terrain", markdown(table), "gps.md")
 
