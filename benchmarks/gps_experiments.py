@@ -83,6 +83,7 @@ STYLES = {"plan": ("k", 2.0, 3), "guides": ("0.6", 0.8, 1), "policy": ("C0", 0.8
 AXES = {"cartpole": ("x (m)", "angle (rad)"), "swimmer": ("x (m)", "y (m)"), "ant": ("x (m)", "y (m)")}
 Row = dict[str, Any]
 Act = Callable[[int, Tensor], Tensor]
+LISTED = "python benchmarks/gps_experiments.py --list"  # the commands of all runs
 
 
 @dataclass
@@ -293,7 +294,7 @@ def collect(args: Args) -> None:
             tables["runs"].append(run | dict(horizon=horizon) | kept)
         for name in ("generalisation", "paths"):
             tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
-            older |= {line.rpartition("; ")[0] + "; --list\n" for line in origins(directory / f"{name}.csv")}
+            older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(directory / f"{name}.csv")}
     first: dict[str, tuple[str, ...]] = {}  # one run a task is drawn, every fourth step
     learned = [
         row for case in ("feedback", "feedback-short", "full") for row in tables["paths"] if row["variant"] == case
@@ -303,7 +304,7 @@ def collect(args: Args) -> None:
     for name, rows in tables.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
         rows += [row for row in read_csv(args.table(name)) if tuple(row[key] for key in RUN) not in here]
-        known = older | {line for line in origins(args.table(name)) if line.endswith("; --list\n")}
+        known = older | {line for line in origins(args.table(name)) if line.endswith(f"; {LISTED}\n")}
         write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)), older=sorted(known))
 
 
