@@ -244,12 +244,13 @@ def table(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> lis
     return rows
 
 
-def ratios(args: Args, tasks: Sequence[TaskName]) -> list[Row]:
+def ratios(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> list[Row]:
     """Of PFPN and the Gaussian policy, by each algorithm: the best return within control steps that all runs made."""
     rows = list[Row]()
     for env, algorithm in product(tasks, ("ppo", "shac", "sac")):
-        both = [curves(args, f"{policy}_{algorithm}", env) for policy in ("pfpn", "pfpn_gaussian")]
-        if all(both):
+        names = [f"{policy}_{algorithm}" for policy in ("pfpn", "pfpn_gaussian")]
+        both = [curves(args, name, env) for name in names if name in learners]
+        if len(both) == 2 and all(both):
             end = min(run["control_steps"][-1] for runs in both for run in runs)
             best = [[np.nanmax(run["return"][run["control_steps"] <= end]) for run in runs] for runs in both]
             row: dict[str, object] = {"task": env, "algorithm": algorithm, "control steps": f"{end / 1e6:.3g} M"}
@@ -309,10 +310,10 @@ def report(args: Args, name: Name) -> None:
         args.publish("results", markdown(rows, columns), f"{page}.md", everywhere)
         return draw(args, page, learners, tasks)
     rows = table(args, learners, tasks)
-    of_particles = name in ("pfpn", "resampling", "imitation")
-    beside = f"{markdown(ratios(args, tasks))}\n" if of_particles else ""
-    page = "pfpn.md" if of_particles else "experiments.md"
-    args.publish(name, f"{markdown(rows)}\n{beside}![{title}]({args.link(name)})\n", page)
+    beside = ratios(args, learners, tasks)
+    text = f"{markdown(rows)}\n" + (f"{markdown(beside)}\n" if beside else "")
+    page = "pfpn.md" if "pfpn_ppo" in learners else "experiments.md"
+    args.publish(name, f"{text}![{title}]({args.link(name)})\n", page)
     if compared := [env for env in tasks if env in {row["task"] for row in rows}]:
         draw(args, name, learners, compared)
 
