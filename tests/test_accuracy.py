@@ -315,8 +315,8 @@ def source(scene, **optional):
     spec, text = kernel_spec(scene, divide(scene), wp.float64, implicit=False, env_last=False, **optional), ""
     for build in (forward_kernel, backward_kernel):
         module = build(spec).module
-        module.load("cpu")
-        (path,) = (Path(wp.config.kernel_cache_dir) / module.get_module_identifier()).glob("*.cpp")
+        module.load("cpu", 1)  # the block that Warp launches on a CPU: for another one it would compile anew
+        (path,) = (Path(wp.config.kernel_cache_dir) / module.get_module_identifier(1)).glob("*.cpp")
         text += path.read_text()
     return re.sub(r"//.*", "", text)  # comments quote the Python source, branches that are not taken included
 
