@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import BALL, HINGE, acting_states, leg_scene, parse, run, task_scene
+from scenes import BALL, HINGE, OSCILLATOR, acting_states, leg_scene, parse, run, task_scene
 
 import diffsim
 from diffsim.integration import INTEGRATORS, Integration
@@ -99,17 +99,6 @@ def test_penalty_constants_replace_the_files():
 # Order of convergence
 
 
-OSCILLATOR = """
-<mujoco>
-  <worldbody>
-    <body>
-      <joint axis="0 0 1" stiffness="20" damping="1"/>
-      <inertial pos="0 0 0" mass="1" diaginertia="0.5 0.5 0.5"/>
-    </body>
-  </worldbody>
-</mujoco>"""
-
-
 @pytest.mark.parametrize("integrator, theta, order", SETTINGS)
 def test_order_of_a_damped_oscillator(integrator, theta, order):
     """Angle, rate and the gradient of the angle, against the closed form."""
@@ -124,7 +113,7 @@ def test_order_of_a_damped_oscillator(integrator, theta, order):
     def simulated(substeps):
         leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in start]
         sim = Simulator(scene, 1, Integration(integrator, substeps, theta), t, dtype=torch.float64)
-        q, v = sim.step(*leaves, torch.zeros(1, 0, dtype=torch.float64))
+        q, v = sim.step(*leaves, torch.zeros(1, 1, dtype=torch.float64))
         return np.array([q.item(), v.item(), *(g.item() for g in torch.autograd.grad(q, leaves))])
 
     errors = [abs(simulated(n) - exact) for n in (256, 512, 1024)]

@@ -23,6 +23,7 @@ from scenes import (
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
+    in_free_flight,
     leg_scene,
     parse,
     pass_limits,
@@ -221,7 +222,7 @@ def halving_orders(errors):
 @pytest.mark.parametrize("base", ["floating", "ball"])
 def test_free_flight_keeps_momentum_and_energy_to_first_order(base, rng):
     """A tree that tumbles for a quarter of a second; gravity adds m g t, motors cannot change momentum."""
-    scene = tree_scene(base, 0).without("contact", "limit", "damping")
+    scene = in_free_flight(tree_scene(base, 0))
     qpos, qvel, ctrl = free_states(scene, 1, rng)
     t, substeps = 0.25, [256, 512, 1024]
 

@@ -7,7 +7,7 @@ import pytest
 import reference
 import torch
 import warp as wp
-from scenes import grounded_states, leg_scene, run, task_scene, tree_scene
+from scenes import acting_states, grounded_states, leg_scene, run, task_scene, tree_scene
 from test_accuracy import source
 
 import diffsim
@@ -21,6 +21,8 @@ SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
 
 
 def robot(name, count, rng):
+    if name == "hopper":
+        return task_scene(name), acting_states(task_scene(name), count, rng)
     scene = tree_scene("planar", 0) if name == "planar" else leg_scene(name, grounded=True)
     return grounded_states(scene, count, rng)
 
@@ -38,9 +40,9 @@ def test_steps_are_the_references(name, integration, rng):
             np.testing.assert_allclose(value[e], end, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("integration", SETTINGS)
-def test_factors_of_one_change_no_bit(integration, rng):
-    scene, states = robot("linear", 16, rng)
+@pytest.mark.parametrize("name, integration", [*zip(("linear", "hopper"), SETTINGS, strict=True)])
+def test_factors_of_one_change_no_bit(name, integration, rng):
+    scene, states = robot(name, 16, rng)
     results = []
     for factors in (False, True):
         sim = Simulator(scene, 16, integration, dtype=torch.float64, factors=factors)
@@ -91,11 +93,12 @@ def test_gradients_reach_a_tensor_through_the_environment(integrator):
 
 
 def test_recorded_steps_are_counted():
-    env = diffsim.make("cartpole", 2, horizon=1, factors=True)
-    env.sim.factors = torch.ones(2, len(FACTORS), requires_grad=True)
-    env.step(torch.zeros(2, 1))
+    env = diffsim.make("hopper", 2, horizon=1, dtype=torch.float64, factors=True)
+    env.sim.factors = torch.ones(2, len(FACTORS), dtype=torch.float64, requires_grad=True)
+    action = torch.zeros(2, 3, dtype=torch.float64)
+    env.step(action)
     with pytest.raises(RuntimeError, match="horizon of 1 differentiable steps exceeded"):
-        env.step(torch.zeros(2, 1))
+        env.step(action)
 
 
 def test_wrong_factors_are_refused():
