@@ -328,7 +328,7 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
 
 @pytest.mark.parametrize("name", [*TASKS, "linear", "hill"])
 def test_kernels_hold_the_code_of_the_features_and_no_other(name):
-    scene = task_scene(name) if name in TASKS else leg_scene(name)
+    scene = task_scene(name) if name in TASKS else leg_scene(name, grounded=name == "linear")
     text = source(scene)
     for feature, pattern in CODE.items():
         assert bool(re.search(pattern, text)) == (feature in scene.features), feature

@@ -7,7 +7,7 @@ import pytest
 import reference
 import torch
 import warp as wp
-from scenes import acting_states, grounded_states, leg_scene, run, task_scene, tree_scene
+from scenes import leg_scene, run, task_scene, varied_robot
 from test_accuracy import source
 
 import diffsim
@@ -20,18 +20,13 @@ from diffsim.simulator import Simulator
 SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
 
 
-def robot(name, count, rng):
-    if name == "hopper":
-        return task_scene(name), acting_states(task_scene(name), count, rng)
-    scene = tree_scene("planar", 0) if name == "planar" else leg_scene(name, grounded=True)
-    return grounded_states(scene, count, rng)
-
-
+# The hopper's kernels are other tests' already.
 @pytest.mark.parametrize(
-    "name, integration", [(name, setting) for name in ("linear", "planar") for setting in SETTINGS]
+    "name, integration",
+    [*(("linear", setting) for setting in SETTINGS), *zip(("planar", "hopper"), SETTINGS, strict=True)],
 )
 def test_steps_are_the_references(name, integration, rng):
-    scene, states = robot(name, 4, rng)
+    scene, states = varied_robot(name, 4, rng)
     factors = rng.uniform(0.5, 2.0, (4, len(FACTORS)))
     ends = run(scene, *states, factors=factors, integration=integration)
     for e, (row, *start) in enumerate(zip(factors, *states, strict=True)):
@@ -42,7 +37,7 @@ def test_steps_are_the_references(name, integration, rng):
 
 @pytest.mark.parametrize("name, integration", [*zip(("linear", "hopper"), SETTINGS, strict=True)])
 def test_factors_of_one_change_no_bit(name, integration, rng):
-    scene, states = robot(name, 16, rng)
+    scene, states = varied_robot(name, 16, rng)
     results = []
     for factors in (False, True):
         sim = Simulator(scene, 16, integration, dtype=torch.float64, factors=factors)
@@ -55,7 +50,7 @@ def test_factors_of_one_change_no_bit(name, integration, rng):
 
 def test_each_environment_and_step_has_its_own(rng):
     """Steps of a window see what was written in place before them, and so do their adjoints."""
-    scene, states = robot("linear", 2, rng)
+    scene, states = varied_robot("linear", 2, rng)
     sim = Simulator(scene, 2, SETTINGS[0], horizon=2, dtype=torch.float64, factors=True)
     q, v, u = (torch.tensor(x, requires_grad=True) for x in states)
     per_step = rng.uniform(0.5, 2.0, (2, 2, len(FACTORS)))
