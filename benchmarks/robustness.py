@@ -50,7 +50,7 @@ TOLERANCE = 0.02  # of the smallest push
 KEY = ("checkpoint", "task", "learner", "contact", "seed")
 CURVE_KEY = (*KEY, "test", "level")  # level: of a push in multiples of the smallest, of a cube in kg
 GROUP = ("task", "learner", "contact", "mass")  # of a row of the table
-EACH = ("seed", "forward N", "sideways N", "forward m/s", "sideways m/s")  # in it each seed's
+EACH = ("seed", "forward N", "sideways N", "forward m/s", "sideways m/s")  # in it of each seed
 
 
 @dataclass
@@ -267,8 +267,10 @@ def table(rows: list[dict[str, str]]) -> str:
     tasks, groups = [*diffsim.TASKS], dict[tuple[str, ...], list[dict[str, str]]]()
     for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"])):
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
-    each = ({name: " ".join(seed[name] for seed in seeds) for name in EACH} for seeds in groups.values())
-    return markdown([seeds[0] | cells for seeds, cells in zip(groups.values(), each, strict=True)], (*GROUP, *EACH))
+    names = {name: name.replace("seed", "seeds").replace(" ", ", ") for name in EACH}
+    each = ({names[name]: " ".join(seed.get(name, "") for seed in seeds) for name in EACH} for seeds in groups.values())
+    rows = [seeds[0] | cells for seeds, cells in zip(groups.values(), each, strict=True)]
+    return markdown(rows, (*GROUP, *names.values()))
 
 
 def main(args: Args) -> None:
