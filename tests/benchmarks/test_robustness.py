@@ -166,7 +166,11 @@ def test_the_command_writes_pushes_and_curves(tmp_path: Path, capsys: pytest.Cap
     assert [float(line["m/s"]) for line in pushes] == pytest.approx(0.1 * force / 15.8 * robustness.MULTIPLES, rel=0.02)
     assert 0 <= float(cube["steps"]) <= 60 and float(cube["impulse"]) > 0
     assert (tmp_path / "robustness.png").stat().st_size > 5_000
-    assert f"| hopper | shac | soft | 1 | 15.8 | {row['forward N']} |  |" in capsys.readouterr().out
+    line = f"| hopper | shac | soft | 15.8 | 1 | {row['forward N']} |  | {row['forward m/s']} |  |"
+    assert line in capsys.readouterr().out
+    other = row | {"checkpoint": "policies/hopper__2", "seed": "2", "forward N": "7", "learner": "shac"}
+    assert f"| hopper | shac | soft | 15.8 | 1 2 | {row['forward N']} 7 |" in robustness.table([other, row])
+    assert robustness.table([row | {"learner": "sapo"}, row]).count("| hopper |") == 2
 
 
 @pytest.mark.parametrize(
