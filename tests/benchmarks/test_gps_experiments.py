@@ -68,6 +68,21 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
         gps.parse(gps.Args, ["--env", "hopper", *flags.split()])
 
 
+def test_the_list_holds_the_runs_that_the_page_shows() -> None:
+    """Of each task, case and seed in results/; a case that has other flags for a seed keeps them."""
+    jobs = experiments.jobs(experiments.Args())
+    runs = read_csv(experiments.RESULTS / "cpu" / "gps_runs.csv")
+    assert {"__".join((row["env"], row["variant"], row["seed"])) for row in runs} <= jobs.keys()
+    runs = read_csv(experiments.RESULTS / "cpu" / "gps_terrain.csv")
+    assert {"__".join((row["env"], row["variant"], row["seed"])) for row in runs} <= jobs.keys()
+    one, two, other = (experiments.jobs(experiments.Args(env=("swimmer",), seeds=(seed,))) for seed in (1, 2, 7))
+    assert "200" in one["swimmer__feedback__1"] and "100" in two["swimmer__feedback__2"]
+    assert other["swimmer__feedback__7"] == one["swimmer__feedback__1"]
+    for name, flags in jobs.items():
+        env, case, _ = name.split("__")
+        gps.parse(gps.Args, ["--env", env, *experiments.CASES[case].split(), *flags])
+
+
 def test_a_finished_run_is_kept(runs: Path) -> None:
     before = (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns
     assert experiments.train(runs / "cartpole__full__1", [], 4) == "cartpole__full__1: done before"
