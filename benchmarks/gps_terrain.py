@@ -1,13 +1,14 @@
-"""Guided policy search on slopes, steps and rough ground that no training saw, beside its guides (Figures 3 and 4).
+"""Guided policy search on slopes, steps and rough ground, beside its guides (Figures 3 and 4).
 
     python benchmarks/gps_terrain.py runs/gps/walker__feedback-short__1 runs/gps/hopper__feedback__1
+    python benchmarks/gps_terrain.py --steps 500 runs/gps/walker__feedback-terrain__1      longer than its guides
     python benchmarks/gps_terrain.py --draw-only
 
 Takes runs of gps_experiments.py. Each terrain has ten profiles: a slope or step begins at ten places 10 cm apart, so
 that a robot meets it in ten phases of its gait; rough ground has ten seeds. All controllers get heights over the ground
-(System.over_ground), as a task's observations do; velocities and angles are the world's. None sees the terrain. A robot
-falls where its root sinks 0.45 m below its start's height over the ground. A trajectory is kept if the robot does not
-fall and its return is within a quarter of the guides' mean.
+as a task's observations do; velocities and angles are the world's. None sees the terrain. A robot stands if its root
+never sinks 0.45 m below its start's height over the ground. It has walked over a terrain if it stands to the end and
+has come at least 90 % as far as the guides. It keeps the guides' return if it stands, and that is within a quarter.
 
 Writes gps_terrain.csv, gps_terrain.png and, with --update-results, the table of docs/gps.md.
 """

@@ -46,7 +46,7 @@ def test_level_ground_repeats_the_plan_and_a_steep_slope_does_not(
     gps_terrain.main(gps_terrain.Args(checkpoints=(directory,), output=output, steps=6))
     longer = [row for row in read_csv(output / "gps_terrain.csv") if row["T"] == "6"]
     assert {row["controller"] for row in longer} == {"policy", "tbdp"}  # the DDP controller's time has run out
-    assert float(longer[0]["guides"]) == pytest.approx(2 * float(level["guides"]))
+    assert float(longer[0]["guides"]) == pytest.approx(2 * float(level["guides"]), rel=1e-2)
 
 
 def test_terrains() -> None:
