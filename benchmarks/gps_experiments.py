@@ -3,7 +3,7 @@
     python benchmarks/gps_experiments.py                  the runs of docs/gps.md; finished ones are kept
     python benchmarks/gps_experiments.py --env hopper --cases full adaptive --seeds 1 2 --train-only    a part of them
     python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
-    python benchmarks/gps_experiments.py --list           a command for each run, to be run side by side
+    python benchmarks/gps_experiments.py --list           a command for each plan, and for each run, to run side by side
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
     python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
 
@@ -61,11 +61,11 @@ FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
 # guide each, and random ones of their kinds; without the random ones; without guides but that of level ground
 SLOPES = "level incline:10 incline:-10 incline:5 incline:-5 step:5 step:-5"
 ROUGH = "rough:10:1:1 rough:10:1:2 rough:10:2:1 rough:10:2:2"
-RANDOM = "--practice incline:10 step:5 rough:10:1 rough:10:2"
-GROUNDS = {"slope": "--terrain incline:10", "rough": f"--terrain {ROUGH} --practice rough:10:1 rough:10:2"}
+RANDOM = "--practice incline:12 step:7 rough:12:1 rough:12:2"
+GROUNDS = {"slope": "--terrain incline:10", "rough": f"--terrain {ROUGH} --practice rough:12:1 rough:12:2"}
 GROUNDS |= {"terrain": f"--terrain {SLOPES} {ROUGH} {RANDOM}"}
 GROUNDS |= {"guides": f"--terrain {SLOPES} {ROUGH}", "practice": RANDOM}
-MORE = "--horizon 160 --guiding-samples 44 --samples 20 --active 120"
+MORE = "--horizon 160 --guiding-samples 44 --samples 40 --active 160"
 CASES |= {f"feedback-{name}": f"--variant feedback {MORE} {flags}" for name, flags in GROUNDS.items()}
 FIVE, THREE, TWO, ONE = (1, 2, 3, 4, 5), (1, 2, 3), (1, 2), (1,)
 OTHERS = "unregularized nonguided restart single-example dagger"
@@ -73,7 +73,13 @@ HOPPER, WALKER, SWIMMER = (
     f"--demonstration benchmarks/plans/{name}_500.npz" for name in ("hopper", "walker", "swimmer")
 )
 BRIEF, LONGER = "--ilqr-iterations 2", "--ilqr-iterations 40"
-TERRAIN = f"--demonstration benchmarks/plans/walker_terrain_160.npz {BRIEF} --imitation 40 --iterations 45"
+TERRAIN = f"--demonstration benchmarks/plans/walker_terrain_160.npz {BRIEF} --imitation 23 --iterations 26"
+PLANS = {  # of benchmarks/plans/: runs of gps.py that write such a plan.npz; the swimmer's: see gps_undulation.py
+    "hopper_500": "--env hopper --window 50 --restarts 8 --seed 2 --iterations 1",
+    "walker_500": "--env walker --restarts 8 --ilqr-iterations 40 --iterations 1",
+    "walker_terrain_160": f"--env walker --horizon 160 --terrain {SLOPES} {ROUGH} {WALKER} --ilqr-iterations 20 "
+    "--samples 11 --iterations 1",
+}
 # What docs/gps.md shows, per task: cases, seeds, flags. Other seeds run as the first of their case
 SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
     "cartpole": [
@@ -146,7 +152,7 @@ class Args:
     train_only: bool = False
     """only train: several such commands may run side by side"""
     list: bool = False
-    """only print a command for each of the runs"""
+    """only print a command for each plan and each run"""
     draw_only: bool = False
     """train nothing: collect, draw and tabulate the runs there are"""
     record: Path | None = None
@@ -232,7 +238,10 @@ def train_all(args: Args) -> None:
 
 
 def commands(args: Args) -> Iterator[str]:
-    """One for each run, of one thread."""
+    """One for each plan that the runs start from, then one for each run, of one thread."""
+    for name, flags in PLANS.items():
+        if name.split("_")[0] in args.env:
+            yield shlex.join(["python", "gps.py", *flags.split(), "--run-dir", f"runs/plans/{name}"])
     runs = args.runs.relative_to(ROOT) if args.runs.is_relative_to(ROOT) else args.runs
     rest = ["--", *args.arguments] if args.arguments else []
     for name in jobs(args):
