@@ -147,10 +147,11 @@ def main(args: Args) -> None:
             print(", ".join(digits(value) for value in row.values()), flush=True)
             args.merge("gps_terrain", [row], KEY)
     rows = [row for row in args.read("gps_terrain") if row["variant"] in GROUNDS]
-    env = "walker" if any(row["env"] == "walker" for row in rows) else rows[0]["env"]
-    rows = [row for row in rows if row["env"] == env]
-    plot(args.picture("gps_terrain"), panels([row for row in rows if row["T"] == rows[0]["T"]]))
-    args.publish("gps terrain", markdown(table(rows)), "gps.md")
+    tasks = sorted({row["env"] for row in rows}, reverse=True)  # the page shows the walker
+    rows = [row for row in rows if row["env"] == tasks[0]]
+    if rows:
+        plot(args.picture("gps_terrain"), panels([row for row in rows if row["T"] == rows[0]["T"]]))
+        args.publish("gps terrain", markdown(table(rows)), "gps.md")
 
 
 if __name__ == "__main__":
