@@ -43,9 +43,11 @@ def test_level_ground_repeats_the_plan_and_a_steep_slope_does_not(
     before = (output / "gps_terrain.csv").read_bytes()
     gps_terrain.main(gps_terrain.Args(draw_only=True, output=output))
     assert before == (output / "gps_terrain.csv").read_bytes()
+    monkeypatch.setattr(gps_terrain, "FAR", 9.0)
     gps_terrain.main(gps_terrain.Args(checkpoints=(directory,), output=output, steps=6))
     longer = [row for row in read_csv(output / "gps_terrain.csv") if row["T"] == "6"]
     assert {row["controller"] for row in longer} == {"policy", "tbdp"}  # the DDP controller's time has run out
+    assert {row["standing"] for row in longer} == {"1"} and {row["walked"] for row in longer} == {"0"}
     assert float(longer[0]["guides"]) == pytest.approx(2 * float(level["guides"]), rel=1e-2)
 
 
