@@ -239,9 +239,9 @@ def train_all(args: Args) -> None:
 
 def commands(args: Args) -> Iterator[str]:
     """One for each plan that the runs start from, then one for each run, of one thread."""
-    for name, flags in PLANS.items():
+    for name, plan in PLANS.items():
         if name.split("_")[0] in args.env:
-            yield shlex.join(["python", "gps.py", *flags.split(), "--run-dir", f"runs/plans/{name}"])
+            yield shlex.join(["python", "gps.py", *plan.split(), "--run-dir", f"runs/plans/{name}"])
     runs = args.runs.relative_to(ROOT) if args.runs.is_relative_to(ROOT) else args.runs
     rest = ["--", *args.arguments] if args.arguments else []
     for name in jobs(args):
