@@ -409,6 +409,19 @@ def test_variants(variant: str, tmp_path: Path) -> None:
     assert moved == (variant in ("policy-gradient", "dagger"))
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("variant", ["full", "feedback"])
+def test_a_gpu_plans_and_learns_as_the_cpu_does(variant: str, tmp_path: Path) -> None:
+    """The same plan, the same samples, and policies that differ by rounding alone."""
+    flags = [*TINY, "--variant", variant, *"--adaptive 1 --adaptive-iterations 2 --device".split()]
+    one, other = (run(gps, tmp_path / device, *flags, device)["modules"] for device in ("cpu", "cuda"))
+    for part in ("x", "u", "K", "L"):
+        place = LinearGaussian._fields.index(part)
+        torch.testing.assert_close(other["search"]["guides"][0][place].cpu(), one["search"]["guides"][0][place])
+    assert other["search"]["control_steps"] == one["search"]["control_steps"]
+    torch.testing.assert_close(other["policy"]["theta"].cpu(), one["policy"]["theta"], rtol=1e-3, atol=1e-3)
+
+
 def test_seeds_and_adaptive_guides(tmp_path: Path) -> None:
     arguments = [*TINY, *"--guides 2 --adaptive 1 --adaptive-iterations 2 --stored 60 --seed".split()]
     one, other = (run(gps, tmp_path / str(seed), *arguments, seed)["modules"] for seed in (1, 2))
