@@ -32,7 +32,7 @@ from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
 from diffsim.tasks import TASKS
-from diffsim.terrain import incline
+from diffsim.terrain import named_terrains, random_terrain
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.checkpoint import Stateful
@@ -68,7 +68,7 @@ PER_TASK = {
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples", "slope")
+    FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples", "terrain")
 
     variant: Variant = "feedback"
     """the algorithm (full), after imitation of the guides' feedback (ours), or one of Figure 2's others (per task)"""
@@ -106,8 +106,10 @@ class Args(Flags):
     """standard deviation of the guiding actions relative to the policy's: the temperature of exp(reward) (per task)"""
     guiding_samples: Count = 40
     """trajectories drawn from the guiding distributions"""
-    slope: Finite = 0.0
-    """train on an incline of so many degrees that begins at x = 1 m; the policy does not see it"""
+    terrain: tuple[str, ...] = ("level",)
+    """train on these, with guides on each: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
+    practice: tuple[str, ...] = ()
+    """the policy's trajectories go each over a random terrain of these kinds, up to that size, not over --terrain"""
     adaptive: Natural = 0
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
     adaptive_iterations: Count = 50
@@ -150,7 +152,8 @@ class Args(Flags):
             fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
         if self.env == "cartpole" and self.reward == "target":
             fail("--reward target is of robots that walk or swim; cartpole has --reward native")
-        least = dict(horizon=2, guiding_samples=max(2, self.guides), restarts=self.guides, samples=max(2, self.guides))
+        most = max(2, self.guides * len(self.terrain))
+        least = dict(horizon=2, guiding_samples=most, restarts=self.guides, samples=most)
         least |= dict(active=self.guiding_samples + self.samples, stored=self.active)
         for name, bound in least.items():
             if getattr(self, name) < bound:
@@ -159,6 +162,9 @@ class Args(Flags):
             fail(f"--regularizer-bounds must be two numbers in order, not {self.regularizer_bounds}")
         if self.demonstration and self.guides > 1:
             fail("--demonstration is one trajectory: --guides must be 1")
+        if self.adaptive and len(self.terrain) > 1:
+            fail("--adaptive is of guides on one --terrain")
+        named_terrains(*self.terrain, *(random_terrain(kind, torch.Generator()) for kind in self.practice))
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -170,7 +176,9 @@ class Search:
     NUMBERS = "w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.args, self.system = args, System(env, args.threads or None, incline(args.slope) if args.slope else None)
+        self.args, self.env = args, env
+        self.grounds = {name: self.over(name) for name in args.terrain}
+        self.system = self.over(*self.grounds) if len(self.grounds) > 1 else self.grounds[args.terrain[0]]
         self.cost = AfterStep(self.system, lambda x, u: -self.reward(x, u))
         self.rng = torch.Generator().manual_seed(args.seed)  # on the CPU: the same numbers for every device
         self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn
@@ -187,6 +195,10 @@ class Search:
         self.student = self.network.theta  # the last of feedback's fits
         self.modules: dict[str, Stateful] = {"policy": self.network, "samples": self.S, "search": self}
 
+    def over(self, *names: str) -> System:
+        """The robot over terrains: trajectory i over number i % n."""
+        return System(self.env, self.args.threads or None, None if names == ("level",) else named_terrains(*names))
+
     @property
     def policy(self) -> nn.Sequential:
         """theta* without noise, for environments and checkpoints."""
@@ -194,12 +206,13 @@ class Search:
 
     def prepare(self, say: Callable[[str], None]) -> dict[str, float]:
         """Lines 1 to 4, with progress told to say; returns the pretrained policy's metrics."""
-        args, policy, before = self.args, self.network, self.system.steps
-        plan = plan_trajectories(self, say)
-        self.plan_return = -plan.cost.min().item()
-        policy.sigma = (args.noise * plan.u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
-        self.guides = make_guides(self, plan, say)  # line 1: generate DDP solutions
-        self.plan_steps = self.system.steps - before
+        args, policy = self.args, self.network
+        plans = [plan_trajectories(self, terrain, say) for terrain in self.grounds]
+        self.plan_return = -sum(plan.cost.min().item() for plan in plans) / len(plans)
+        policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
+        pairs = zip(self.grounds.values(), plans, strict=True)  # line 1: generate DDP solutions
+        self.guides = [guide for ground, plan in pairs for guide in make_guides(self, ground, plan, say)]
+        self.plan_steps = sum(ground.steps for ground in self.grounds.values())
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
         policy.standardise(guiding.obs, guiding.u)
@@ -221,7 +234,7 @@ class Search:
         if args.variant == "dagger":
             self.lessons = guiding.obs, guiding.u
         if args.variant == "feedback":
-            self.learn(guiding.pick(slice(args.samples)))  # more would outweigh what the policy visits
+            self.learn(guiding.pick(slice(0, args.samples * len(plans), len(plans))))  # more would outweigh own ones
             self.learn(own)
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
         return self.metrics(own) | guides
@@ -263,7 +276,6 @@ class Search:
         cost = args.action_cost * u.square().sum(-1)
         if args.reward == "native":
             return system.reward(x, u) - cost
-        x = system.over_ground(x)
         if system.scene.floating:
             height, attitude = x[..., 2], 4.0 * x[..., 4:7].square().sum(-1)
         else:
@@ -284,24 +296,24 @@ class Search:
         sources, log_q = torch.full((len(u),), source, device=u.device), u.mT[:, :0]
         return Samples(x, self.system.observe(x[:, :-1]), u, reward, native, sources, log_q)
 
-    def roll_out(self, theta: Tensor, noise: Tensor, source: int = -1, start: Tensor | None = None) -> Samples:
-        """Trajectories of a policy with standard normal noise (m, T, nu), from the fixed start or from (m, nx)."""
-        policy, system = self.network, self.system
+    def roll_out(self, system: System, theta: Tensor, noise: Tensor, start: Tensor, source: int = -1) -> Samples:
+        """Trajectories of a policy with standard normal noise (m, T, nu), from start (1 or m, nx)."""
 
         def act(t: int, x: Tensor) -> Tensor:
-            return policy.mean(theta, system.observe(x)) + policy.sigma * noise[:, t]
+            return self.network.mean(theta, system.observe(x)) + self.network.sigma * noise[:, t]
 
-        start = self.guides[0].x[:1].expand(len(noise), -1) if start is None else start
-        return self.measure(*system.rollout(start, self.args.horizon, act), source)
+        return self.measure(*system.rollout(start.expand(len(noise), -1), self.args.horizon, act), source)
 
     def draw(self, theta: Tensor, source: int = -1) -> Samples:
         """Trajectories, --samples of them; those of the restart variant that join S start at states of the guides."""
-        count, start = self.args.samples, None
+        count, start, kinds, system = self.args.samples, self.guides[0].x[:1], self.args.practice, self.system
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
+        if kinds:
+            system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
         if source >= 0 and self.args.variant == "restart":
             x = torch.cat([guide.x[:-1] for guide in self.guides])
             start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
-        return self.roll_out(theta, noise, source, start)
+        return self.roll_out(system, theta, noise, start, source)
 
     def metrics(self, samples: Samples) -> dict[str, float]:
         objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
@@ -310,10 +322,11 @@ class Search:
         return {name: value.item() for name, value in objective.items()} | counts
 
     def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
-        """So many trajectories of guides in equal shares, numbered from the first one's source on."""
+        """So many trajectories of guides in equal shares, each over its terrain, numbered from the first source on."""
         self.control_steps += count * self.args.horizon
         shares = [self.noise(len(range(i, count, len(guides)))) for i in range(len(guides))]
-        parts = [self.measure(*g.sample(self.system, shares[i]), first + i) for i, g in enumerate(guides)]
+        grounds = [ground for ground in self.grounds.values() for _ in range(self.args.guides)]
+        parts = [self.measure(*g.sample(grounds[i], shares[i]), first + i) for i, g in enumerate(guides)]
         return Samples(*map(torch.cat, zip(*parts, strict=True)))
 
     def sample_guides(self) -> Samples:
@@ -341,8 +354,7 @@ class Search:
     def learn(self, samples: Samples) -> float:
         """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share.
 
-        By the step that looks most like a state: the policy does not see the time, and would be told to jump where it
-        runs late. Far away, as after a fall, linear feedback means nothing.
+        Of the step that looks most alike: at its own time a late policy would be told to jump. Far off all is nonsense.
         """
         x = samples.x[:, :-1].flatten(0, 1)
         guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
@@ -355,8 +367,7 @@ class Search:
     def imitate(self) -> tuple[Tensor, dict[str, float]]:
         """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides.
 
-        Their covariance is eta Q_uu^-1, so that an error counts by what it costs under iLQR's value function; beyond
-        a standard deviation linearly, because few far-off states would rule a square.
+        An error counts by its cost under iLQR's values, beyond a standard deviation linearly: few would rule a square.
         """
         index = torch.randperm(len(self.lessons[0]), generator=self.rng)[:LESSONS]
         obs, u, inverse = (part[index.to(part.device)] for part in self.lessons)
@@ -412,47 +423,44 @@ class Search:
         device = self.system.device
         for name in ("guides", "adapted"):
             setattr(self, name, [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[name]])
-        self.lessons = tuple(tensor.to(device) for tensor in state["lessons"])
-        self.student = state["student"].to(device)
+        self.lessons, self.student = tuple(t.to(device) for t in state["lessons"]), state["student"].to(device)
         self.rng.set_state(state["rng"])
 
 
 # Planning: line 1 -----------------------------------------------------------------------------------------------------
 
 
-def plan_trajectories(search: Search, say: Callable[[str], None]) -> Plan:
-    """Trajectory optimisation from random action sequences or from a demonstration; the best of its results."""
-    args, system, T = search.args, search.system, search.args.horizon
+def plan_trajectories(search: Search, terrain: str, say: Callable[[str], None]) -> Plan:
+    """Trajectory optimisation on a terrain, from random action sequences or from a demonstration; its best results."""
+    args, system, T = search.args, search.grounds[terrain], search.args.horizon
 
     def show(iteration: int, costs: Tensor) -> None:
         if iteration % 10 == 9:
-            say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
+            say(f"planning {terrain}, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
 
+    first = min(args.window or T, T)
     try:
         if args.demonstration:
-            example = load_demonstration(system, args.demonstration, T)
-            x, u = follow_demonstration(system, *example, args.tracking)
+            x, u = load_demonstration(system, args.demonstration, T, terrain, first)
+            x, u = follow_demonstration(system, x, u, args.tracking)
         else:
-            first = min(args.window or T, T)
             u = starting_actions(args.restarts, first, system.nu, system.control_dt, search.rng).to(system.device)
             x, u = best_of_random_starts(system, search.cost, system.start()[0], u, args.guides, args.screening, show)
-            say(f"planning the rest by windows of {first} steps")
-            x, u = receding_horizon(system, search.cost, x, u, T, max(first // 5, 1), 8, search.rng)
+        x, u = receding_horizon(system, search.cost, x, u, T, max(first // 5, 1), 8, search.rng)
     except ValueError as error:
         fail(error)
     return ilqr(system, search.cost, x, u, args.ilqr_iterations, show=show)
 
 
-def make_guides(search: Search, plan: Plan, say: Callable[[str], None]) -> list[LinearGaussian]:
+def make_guides(search: Search, system: System, plan: Plan, say: Callable[[str], None]) -> list[LinearGaussian]:
     """The controllers about a plan, with the tracking term of Section 6. Checks the Jacobians that they rest on."""
-    args, system = search.args, search.system
+    args = search.args
     cost = Sum((search.cost, Tracking(system, plan.x, plan.u, args.tracking)))
     guides = maximum_entropy_controllers(system, cost, plan, search.network.sigma, args.spread)
     returns = ", ".join(f"{-cost:.2f} ({note})" for cost, note in zip(plan.cost, plan.note, strict=True))
     say(f"planned in {system.steps:,} control steps: returns {returns}")
-    for guide in guides:
-        if guide.mu > 1e-2:
-            say(f"warning: a guide's Q_uu needed mu = {guide.mu:.1e}; it is far from an optimum")
+    for mu in [guide.mu for guide in guides if guide.mu > 1e-2]:
+        say(f"warning: a guide's Q_uu needed mu = {mu:.1e}; it is far from an optimum")
     error = system.check_jacobians(plan.x[0, : -1 : args.horizon // 16 or 1], plan.u[0, :: args.horizon // 16 or 1])
     say(f"Jacobians against central differences: relative error {error.median():.1e}, worst {error.max():.1e}")
     if not error.median() < 1e-3:
@@ -577,10 +585,7 @@ class SampleSet:
         return torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
 
     def choose(self, active: int, newest: int) -> Tensor:
-        """Line 6, indices: the newest of theta*, the initial guides' samples, others by importance under theta*.
-
-        Adapted guides have no place of their own: they would fill S_k, and nothing in it would say what theta* earns.
-        """
+        """Line 6, indices: the newest of theta*, the initial guides' samples, others by importance under theta*."""
         score = torch.where(self.samples.source < self.initial, 2e9, self.score())
         score[(self.samples.source == self.best).nonzero().flatten()[-newest:]] = 3e9
         return score.argsort(descending=True, stable=True)[:active].sort().values
@@ -656,24 +661,21 @@ def dagger(search: Search) -> dict[str, float]:
 
 @torch.no_grad()
 def evaluate(search: Search) -> Evaluation:
-    """The best policy from the fixed start, with the same noise each time: the task's own returns, until it falls.
-
-    Beside them what is optimised, over the whole horizon: mean, deviation, and without noise.
-    """
+    """The best policy, with the same noise each time: the task's own returns until it falls; also what is optimised."""
     system, count = search.system, search.args.eval_episodes
     noise = search.noise(count + 1, torch.Generator().manual_seed(EVALUATION_SEED))
     noise[0] = 0.0
-    rollouts = search.roll_out(search.network.theta, noise)
+    rollouts = search.roll_out(system, search.network.theta, noise, search.guides[0].x[:1])
     (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
     fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & search.args.early_termination).int()
     alive = fallen.cumsum(1) - fallen == 0
     returns, lengths, x = (S.native * alive).sum(1), alive.sum(1), S.x[..., 0]
     distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
     speed = (distance / (lengths * system.control_dt)).mean().item() if travels(system.scene) else None
-    qpos, action = S.x[:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
+    qpos, action = system.in_world(rollouts.x)[1:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
     others = dict(without_noise=without_noise, plan=search.plan_return, guides=search.guide_return[0])
     others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
-    return Evaluation(returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
+    return Evaluation(returns, lengths, speed, qpos, action, system.copies(count, 1), system.control_dt, others)
 
 
 def train(args: Args) -> None:
@@ -681,7 +683,7 @@ def train(args: Args) -> None:
     search = run.restore(Search(args, run.make_eval_env()))
     if run.iteration == 0:
         run.log(search.prepare(run.message), search.control_steps)
-        save_demonstration(search.system, search.guides[0].x, search.guides[0].u, run.directory / "plan.npz")
+        save_demonstration(search.system, search.guides[:: args.guides], run.directory / "plan.npz", search.grounds)
     for iteration in run:  # lines 5 to 18
         run.log(search.iterate(iteration), search.control_steps)
         if run.evaluation_due:
@@ -690,10 +692,7 @@ def train(args: Args) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args, Search, evaluate)
-    else:
-        train(args)
+    evaluate_checkpoint(args, Search, evaluate) if args.evaluate else train(args)
 
 
 if __name__ == "__main__":

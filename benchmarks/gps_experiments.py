@@ -225,7 +225,7 @@ def controllers(search: gps.Search) -> dict[str, Act]:
     return {
         "policy": lambda _, x: policy.mean(policy.theta, system.observe(x)),
         "ddp": lambda t, x: guide.mean(system, t, x),
-        "tbdp": lambda _, x: nearest_feedback(system, [guide], x, policy.obs_std)[0],
+        "tbdp": lambda _, x: nearest_feedback(system, search.guides, x, policy.obs_std)[0],
     }
 
 
@@ -260,7 +260,7 @@ def generalisation(search: gps.Search, count: int) -> list[Row]:
 def paths(search: gps.Search, count: int = 10) -> list[Row]:
     """Where plan, guiding samples and the noisy policy's trajectories go: the first two coordinates."""
     guides = search.guides[0].sample(search.system, search.noise(count))[0]
-    policy = search.roll_out(search.network.theta, search.noise(count)).x
+    policy = search.roll_out(search.system, search.network.theta, search.noise(count), search.guides[0].x[:1]).x
     rows = []
     for name, x in (("plan", search.guides[0].x[None]), ("guides", guides), ("policy", policy)):
         for i, trajectory in enumerate(x[..., :2].tolist()):

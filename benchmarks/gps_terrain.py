@@ -14,28 +14,22 @@ Writes gps_terrain.csv, gps_terrain.png and, with --update-results, the table of
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
 import common
-import torch
 from common import Line, Panel, parse, plot
 from gps_experiments import CONTROLLERS, RUN, controllers, environment, grouped, load_search
-from tables import ROOT, Row, digits, markdown
+from tables import Row, digits, markdown
 from torch import Tensor
 
-from diffsim import DiffEnv
 from diffsim.planning import System
-from diffsim.terrain import Array, incline, rough, step
-
-sys.path.append(str(ROOT))
-import gps  # noqa: E402
+from diffsim.terrain import named_terrains
 
 PLACES = [0.5 + 0.1 * i for i in range(10)]  # m, where a slope or a step begins
 SEEDS = range(1000, 1010)
-FALL = 0.45  # m
+FALL, WALKED = 0.45, 0.9  # m; of the guides' way
 SIZES = {  # of each terrain
     "incline (degrees)": (-10.0, -5.0, -2.5, 0.0, 2.5, 5.0, 10.0),
     "step (cm)": (-5.0, -2.0, 2.0, 5.0),
@@ -45,12 +39,12 @@ SIZES = {  # of each terrain
 KEY = (*RUN, "terrain", "size", "controller")
 
 
-def profiles(terrain: str, size: float) -> list[Array]:
-    if terrain.startswith("incline"):
-        return [incline(size, start) for start in PLACES]
-    if terrain.startswith("step"):
-        return [step(size / 100, start) for start in PLACES]
-    return [rough(seed, segment=1.0 if "1 m" in terrain else 2.0, degrees=size, start=PLACES[0]) for seed in SEEDS]
+def names(terrain: str, size: float) -> list[str]:
+    """As diffsim.terrain.named_terrains takes them."""
+    kind, segment = terrain.split()[0], "1" if "1 m" in terrain else "2"
+    if kind.startswith("rough"):
+        return [f"rough:{size:g}:{segment}:{seed}:{PLACES[0]}" for seed in SEEDS]
+    return [f"{kind}:{size:g}:{place:g}" for place in PLACES]
 
 
 def until_fall(x: Tensor, height: int) -> tuple[Tensor, Tensor]:
@@ -63,32 +57,21 @@ def until_fall(x: Tensor, height: int) -> tuple[Tensor, Tensor]:
     return up[..., -1].bool(), (x[..., 0].gather(-1, last) - x[..., :1, 0]).squeeze(-1)
 
 
-def rollout(search: gps.Search, env: DiffEnv, profile: Array) -> tuple[Tensor, Tensor, Tensor]:
-    """Each controller from the guide's start: states over the ground, actions, whether finite; see Dynamics.rollout."""
-    system, acts = System(env, 1, profile), list(controllers(search).values())
-
-    def act(t: int, x: Tensor) -> Tensor:
-        own = system.over_ground(x).split(1)
-        return torch.cat([act(t, row) for act, row in zip(acts, own, strict=True)])
-
-    start = search.guides[0].x[:1].expand(len(acts), -1)
-    x, u, finite = system.rollout(start, search.args.horizon, act)
-    return system.over_ground(x), u, finite
-
-
 def measure(path: Path) -> Iterator[Row]:
     """One row for each terrain, size and controller."""
     run, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
-    search.guides = [guide._replace(x=search.system.over_ground(guide.x)) for guide in search.guides]
-    search.system = System(env, 1)  # to which all states here belong: they are over the ground
     guides, height = search.guide_return[0], 2 if search.system.scene.floating else 1
+    far = WALKED * mean((guide.x[-1, 0] - guide.x[0, 0]).item() for guide in search.guides)
+    start = search.guides[0].x[:1].expand(len(PLACES), -1)
     for terrain, size in ((terrain, size) for terrain, sizes in SIZES.items() for size in sizes):
-        parts = zip(*(rollout(search, env, profile) for profile in profiles(terrain, size)), strict=True)
-        for name, x, u, finite in zip(CONTROLLERS, *(torch.stack(part, 1) for part in parts), strict=True):
+        system = System(env, 1, named_terrains(*names(terrain, size)))
+        for name, act in controllers(search).items():
+            x, u, finite = system.rollout(start, search.args.horizon, act)
             returns, (up, distance) = search.measure(x, u, finite).returns, until_fall(x, height)
             standing = up & finite.all(-1)
-            numbers = dict(kept=standing & (returns >= guides - 0.25 * abs(guides)), standing=standing)
-            means = {key: value.double().mean().item() for key, value in (numbers | dict(distance=distance)).items()}
+            kept = standing & (returns >= guides - 0.25 * abs(guides))
+            shares = dict(kept=kept, walked=standing & (distance >= far), standing=standing, distance=distance)
+            means = {key: value.double().mean().item() for key, value in shares.items()}
             row = run | dict(terrain=terrain, size=size, controller=name) | means
             yield row | dict(median_return=returns.median().item(), guides=guides)
 
@@ -102,12 +85,15 @@ def main(args: common.CheckpointFlags) -> None:
     for (env, variant, terrain), rows in grouped(args.read("gps_terrain"), *RUN[:2], "terrain").items():
         shares = dict[str, dict[float, float]]()  # kept, by controller and size
         for (size,), own in grouped(rows, "size").items():
-            means: dict[str, list[float]] = {column: [] for column in ("kept", "standing", "distance")}
+            means: dict[str, list[float]] = {column: [] for column in ("kept", "walked", "standing", "distance")}
             for name in CONTROLLERS:
                 for column, values in means.items():
                     values.append(mean(float(row[column]) for row in own if row["controller"] == name))
                 shares.setdefault(name, {})[float(size)] = 100 * means["kept"][-1]
-            cells = {column: " / ".join(f"{value:.0%}" for value in means[column]) for column in ("kept", "standing")}
+            cells = {
+                column: " / ".join(f"{value:.0%}" for value in means[column])
+                for column in ("kept", "walked", "standing")
+            }
             cells["m until a fall"] = " / ".join(f"{value:.1f}" for value in means["distance"])
             table.append({"task": env, "case": variant, "terrain": terrain, "size": size} | cells)
         lines = [Line(list(s), list(s.values()), f"{CONTROLLERS[name]}o-", name) for name, s in shares.items()]

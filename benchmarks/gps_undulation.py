@@ -114,7 +114,7 @@ def main() -> None:
     if args.plan:
         search = make_search(".025", 200, 500)
         plan = plan_from(search, args)[2]
-        save_demonstration(search.system, plan.x[0], plan.u[0], args.plan)
+        save_demonstration(search.system, [(plan.x[0], plan.u[0])], args.plan)
         print(f"return {-plan.cost.item():.1f}, {speed(search, plan.x).item():.2f} m/s: {args.plan}")
         return
     rows = []
@@ -125,7 +125,7 @@ def main() -> None:
         row["top speed m/s"] = f"{speed(search, undulate(search, args, fastest=True)[0]).item():.2f}"
         row |= {"undulation": f"{search.reward(x[:, 1:], u).sum().item():.0f}", "m/s": f"{speed(search, x).item():.2f}"}
         row |= {"plan from it": f"{-plan.cost.item():.0f}", "plan m/s": f"{speed(search, plan.x).item():.2f}"}
-        scratch = gps.plan_trajectories(search, lambda text: None)
+        scratch = gps.plan_trajectories(search, "level", lambda text: None)
         row |= {"random plan": f"{-scratch.cost.item():.0f}", "random m/s": f"{speed(search, scratch.x).item():.2f}"}
         rows.append(row)
         print(row, flush=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.integration import is_real
-from diffsim.terrain import check_terrain
+from diffsim.terrain import TerrainError, check_terrain
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -251,7 +251,7 @@ class Scene:
                 or a robot that touches no ground.
         """
         if not self.ncontact:
-            raise ValueError(f"{self.name} touches no ground, so it has no terrain")
+            raise TerrainError(f"{self.name} touches no ground, so it has no terrain")
         return dataclasses.replace(self, terrain=check_terrain(vertices), ground_height=0.0)
 
     def without(self, *features: str) -> Scene:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment; half width and half thickness of all
+
+
+class TerrainError(ValueError):
+    """A terrain that cannot be made of its name, or not for a robot."""
 
 
 def incline(degrees: float, start: float = 1.0) -> Array:
@@ -74,6 +79,51 @@ def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float 
         raise ValueError(f"length is {length!r}, must be at least one segment of {segment!r}")
     angles = np.random.default_rng(seed).uniform(-1.0, 1.0, count) * math.atan(steepest)
     return _profile(start, [segment] * count + [1.0], [*np.tan(angles), 0.0])
+
+
+def named_terrains(*names: str) -> Array:
+    """(M, K, 2) profiles of M names, as flags of a command have them, K of the longest.
+
+    A name is "level", "incline:DEGREES", "step:CENTIMETRES" or "rough:DEGREES". Further numbers after colons are
+    `start` of the first two, and `segment`, `seed` (0) and `start` of rough ground.
+
+    Raises:
+        TerrainError: another name, a number too few or too many, or one that the function of that name refuses.
+    """
+    profiles = []
+    for name in names:
+        kind, *numbers = name.split(":")
+        try:
+            profiles.append(_MAKERS[kind](*map(float, numbers)))
+        except (KeyError, TypeError) as error:
+            usage = "incline:DEGREES[:START], step:CENTIMETRES[:START] or rough:DEGREES[:SEGMENT[:SEED[:START]]]"
+            raise TerrainError(f"terrain {name!r} must be level, {usage}") from error
+        except ValueError as error:
+            raise TerrainError(f"terrain {name!r}: {error}") from error
+    most = max(map(len, profiles))
+    for i, p in enumerate(profiles):  # the last segment goes on
+        more = p[-1] + np.arange(1, most - len(p) + 1)[:, None] * (p[-1] - p[-2])
+        profiles[i] = np.concatenate((p, more))
+    return np.stack(profiles)
+
+
+def random_terrain(kind: str, rng: torch.Generator) -> str:
+    """The name of a terrain drawn from those of a kind, a name without place or seed, up to its size up and down.
+
+    It begins between x = 0.5 and 1.5 m.
+
+    Raises:
+        TerrainError: level ground, or a place or a seed.
+    """
+    name, *numbers = kind.split(":")
+    if (name, len(numbers)) not in {("incline", 1), ("step", 1), ("rough", 1), ("rough", 2)}:
+        usage = "incline:DEGREES, step:CENTIMETRES or rough:DEGREES[:SEGMENT]"
+        raise TerrainError(f"kind of terrain {kind!r} must be {usage}")
+    size, place = torch.rand(2, generator=rng, dtype=torch.float64).tolist()
+    if name == "rough":
+        seed = int(torch.randint(2**31, (1,), generator=rng))
+        return ":".join((name, *numbers, *["1"] * (2 - len(numbers)), f"{seed}", f"{0.5 + place:.4f}"))
+    return f"{name}:{(2 * size - 1) * float(numbers[0]):.6g}:{0.5 + place:.4f}"
 
 
 def check_terrain(vertices: ArrayLike) -> Array:
@@ -160,6 +210,15 @@ class Elevation:
         The dimension before the last of qpos is that of the environments, all or those of rows (k,), unless one
         terrain serves all.
         """
+        x, (start, level, slope) = self._below(qpos, rows)
+        return (level + slope * (x - start)).squeeze(-1)
+
+    def gradient(self, qpos: Tensor) -> Tensor:
+        """(..., nq, nq) by which qpos (..., nq) of the root's `lift` changes beside itself; walls do not count."""
+        return self._below(qpos, None)[1][2].unsqueeze(-1) * torch.outer(self._up, self._along)
+
+    def _below(self, qpos: Tensor, rows: Tensor | None) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The root's x (..., 1), and (..., 1) each: where the segment below begins, its height there, its slope."""
         profiles = self._profiles
         if profiles.shape[1] == 1:
             profiles = profiles[:, 0]
@@ -167,8 +226,7 @@ class Elevation:
             profiles = profiles[:, rows]
         x = (self._x0 + qpos @ self._along).unsqueeze(-1)
         segment = ((x >= profiles[0]).sum(-1, keepdim=True) - 1).clamp(min=0)
-        start, level, slope = (p.expand(*x.shape[:-1], -1).gather(-1, segment) for p in profiles)
-        return (level + slope * (x - start)).squeeze(-1)
+        return x, tuple(p.expand(*x.shape[:-1], -1).gather(-1, segment) for p in profiles)
 
     def lift(self, qpos: Tensor, rows: Tensor | None = None) -> Tensor:
         """World qpos (..., nq) of one over the plane."""
@@ -192,6 +250,14 @@ def root(scene: Scene) -> tuple[float, Array, Array]:
         if abs(axis[2]) > 1 - 1e-9:
             up[link - 1] = np.sign(axis[2])
     return float(place[0]), along, up
+
+
+_MAKERS: dict[str, Callable[..., Array]] = {
+    "level": lambda: incline(0.0),
+    "incline": incline,
+    "step": lambda height, start=1.0: step(height / 100, start),
+    "rough": lambda degrees, segment=1.0, seed=0.0, start=1.0: rough(int(seed), segment, degrees, start=start),
+}
 
 
 def _profile(start: float, runs: list[float], slopes: list[float]) -> Array:

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import assert_refuses, assert_same, run
+from learners import assert_refuses, assert_same, read_progress, run
 from torch import Tensor
 
 import diffsim
 import gps
-from diffsim.planning import LinearGaussian
+from diffsim import render
+from diffsim.planning import LinearGaussian, save_demonstration
+from diffsim.terrain import named_terrains
 from diffsim.training import evaluate, load_policy
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.lbfgs import maximise
@@ -208,18 +211,6 @@ def test_reward_of_the_paper() -> None:
     torch.testing.assert_close(native.reward(x, u), native.system.reward(x, u) - 0.03)
 
 
-def test_reward_counts_the_height_over_the_ground() -> None:
-    """On a slope of 10 degrees, which has risen by 0.18 m a metre after its start."""
-    search = make_search("hopper", "--slope 10")
-    flat, system, u = make_search("hopper"), search.system, torch.ones(3).double()
-    x = system.start()[0] + 0.1
-    uphill = x.clone()
-    uphill[0] = 2.0
-    uphill[1] += math.tan(math.radians(10.0))
-    torch.testing.assert_close(search.reward(uphill, u), flat.reward(x, u))
-    assert search.reward(x, u) == flat.reward(x, u)
-
-
 def test_policy_has_the_papers_1256_parameters() -> None:
     policy = make_search("walker").network  # 18 inputs in the paper, 17 here
     assert len(policy.initial(torch.Generator())) == 1256 - 50
@@ -365,7 +356,7 @@ def test_evaluation(trained: Path, rows: list[dict[str, str]], tmp_path: Path, s
 def test_the_policy_acts_in_environments_as_it_does_in_the_search(trained: Path, search: gps.Search) -> None:
     env = diffsim.make("cartpole", 2, horizon=1, dtype=torch.float64, stochastic_init=False)
     env.episode_length = 30
-    S = search.roll_out(search.network.theta, 0 * search.noise(1))
+    S = search.roll_out(search.system, search.network.theta, 0 * search.noise(1), search.guides[0].x[:1])
     returns = S.native.sum(1).expand(2)
     torch.testing.assert_close(evaluate(env, search.policy).returns, returns)
     torch.testing.assert_close(
@@ -437,9 +428,93 @@ def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
     assert search["guides"][0][0][0].tolist() == [0.3, 3.0, 0.0, 0.0]
 
 
+SLOPES = "level", "incline:15:-1", "incline:-15:-1"  # all but the first begin behind the start
+HOPPING = (
+    "--env hopper --horizon 8 --window 4 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 "
+    "--guiding-samples 6 --samples 6 --active 12 --stored 16 --lbfgs-iterations 2 --iterations 2 --eval-every 0 "
+    "--eval-episodes 2 --quiet --terrain"
+).split()
+
+
+def test_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A guide on each, which is sampled there; trajectory i of the policy goes over terrain i % 3; a plan of each."""
+    run(gps, tmp_path, *HOPPING, *SLOPES)
+    state = load(tmp_path / "checkpoint.pt", "gps")
+    search = gps.Search(gps.Args(**state["args"]), environment("hopper", 1))
+    restore(search, state)
+    assert len(search.guides) == search.S.initial == 3 and search.plan_steps == int(
+        float(read_progress(tmp_path)[0]["sim_model_steps"])
+    )
+    monkeypatch.setattr(search, "noise", lambda count, rng=None: torch.zeros(count, 8, 3).double())
+    S = search.follow(search.guides, 6)
+    own = search.draw(search.network.theta)
+    for i, guide in enumerate(search.guides):
+        assert (S.source == i).sum() == 2
+        torch.testing.assert_close(S.x[S.source == i], guide.x.expand(2, -1, -1))
+        alone = search.roll_out(search.grounds[SLOPES[i]], search.network.theta, search.noise(1), guide.x[:1])
+        torch.testing.assert_close(own.x[i::3], alone.x.expand(2, -1, -1))
+    assert not any(torch.allclose(own.x[0], own.x[i]) for i in (1, 2))
+    plan = np.load(tmp_path / "plan.npz")
+    assert tuple(plan["terrain"]) == SLOPES and plan["action"].shape == (3, 8, 3)
+    for i, name in enumerate(SLOPES):  # each is the start of its own terrain's guide, and is followed to its end
+        again = make_search("hopper", f"--horizon 8 --terrain {name} --demonstration {tmp_path / 'plan.npz'}")
+        again.args.ilqr_iterations = 0
+        torch.testing.assert_close(gps.plan_trajectories(again, name, print).x[0], search.guides[i].x)
+    evaluation = gps.evaluate(search)  # beside these two one without noise, which is the first
+    world = evaluation.qpos[0, :, 1] - search.guides[0].x[0, 1]
+    torch.testing.assert_close(world, torch.tensor([1.0, -1.0]).double() * math.tan(math.radians(15.0)))
+    films: list[Any] = []
+    monkeypatch.setattr(render, "film", lambda path, scene, *_: films.append(scene.terrain))
+    for returns, name in (((0.0, 1.0), SLOPES[1]), ((1.0, 0.0), SLOPES[2])):  # of two, the worse one is filmed
+        replace(evaluation, returns=torch.tensor(returns)).save_video(tmp_path / "video.mp4")
+        np.testing.assert_allclose(films[-1][0, :3], named_terrains(name)[0])
+
+
+def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each trajectory has its own, drawn anew of the kinds in turn; a resumed run draws the same."""
+    kinds, drawn = ("incline:20", "rough:10:2"), list[str]()
+
+    def random_terrain(kind: str, rng: torch.Generator) -> str:
+        drawn.append(kind)
+        return f"incline:{40 * torch.rand(1, generator=rng).item() - 20}:-1"
+
+    monkeypatch.setattr(gps, "random_terrain", random_terrain)
+    arguments = [*HOPPING, "level", "--practice", *kinds]
+    whole = run(gps, tmp_path / "whole", *arguments)
+    assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
+    start, S = whole["modules"]["search"]["guides"][0][0][0], whole["modules"]["samples"]
+    own = S["samples"][0][S["samples"][5] > 0]
+    assert len(own) >= 6 and len(own[:, 1].unique(dim=0)) == len(own) and (own[:, 0] == start).all()
+    run(gps, tmp_path / "parts", *arguments, "--stop-after", 1)
+    gps.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
+    parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
+    assert_same(parts["modules"], whole["modules"])
+
+
+def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None:
+    """Its first window is followed, and the rest is planned."""
+    path, search = tmp_path / "level.npz", make_search("hopper", "--horizon 8")
+    u = 0.1 * torch.ones(1, 8, 3).double()
+    x, _, _ = search.system.rollout(search.system.start(), 8, lambda t, _: u[:, t])
+    save_demonstration(search.system, [(x[0], u[0])], path)
+    flags = f"--horizon 8 --window 4 --terrain level step:-20:0.01 --demonstration {path}"
+    search = make_search("hopper", flags)
+    search.args.ilqr_iterations = 0
+    level, step = (gps.plan_trajectories(search, name, print) for name in search.grounds)
+    torch.testing.assert_close(level.x, x)
+    assert step.x.shape == x.shape and not torch.allclose(step.u, u)
+    ground = search.grounds["step:-20:0.01"]
+    torch.testing.assert_close(ground.rollout(step.x[:, 0], 8, lambda t, _: step.u[:, t])[0], step.x)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ("--env hopper --terrain hill", "terrain 'hill' must be level, incline:DEGREES"),
+        ("--env hopper --terrain level step:0", "terrain 'step:0': height is 0.0"),
+        ("--env hopper --practice incline:10:1", "kind of terrain 'incline:10:1' must be incline:DEGREES"),
+        ("--env hopper --terrain level step:1 step:2 --samples 2", "--samples must be at least 3, not 2"),
+        ("--env hopper --terrain level step:1 --adaptive 1", "--adaptive is of guides on one --terrain"),
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant"),
         ("--env cartpole --horizon 1", "--horizon must be at least 2, not 1"),
         ("--env cartpole --guiding-samples 1", "--guiding-samples must be at least 2, not 1"),

@@ -19,7 +19,7 @@ from diffsim.integration import Integration
 from diffsim.planning.system import System
 from diffsim.scene import Scene
 from diffsim.simulator import Simulator
-from diffsim.terrain import Elevation, incline, rough, slabs, step
+from diffsim.terrain import Elevation, TerrainError, incline, named_terrains, random_terrain, rough, slabs, step
 
 IMPLICIT = Integration("implicit", 8, 0.5)  # of the ball; the hopper is explicit, so that two kernels do for all
 # A valley, a ridge, a wall and a short segment; a ball of 0.1 m fits between all of them.
@@ -289,19 +289,42 @@ def test_a_window_is_differentiable_over_terrain():
 
 
 def test_planning_sees_the_terrain():
+    """States over the ground, on a slope that begins behind the start: the environment's, and their Jacobians."""
     env = hoppers(incline(15.0, start=-2.0), 1, stochastic_init=False)
     system = System(env)
-    torch.testing.assert_close(system.start(), torch.cat((env.qpos, env.qvel), 1))
+    start = torch.cat((env.qpos, env.qvel), 1)
+    assert start[0, 1] > 0.4 + system.start()[0, 1]
+    torch.testing.assert_close(system.in_world(system.start()[:, None])[:, 0], start)
     torch.testing.assert_close(system.observe(system.start()), env.reset()[0])
     u = torch.full((1, 3), 0.1).double()
     x, _, _ = system.rollout(system.start(), 40, lambda t, _: u)
     for t in range(1, 41):
         obs, reward, *_ = env.step(torch.tanh(u))
+        torch.testing.assert_close(system.in_world(x)[0, t, :6], env.qpos[0])
         torch.testing.assert_close(system.reward(x[:, t], u), reward)
         torch.testing.assert_close(system.observe(x[:, t]), obs)
     assert system.check_jacobians(x[0, 30:40:3], u.expand(4, -1)).max() < 1e-4
-    with pytest.raises(ValueError, match="terrain has 2 profiles, must have 1"):
-        System(hoppers(np.stack([PLANE, PLANE])))
+
+
+def test_planning_over_several_terrains():
+    """Trajectory i goes over terrain i % M, and a controller gets its state over that."""
+    profiles = named_terrains("incline:15:-1", "step:30:0.05", "rough:10:1:3:-5")
+    together, seen = System(hoppers(None, 1), 1, profiles), []
+    start = together.start().repeat(5, 1)
+    start[3:, :2] += torch.tensor([0.3, 0.1])
+
+    def act(t, x):
+        seen.append(x)
+        return 0.5 * x[:, 6:9]
+
+    x, u, finite = together.rollout(start, 30, act)
+    assert finite.all() and torch.equal(torch.stack(seen, 1), x[:, :-1])
+    for i in range(5):
+        alone = System(hoppers(None, 1), 1, profiles[i % 3])
+        one = alone.rollout(start[i : i + 1], 30, act)
+        assert torch.equal(one[0][0], x[i]) and torch.equal(one[1][0], u[i])
+    with pytest.raises(ValueError, match="Jacobians need one terrain"):
+        together.jacobians(x[:, 0], u[:, 0], x[:, 1])
 
 
 # Input and pictures ---------------------------------------------------------------------------------------------------
@@ -330,7 +353,7 @@ def test_wrong_terrain_is_refused(vertices, message):
 
 
 def test_what_cannot_have_a_terrain_says_so():
-    with pytest.raises(ValueError, match="robot touches no ground, so it has no terrain"):
+    with pytest.raises(TerrainError, match="robot touches no ground, so it has no terrain"):
         parse(PENDULUM).with_terrain(PLANE)
     with pytest.raises(ValueError, match="terrain has 2 profiles, must have 1 or one for each of 3"):
         diffsim.make("hopper", 3, terrain=[PLANE, PLANE])
@@ -359,6 +382,67 @@ def test_generated_profiles():
     ):
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_terrains_by_their_names():
+    for name, profile in (
+        ("level", incline(0.0)),
+        ("incline:-10", incline(-10.0)),
+        ("incline:5:1.4", incline(5.0, start=1.4)),
+        ("step:-5", step(-0.05)),
+        ("step:2:0.7", step(0.02, start=0.7)),
+        ("rough:8", rough(0, degrees=8.0)),
+        ("rough:8:2", rough(0, 2.0, 8.0)),
+        ("rough:8:2:7:0.5", rough(7, 2.0, 8.0, start=0.5)),
+    ):
+        np.testing.assert_array_equal(named_terrains(name), profile[None])
+    for name in ("hill", "level:1", "incline", "incline:1:2:3", "step", "rough", "rough:1:2:3:4:5", ""):
+        with pytest.raises(TerrainError, match="must be level, incline:DEGREES"):
+            named_terrains("level", name)
+    for name, message in (
+        ("incline:95", "'incline:95': degrees is 95.0"),
+        ("step:0", "height is 0.0"),
+        ("rough:ten", "could not convert string to float: 'ten'"),
+        ("rough:10:1:-1", "'rough:10:1:-1': "),
+    ):
+        with pytest.raises(TerrainError, match=message):
+            named_terrains(name)
+
+
+def test_terrains_in_one_array_keep_their_heights():
+    names = "incline:10", "step:-30", "rough:10:25"
+    stacked, x = named_terrains(*names), np.linspace(-2.0, 60.0, 200)
+    assert stacked.shape == (3, 5, 2)
+    qpos = torch.zeros(len(x), 6).double()
+    qpos[:, 0] = torch.tensor(x)
+    for name, profile in zip(names, stacked, strict=True):
+        scenes = (task_scene("hopper").with_terrain(vertices) for vertices in (named_terrains(name), profile))
+        one, two = (Elevation(scene, "cpu", torch.float64).height(qpos) for scene in scenes)
+        torch.testing.assert_close(one, two)
+        assert one.abs().max() > 0.25
+
+
+def test_random_terrains_are_of_their_kind():
+    """Uniform in both directions up to the size; each begins at its own place, and rough ground has its own seed."""
+    rng = torch.Generator().manual_seed(1)
+    for kind in ("incline:10", "step:5"):
+        names = [random_terrain(kind, rng).split(":") for _ in range(200)]
+        assert {name for name, _, _ in names} == {kind.split(":")[0]}
+        sizes, starts = (np.array([float(name[i]) for name in names]) for i in (1, 2))
+        sizes /= float(kind.split(":")[1])
+        assert -1 < sizes.min() < -0.9 and 0.9 < sizes.max() < 1 and abs(sizes.mean()) < 0.2
+        assert 0.5 < starts.min() < 0.55 and 1.45 < starts.max() < 1.5
+        assert abs(np.corrcoef(sizes, starts)[0, 1]) < 0.2
+    for kind, segment in (("rough:10", "1"), ("rough:10:2", "2")):
+        names = [random_terrain(kind, rng) for _ in range(20)]
+        assert all(name.startswith(f"rough:10:{segment}:") for name in names)
+        assert len({name.split(":")[3] for name in names}) == len({name.split(":")[4] for name in names}) == 20
+        assert named_terrains(*names)[:, 1, 0].min() > 0.5
+    one, other = (random_terrain("step:5", torch.Generator().manual_seed(3)) for _ in range(2))
+    assert one == other
+    for kind in ("level", "incline", "incline:10:1", "step:5:1", "rough:10:1:3", "hill:3"):
+        with pytest.raises(TerrainError, match="kind of terrain .* must be incline:DEGREES"):
+            random_terrain(kind, rng)
 
 
 def test_pictures_show_it():

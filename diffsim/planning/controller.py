@@ -61,7 +61,7 @@ def nearest_feedback(
     """What controllers do where they look most like states, whatever the time.
 
     Coordinates that are not observed, as the place along x, do not count for the likeness but for the feedback, which
-    lets a late policy catch up.
+    lets a late policy catch up. On a terrain the place does not count at all: that of a guide is of its own terrain.
 
     Args:
         x: (m, nx) states.
@@ -73,7 +73,7 @@ def nearest_feedback(
     path, u, K, L = (torch.cat([guide[i][: len(guide.u)] for guide in guides]) for i in range(4))
     looks, own = (system.observe(states) / scale for states in (path, x))
     distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
-    tangent = system.difference(x, path[t])
+    tangent = system.difference(x, path[t]) * system.counts
     return u[t] + (K[t] @ tangent.unsqueeze(-1)).squeeze(-1), L[t], distance / own.shape[1] ** 0.5
 
 

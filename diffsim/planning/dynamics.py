@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -63,7 +64,7 @@ class Dynamics:
     def simulator(self, num_envs: int) -> Simulator:
         if num_envs not in self._simulators:
             self._simulators[num_envs] = Simulator(
-                self.scene,
+                self.copies(num_envs),
                 num_envs,
                 self._integration,
                 self.control_dt,
@@ -72,6 +73,13 @@ class Dynamics:
                 threads=self._threads,
             )
         return self._simulators[num_envs]
+
+    def copies(self, count: int, first: int = 0) -> Scene:
+        """The scene of so many copies from number `first` on; number i has terrain i % M of M."""
+        terrain = self.scene.terrain
+        if terrain is None or len(terrain) == 1:
+            return self.scene
+        return self.scene.with_terrain(terrain[np.arange(first, first + count) % len(terrain)])
 
     def basis(self, x: Tensor) -> Tensor:
         """(..., nx, nd) derivative of `retract` at zero."""

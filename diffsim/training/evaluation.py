@@ -32,7 +32,7 @@ class Evaluation:
         speed: mean forward speed, m/s; None for a robot that does not travel.
         qpos: (T, n, nq) before each step; valid up to an episode's length.
         action: (T, n, nu) of each step.
-        scene, control_dt: what the episodes are of, to draw them.
+        scene, control_dt: what the episodes are of, to draw them; of several terrains episode i has number i % M.
         others: what else a script measured, by name.
     """
 
@@ -76,11 +76,15 @@ class Evaluation:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(values, indent=2, default=str) + "\n")
 
+    @property
+    def median(self) -> int:
+        """The episode of median return."""
+        return int(self.returns.argsort()[(len(self.returns) - 1) // 2])
+
     def median_episode(self, seconds: float = render.VIDEO_SECONDS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """qpos (T, nq) and action (T, nu) of the first seconds of the episode of median return."""
-        episode = self.returns.argsort()[(len(self.returns) - 1) // 2]
-        steps = min(int(self.lengths[episode]), max(1, round(seconds / self.control_dt)))
-        return self.qpos[:steps, episode].cpu().numpy(), self.action[:steps, episode].cpu().numpy()
+        steps = min(int(self.lengths[self.median]), max(1, round(seconds / self.control_dt)))
+        return self.qpos[:steps, self.median].cpu().numpy(), self.action[:steps, self.median].cpu().numpy()
 
     def save_video(self, path: Path, seconds: float = render.VIDEO_SECONDS) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
@@ -88,8 +92,10 @@ class Evaluation:
         Raises:
             OSError, RuntimeError: what is missing to draw or to write, see render.film.
         """
-        qpos, action = self.median_episode(seconds)
-        return render.film(path, self.scene, qpos, self.control_dt, action)
+        (qpos, action), scene = self.median_episode(seconds), self.scene
+        if scene.terrain is not None:
+            scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])
+        return render.film(path, scene, qpos, self.control_dt, action)
 
 
 def kept(own: float, finer: float) -> float:

@@ -25,6 +25,7 @@ from diffsim.env import ActionError
 from diffsim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError, end_in_one_line
 from diffsim.tasks import TASKS, HumanoidImitation
+from diffsim.terrain import TerrainError
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, parse_command_line
 from diffsim.training.variation import parse_ranges
@@ -199,7 +200,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         kind: the script's dataclass of arguments.
         argv: in place of the process's.
     """
-    end_in_one_line(KernelCacheError, TooLargeError, ActionError, FloatingPointError, torch.OutOfMemoryError)
+    kinds = KernelCacheError, TooLargeError, ActionError, TerrainError, FloatingPointError, torch.OutOfMemoryError
+    end_in_one_line(*kinds)
     argv = list(sys.argv[1:] if argv is None else argv)
     # The first pass finds what the defaults of the second depend on, so that its --help shows the task's own.
     args = _cli(kind, [word for word in argv if word not in ("-h", "--help")], kind())
@@ -217,7 +219,10 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args = _cli(kind, argv, defaults)
         args.device = distributed.choose_device(args.device)
     check_ranges(args)
-    args.check()
+    try:
+        args.check()
+    except ValueError as error:
+        fail(error)
     if args.capture_video and distributed.rank() == 0:
         try:
             render.check_opengl()

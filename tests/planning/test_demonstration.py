@@ -9,7 +9,7 @@ import pytest
 import torch
 from systems import normal, task_system
 
-from diffsim.planning import follow_demonstration, load_demonstration
+from diffsim.planning import follow_demonstration, load_demonstration, save_demonstration
 
 
 def write(path: Path, steps: int, **changes: np.ndarray) -> Path:
@@ -25,6 +25,27 @@ def test_reading(tmp_path: Path) -> None:
     bounds = np.array([[1.0], [-1.0]])  # whose atanh is infinite
     u = load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 2, action=bounds), 2)[1]
     torch.testing.assert_close(torch.tanh(u), torch.tensor([[0.995], [-0.995]]).double())
+
+
+def test_several_terrains_in_one_file(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Each is found by its name; of another terrain the beginning of the first is taken."""
+    system, path = task_system("cartpole"), tmp_path / "plan.npz"
+    ways = [(normal(rng, 7, 4), 0.1 * normal(rng, 6, 1)) for _ in range(3)]
+    save_demonstration(system, ways, path, ["level", "step:5", "rough:10"])
+    for name, way in zip(("level", "step:5", "rough:10"), ways, strict=True):
+        for value, expected in zip(load_demonstration(system, path, 6, name, 2), way, strict=True):
+            torch.testing.assert_close(value, expected)
+    for beginning, count in ((None, 6), (4, 4), (9, 6)):
+        x, u = load_demonstration(system, path, 6, "incline:10", beginning)
+        torch.testing.assert_close(x, ways[0][0][: count + 1])
+        torch.testing.assert_close(u, ways[0][1][:count])
+    save_demonstration(system, ways[1:2], path)
+    assert sorted(np.load(path)) == ["action", "qpos", "qvel"] and np.load(path)["qpos"].shape == (7, 2)
+    torch.testing.assert_close(load_demonstration(system, path, 5)[0], ways[1][0][:6])
+    assert len(load_demonstration(system, path, 6, "step:5", 3)[1]) == 3
+    two = {"terrain": np.array(["level", "step:5"])}
+    with pytest.raises(ValueError, match=r"qpos has shape \(10, 2\), must be"):
+        load_demonstration(system, write(tmp_path / "a.npz", 9, **two), 6)
 
 
 @pytest.mark.parametrize(
