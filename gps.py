@@ -51,15 +51,15 @@ LESSONS, REACH = 20_000, 0.5  # of feedback: states of a fit; standard deviation
 GUIDED = "full", "feedback", "unregularized"  # those with guides in S
 # fmt: off
 COLUMNS = ("variant", "horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight",
-           "attitude_weight", "window", "tracking", "spread", "hidden", "noise")
+           "attitude_weight", "window", "tracking", "spread", "hidden", "noise", "perturb")
 PER_TASK = {
-    "cartpole":     ("full",     240, "native", 1e-3, 0.0, 0.0,   0.0,  0.0,  0, 5e-2, 1.0,  50, 0.10),
-    "hopper":       ("feedback", 500, "target", 1e-1, 1.5, 1.25, 10.0,  1.0, 50, 5e-4, 3.0,  50, 0.10),
-    "half_cheetah": ("feedback", 500, "target", 1e-1, 3.0, 0.8,   1.0,  0.1, 50, 5e-4, 3.0,  50, 0.10),
-    "ant":          ("feedback", 500, "target", 1e-2, 3.0, 0.75, 10.0,  0.1, 50, 5e-4, 3.0, 100, 0.10),
-    "humanoid":     ("feedback", 500, "target", 1e-1, 4.2, 1.04, 10.0,  0.1, 50, 5e-4, 3.0, 200, 0.03),
-    "swimmer":      ("feedback", 500, "target", 1e-2, 2.0, 0.0,   0.0,  0.0, 80, 5e-4, 1.0, 200, 0.01),
-    "walker":       ("feedback", 500, "target", 1e-1, 1.2, 1.35, 10.0, 10.0, 50, 5e-4, 3.0,  50, 0.10),
+    "cartpole":     ("full",     240, "native", 1e-3, 0.0, 0.0,   0.0,  0.0,  0, 5e-2, 1.0,  50, 0.10, 0.0),
+    "hopper":       ("feedback", 500, "target", 1e-1, 1.5, 1.25, 10.0,  1.0, 50, 5e-4, 3.0,  50, 0.10, 0.1),
+    "half_cheetah": ("feedback", 500, "target", 1e-1, 3.0, 0.8,   1.0,  0.1, 50, 5e-4, 3.0,  50, 0.10, 0.1),
+    "ant":          ("feedback", 500, "target", 1e-2, 3.0, 0.75, 10.0,  0.1, 50, 5e-4, 3.0, 100, 0.10, 0.1),
+    "humanoid":     ("feedback", 500, "target", 1e-1, 4.2, 1.04, 10.0,  0.1, 50, 5e-4, 30., 200, 0.03, 0.1),
+    "swimmer":      ("feedback", 500, "target", 1e-2, 2.0, 0.0,   0.0,  0.0, 80, 5e-4, 1.0, 200, 0.01, 0.1),
+    "walker":       ("feedback", 500, "target", 1e-1, 1.2, 1.35, 10.0, 10.0, 50, 5e-4, 3.0,  50, 0.10, 0.1),
 }
 # fmt: on
 
@@ -114,6 +114,8 @@ class Args(Flags):
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
     adaptive_iterations: Count = 50
     """iLQR iterations of an adaptation"""
+    perturb: NonNegative = 0.1
+    """the policy's samples start away from the guides', by a normal part of the plan's deviations (per task)"""
     hidden: Count = 50
     """units of the policy's hidden layer (per task)"""
     noise: Positive = 0.1
@@ -221,7 +223,6 @@ class Search:
             obs = self.system.observe(torch.stack([guide.x[:-1] for guide in self.guides]))
             u = torch.stack([guide.u for guide in self.guides])
         policy.theta = policy.fit(policy.initial(self.rng), obs, u, args.pretraining)  # line 3: initialise theta*
-        fit = ((u - policy.mean(policy.theta, obs)) / policy.sigma).square().mean().sqrt().item()
         if args.variant in GUIDED:  # line 4: build S from the guides and theta*
             self.S.append(guiding, *self.guides)
             self.S.initial = len(self.guides)
@@ -236,7 +237,7 @@ class Search:
         if args.variant == "feedback":
             self.learn(guiding.pick(slice(0, args.samples * len(plans), len(plans))))  # more would outweigh own ones
             self.learn(own)
-        guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std, "gps/fit": fit}
+        guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
         return self.metrics(own) | guides
 
     def iterate(self, iteration: int) -> dict[str, float]:
@@ -263,8 +264,7 @@ class Search:
             self.w_r = max(self.w_r / 10, low)  # line 13: decrease w_r
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
-            if not imitating:  # line 16: resample from theta*
-                S.append(self.draw(policy.theta, S.best))
+            S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
         if imitating:
             metrics["gps/near"] = self.learn(S.samples.pick(slice(before, None)))
         S.prune(args.stored)
@@ -305,14 +305,18 @@ class Search:
         return self.measure(*system.rollout(start.expand(len(noise), -1), self.args.horizon, act), source)
 
     def draw(self, theta: Tensor, source: int = -1) -> Samples:
-        """Trajectories, --samples of them; those of the restart variant that join S start at states of the guides."""
-        count, start, kinds, system = self.args.samples, self.guides[0].x[:1], self.args.practice, self.system
-        self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
-        if kinds:
+        """Trajectories, --samples of them, from starts near the guides'; restart's that join S from any state."""
+        args, system, count = self.args, self.system, self.args.samples
+        self.control_steps, noise = self.control_steps + count * args.horizon, self.noise(count)
+        if kinds := args.practice:
             system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
-        if source >= 0 and self.args.variant == "restart":
-            x = torch.cat([guide.x[:-1] for guide in self.guides])
+        x = torch.cat([guide.x[:-1] for guide in self.guides])
+        start = x[:1].expand(count, -1)  # has no part in the importance weights
+        if source >= 0 and args.variant == "restart":
             start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
+        elif args.perturb:
+            away = torch.randn(count, system.nd, generator=self.rng, dtype=REAL).to(x.device)
+            start = system.retract(start, args.perturb * system.difference(x, x[:1]).std(0) * away)
         return self.roll_out(system, theta, noise, start, source)
 
     def metrics(self, samples: Samples) -> dict[str, float]:
@@ -376,7 +380,8 @@ class Search:
             e = inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)
             return 1 - (1 + e.square().sum((1, 2))).sqrt().mean()
 
-        self.student, value = maximise(objective, self.student, self.args.pretraining // 10)
+        fit, value = maximise(objective, self.student, self.args.pretraining // 10)
+        self.student = (self.student + fit) / 2  # a fit alone swings with what its policy visited last
         return self.student, {"gps/lessons": len(u), "gps/error": -value}
 
     def adapt(self) -> Tensor:
@@ -585,7 +590,7 @@ class SampleSet:
         return torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
 
     def choose(self, active: int, newest: int) -> Tensor:
-        """Line 6, indices: the newest of theta*, the initial guides' samples, others by importance under theta*."""
+        """Line 6, indices: theta*'s newest, the initial guides' samples (adapted: too many), then by weight."""
         score = torch.where(self.samples.source < self.initial, 2e9, self.score())
         score[(self.samples.source == self.best).nonzero().flatten()[-newest:]] = 3e9
         return score.argsort(descending=True, stable=True)[:active].sort().values

@@ -49,8 +49,9 @@ import matplotlib.pyplot as plt  # noqa: E402
 
 # What a run is called, and its flags: Figure 2's variants, adaptive guides of Section 4.2, what feedback consists of,
 # and fewer samples
-CASES: dict[str, str] = {variant: f"--variant {variant}" for variant in get_args(gps.Variant)}
-CASES |= {"adaptive": "--variant full --adaptive 10 --adaptive-iterations 10"}
+CASES: dict[str, str] = {variant: f"--variant {variant} --perturb 0" for variant in get_args(gps.Variant)}
+CASES |= {"adaptive": "--variant full --perturb 0 --adaptive 10 --adaptive-iterations 10"}
+CASES |= {"feedback": "--variant feedback"}
 ABLATIONS = {"only": "--imitation 1000", "unbounded": "--bound 100", "tail": "--tail 0", "narrow": "--spread 1"}
 ABLATIONS |= {"stiff": "--tracking 0.05", "before": "--bound 100 --tail 0 --spread 1 --tracking 0.05"}
 ABLATIONS |= {"short": "--horizon 160", "few": "--samples 4 --guiding-samples 10 --active 40"}
@@ -69,7 +70,7 @@ CASES["feedback-slope"] = "--variant feedback --horizon 160 --slope 10"  # needs
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
-    "gps_guides gps_guides_std gps_fit eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
+    "gps_guides gps_guides_std eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
 PLANNED = "full", "feedback", "feedback-short"  # cases whose generalisation is measured

@@ -51,16 +51,32 @@ BLOCK = """
   </worldbody>
 </mujoco>"""
 
-# A physical pendulum about the y axis, hanging at angle 0.
-PENDULUM = """
+# One driven hinge on the world. Its laws are in the kernels even where they do nothing, so all such robots share them.
+ONE_HINGE = """
 <mujoco>
-  <worldbody>
-    <body>
-      <joint axis="0 1 0"/>
-      <inertial pos="0 0 -0.8" mass="1.5" diaginertia="0.1 0.2 0.15"/>
-    </body>
-  </worldbody>
+  <compiler angle="radian"/>
+  <custom> <numeric name="k_limit" data="300"/> <numeric name="d_limit" data="200"/> </custom>
+  <worldbody> <body> <joint name="hinge" {joint}/> <inertial {inertial}/> </body> </worldbody>
+  <actuator> <motor joint="hinge" gear="3" ctrlrange="-1 1" ctrllimited="true"/> </actuator>
 </mujoco>"""
+NO_SPRING = 'stiffness="1e-300" damping="1e-300"'
+
+# A physical pendulum about the y axis, hanging at angle 0.
+PENDULUM = ONE_HINGE.format(
+    joint=f'axis="0 1 0" range="-9 9" {NO_SPRING}', inertial='pos="0 0 -0.8" mass="1.5" diaginertia="0.1 0.2 0.15"'
+)
+
+# A limited hinge about the vertical, so that only its motor and its limit act.
+HINGE = ONE_HINGE.format(
+    joint=f'axis="0 0 1" range="-0.5 0.5" armature="0.1" {NO_SPRING}',
+    inertial='pos="0 0 0" mass="1" diaginertia="0.4 0.4 0.4"',
+)
+
+# A damped oscillation about the vertical.
+OSCILLATOR = ONE_HINGE.format(
+    joint='axis="0 0 1" range="-9 9" stiffness="20" damping="1"',
+    inertial='pos="0 0 0" mass="1" diaginertia="0.5 0.5 0.5"',
+)
 
 # A ball joint on the world, driven about two axes of the arm's frame, and a slide along the arm.
 SHOULDER = """
@@ -138,6 +154,15 @@ def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple
     return raise_ground(scene, qpos), (qpos, qvel, ctrl)
 
 
+def varied_robot(name: str, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
+    """A robot for the factors, all of which matter in its states: "linear" and "hill" legs, "planar" tree, "hopper"."""
+    if name == "hopper":
+        scene = task_scene(name).with_penalty({"d_limit": 500.0})
+        return scene, acting_states(scene, count, rng)
+    scene = tree_scene("planar", 0) if name == "planar" else leg_scene(name, grounded=True)
+    return grounded_states(scene, count, rng)
+
+
 # A pendulum on a cart that is pulled from the wall.
 CRANE = """
 <mujoco>
@@ -151,21 +176,6 @@ CRANE = """
   <tendon> <spatial name="rope"> <site site="end"/> <site site="wall"/> </spatial> </tendon>
   <actuator> <motor name="winch" tendon="rope" gear="-9" ctrllimited="true" ctrlrange="0 1"/> </actuator>
 </mujoco>"""
-
-# One limited, driven hinge about the vertical, so that only its own laws act.
-HINGE = """
-<mujoco>
-  <compiler angle="radian"/>
-  <custom> <numeric name="k_limit" data="300"/> <numeric name="d_limit" data="200"/> </custom>
-  <worldbody>
-    <body>
-      <joint name="hinge" axis="0 0 1" range="-0.5 0.5" armature="0.1"/>
-      <inertial pos="0 0 0" mass="1" diaginertia="0.4 0.4 0.4"/>
-    </body>
-  </worldbody>
-  <actuator> <motor joint="hinge" gear="3" ctrlrange="-1 1" ctrllimited="true"/> </actuator>
-</mujoco>"""
-
 
 FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
 
@@ -354,6 +364,12 @@ def raise_ground(scene: Scene, qpos: Array) -> Scene:
 def without_ground(scene: Scene) -> Scene:
     """The same scene, hence the same kernels, with the ground too deep to be reached."""
     return dataclasses.replace(scene, ground_height=-1e3)
+
+
+def in_free_flight(scene: Scene) -> Scene:
+    """The same scene, hence the same kernels, without effective limits and damping besides."""
+    wide = {"lower": np.minimum(scene.lower, -1e9), "upper": np.maximum(scene.upper, 1e9)}
+    return dataclasses.replace(without_ground(scene), damping=1e-300 * scene.damping, **wide)
 
 
 def unit(quaternion: Array) -> Array:

@@ -33,11 +33,8 @@ FISH = """
   </worldbody>
   <actuator> <motor joint="a" gear="5"/> <motor joint="b" gear="5"/> </actuator>
 </mujoco>"""
-ROOTS = {
-    "floating": "<freejoint/>",
-    "planar": '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><joint axis="0 0 1"/>',
-    "fixed": '<joint axis="0 1 1"/>',
-}
+# A planar root is the swimmer's, in test_dynamics.py and test_gradient.py.
+ROOTS = {"floating": "<freejoint/>", "fixed": '<joint axis="0 1 1"/>'}
 BALL = """
 <mujoco>
   <option density="3" viscosity="{viscosity}" gravity="0 0 0"/>

@@ -7,7 +7,7 @@ import pytest
 import reference
 import torch
 import warp as wp
-from scenes import grounded_states, leg_scene, run, task_scene, tree_scene
+from scenes import leg_scene, run, task_scene, varied_robot
 from test_accuracy import source
 
 import diffsim
@@ -20,16 +20,13 @@ from diffsim.simulator import Simulator
 SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
 
 
-def robot(name, count, rng):
-    scene = tree_scene("planar", 0) if name == "planar" else leg_scene(name, grounded=True)
-    return grounded_states(scene, count, rng)
-
-
+# The hopper's kernels are other tests' already.
 @pytest.mark.parametrize(
-    "name, integration", [(name, setting) for name in ("linear", "planar") for setting in SETTINGS]
+    "name, integration",
+    [*(("linear", setting) for setting in SETTINGS), *zip(("planar", "hopper"), SETTINGS, strict=True)],
 )
 def test_steps_are_the_references(name, integration, rng):
-    scene, states = robot(name, 4, rng)
+    scene, states = varied_robot(name, 4, rng)
     factors = rng.uniform(0.5, 2.0, (4, len(FACTORS)))
     ends = run(scene, *states, factors=factors, integration=integration)
     for e, (row, *start) in enumerate(zip(factors, *states, strict=True)):
@@ -38,9 +35,9 @@ def test_steps_are_the_references(name, integration, rng):
             np.testing.assert_allclose(value[e], end, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("integration", SETTINGS)
-def test_factors_of_one_change_no_bit(integration, rng):
-    scene, states = robot("linear", 16, rng)
+@pytest.mark.parametrize("name, integration", [*zip(("linear", "hopper"), SETTINGS, strict=True)])
+def test_factors_of_one_change_no_bit(name, integration, rng):
+    scene, states = varied_robot(name, 16, rng)
     results = []
     for factors in (False, True):
         sim = Simulator(scene, 16, integration, dtype=torch.float64, factors=factors)
@@ -53,7 +50,7 @@ def test_factors_of_one_change_no_bit(integration, rng):
 
 def test_each_environment_and_step_has_its_own(rng):
     """Steps of a window see what was written in place before them, and so do their adjoints."""
-    scene, states = robot("linear", 2, rng)
+    scene, states = varied_robot("linear", 2, rng)
     sim = Simulator(scene, 2, SETTINGS[0], horizon=2, dtype=torch.float64, factors=True)
     q, v, u = (torch.tensor(x, requires_grad=True) for x in states)
     per_step = rng.uniform(0.5, 2.0, (2, 2, len(FACTORS)))
@@ -91,11 +88,12 @@ def test_gradients_reach_a_tensor_through_the_environment(integrator):
 
 
 def test_recorded_steps_are_counted():
-    env = diffsim.make("cartpole", 2, horizon=1, factors=True)
-    env.sim.factors = torch.ones(2, len(FACTORS), requires_grad=True)
-    env.step(torch.zeros(2, 1))
+    env = diffsim.make("hopper", 2, horizon=1, dtype=torch.float64, factors=True)
+    env.sim.factors = torch.ones(2, len(FACTORS), dtype=torch.float64, requires_grad=True)
+    action = torch.zeros(2, 3, dtype=torch.float64)
+    env.step(action)
     with pytest.raises(RuntimeError, match="horizon of 1 differentiable steps exceeded"):
-        env.step(torch.zeros(2, 1))
+        env.step(action)
 
 
 def test_wrong_factors_are_refused():

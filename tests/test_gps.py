@@ -270,10 +270,27 @@ def test_lessons_end_where_the_guides_are_far(search: gps.Search) -> None:
     assert len(u) == 102
     search.student = search.network.theta
     theta, metrics = search.imitate()
-    errors = [(inverse @ (u - search.network.mean(t, obs)).unsqueeze(-1)).norm(dim=1) for t in (theta, search.student)]
-    assert metrics["gps/error"] == pytest.approx((1 + errors[0].square()).sqrt().mean().item() - 1)
-    worse = search.network.theta
-    assert errors[0].mean() < (inverse @ (u - search.network.mean(worse, obs)).unsqueeze(-1)).norm(dim=1).mean()
+    before = search.network.theta
+    assert search.student is theta
+    fit = 2 * theta - before  # half of it is the last one
+    last, half, fitted = (
+        (inverse @ (u - search.network.mean(t, obs)).unsqueeze(-1)).norm(dim=1) for t in (before, theta, fit)
+    )
+    assert metrics["gps/error"] == pytest.approx((1 + fitted.square()).sqrt().mean().item() - 1)
+    assert fitted.mean() < half.mean() < last.mean()
+
+
+def test_perturbed_starts(search: gps.Search) -> None:
+    """They differ by the plan's deviations, whatever theta: without --perturb all samples start where the guides do."""
+    path, system = search.guides[0].x[:-1], search.system
+    assert (search.draw(search.network.theta).x[:, 0] == path[0]).all()
+    search.args.perturb, search.args.samples = 0.3, 400
+    away = system.difference(search.draw(search.network.theta).x[:, 0], path[:1].expand(400, -1))
+    expected = 0.3 * system.difference(path, path[:1]).std(0)
+    assert (expected > 0).all()
+    torch.testing.assert_close(away.std(0) / expected, torch.ones_like(expected), atol=0.12, rtol=0.0)
+    assert (away.mean(0).abs() < 0.2 * expected).all()
+    torch.testing.assert_close(torch.corrcoef(away.mT), torch.eye(len(expected)).to(away), atol=0.2, rtol=0.0)
 
 
 def test_active_set(search: gps.Search) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -41,7 +43,7 @@ def test_swimmer_is_carried_by_its_fluid() -> None:
     """A wave that travels along the body, held by springs, drives it against the wave; in a vacuum it stays."""
     scene, ends = task_scene("swimmer"), []
     for lag in (0.5 * np.pi, -0.5 * np.pi):
-        for fluid in (scene, scene.without("drag")):
+        for fluid in (scene, dataclasses.replace(scene, density=1e-300, viscosity=0.0)):
             sim = Simulator(fluid, 1, Integration(substeps=10), dtype=REAL)
             qpos, qvel = torch.zeros(1, 5, dtype=REAL), torch.zeros(1, 5, dtype=REAL)
             for t in range(300):
