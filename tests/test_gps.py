@@ -463,7 +463,7 @@ def test_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         float(read_progress(tmp_path)[0]["sim_model_steps"])
     )
     monkeypatch.setattr(search, "noise", lambda count, rng=None: torch.zeros(count, 8, 3).double())
-    S = search.follow(search.guides, 6)
+    search.args.perturb, S = 0.0, search.follow(search.guides, 6)
     own = search.draw(search.network.theta)
     for i, guide in enumerate(search.guides):
         assert (S.source == i).sum() == 2
