@@ -496,7 +496,7 @@ def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return f"incline:{40 * torch.rand(1, generator=rng).item() - 20}:-1"
 
     monkeypatch.setattr(gps, "random_terrain", random_terrain)
-    arguments = [*HOPPING, "level", "--practice", *kinds]
+    arguments = [*HOPPING, "level", "--practice", *kinds, "--perturb", "0"]
     whole = run(gps, tmp_path / "whole", *arguments)
     assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
     start, S = whole["modules"]["search"]["guides"][0][0][0], whole["modules"]["samples"]
