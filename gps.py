@@ -356,10 +356,8 @@ class Search:
         return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
 
     def learn(self, samples: Samples) -> float:
-        """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share.
-
-        Of the step that looks most alike: at its own time a late policy would be told to jump. Far off all is nonsense.
-        """
+        """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share."""
+        # Of the step that looks most alike: at its own time a late policy would be told to jump.
         x = samples.x[:, :-1].flatten(0, 1)
         guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
         u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std)
@@ -369,10 +367,8 @@ class Search:
         return near.double().mean().item()
 
     def imitate(self) -> tuple[Tensor, dict[str, float]]:
-        """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides.
-
-        An error counts by its cost under iLQR's values, beyond a standard deviation linearly: few would rule a square.
-        """
+        """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides."""
+        # An error counts by its cost under iLQR's values, beyond a deviation linearly: few would rule a square.
         index = torch.randperm(len(self.lessons[0]), generator=self.rng)[:LESSONS]
         obs, u, inverse = (part[index.to(part.device)] for part in self.lessons)
 
