@@ -47,7 +47,7 @@ from diffsim.training.run import Run
 Variant = Literal[
     "full", "feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
 ]
-LESSONS, REACH = 20_000, 0.5  # of feedback: states of a fit; standard deviations from a guide within which it teaches
+LESSONS, REACH, BLEND = 20_000, 0.5, 0.1  # of feedback: states of a fit; how far a guide teaches; over which guides mix
 GUIDED = "full", "feedback", "unregularized"  # those with guides in S
 # fmt: off
 COLUMNS = ("variant", "horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight",
@@ -360,8 +360,8 @@ class Search:
         # Of the step that looks most alike: at its own time a late policy would be told to jump.
         x = samples.x[:, :-1].flatten(0, 1)
         guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
-        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std)
-        near, u = distance <= REACH, u.clamp(-self.args.bound, self.args.bound)
+        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std, self.args.bound, BLEND)
+        near = distance <= REACH
         new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
         self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
         return near.double().mean().item()

@@ -3,7 +3,7 @@
     python benchmarks/gps_experiments.py                  the runs of docs/gps.md; finished ones are kept
     python benchmarks/gps_experiments.py --env hopper --cases full adaptive --seeds 1 2 --train-only    a part of them
     python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
-    python benchmarks/gps_experiments.py --list           a command for each run, to be run side by side
+    python benchmarks/gps_experiments.py --list           a command for each plan, and for each run, to run side by side
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
     python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
 
@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 from statistics import mean, median
 from typing import Annotated, Any, get_args
@@ -58,15 +58,57 @@ ABLATIONS |= {"short": "--horizon 160", "few": "--samples 4 --guiding-samples 10
 CASES |= {f"feedback-{name}": f"--variant feedback {flags}" for name, flags in ABLATIONS.items()}
 ABLATED = [f"feedback-{name}" for name in ABLATIONS if name != "short"]
 FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
-PLAN = "--ilqr-iterations 2 --demonstration benchmarks/plans/"
-# What docs/gps.md shows, per task: seeds, cases, flags
-SUITE: dict[str, tuple[tuple[int, ...], tuple[str, ...], str]] = {
-    "cartpole": ((1, 2, 3, 4, 5), tuple(FIGURE_2), "--iterations 24"),
-    "hopper": ((1, 2, 3, 4, 5), tuple(CASES), f"--imitation 14 --iterations 19 {PLAN}hopper_500.npz"),
-    "walker": ((1, 2, 3, 4, 5), tuple(FIGURE_2), f"--imitation 28 --iterations 31 {PLAN}walker_500.npz"),
-    "swimmer": ((1, 2, 3, 4, 5), ("feedback",), f"--horizon 160 --iterations 24 {PLAN}swimmer_500.npz"),
+# On which ground the walker trains: one slope, as in Figure 3; rough ground, as in Figure 4; many terrains, with a
+# guide each, and random ones of their kinds; without the random ones; without guides but that of level ground
+SLOPES = "level incline:10 incline:-10 incline:5 incline:-5 step:5 step:-5"
+ROUGH = "rough:10:1:1 rough:10:1:2 rough:10:2:1 rough:10:2:2"
+RANDOM = "--practice incline:12 step:7 rough:12:1 rough:12:2"
+GROUNDS = {"slope": "--terrain incline:10", "rough": f"--terrain {ROUGH} --practice rough:12:1 rough:12:2"}
+GROUNDS |= {"terrain": f"--terrain {SLOPES} {ROUGH} {RANDOM}"}
+GROUNDS |= {"guides": f"--terrain {SLOPES} {ROUGH}", "practice": RANDOM}
+MORE = "--horizon 160 --guiding-samples 44 --samples 40 --active 160"
+CASES |= {f"feedback-{name}": f"--variant feedback {MORE} {flags}" for name, flags in GROUNDS.items()}
+FIVE, THREE, TWO, ONE = (1, 2, 3, 4, 5), (1, 2, 3), (1, 2), (1,)
+OTHERS = "unregularized nonguided restart single-example dagger"
+HOPPER, WALKER, SWIMMER = (
+    f"--demonstration benchmarks/plans/{name}_500.npz" for name in ("hopper", "walker", "swimmer")
+)
+BRIEF, LONGER = "--ilqr-iterations 2", "--ilqr-iterations 40"
+TERRAIN = f"--demonstration benchmarks/plans/walker_terrain_160.npz {BRIEF} --imitation 23 --iterations 26"
+PLANS = {  # of benchmarks/plans/: runs of gps.py that write such a plan.npz; the swimmer's: see gps_undulation.py
+    "hopper_500": "--env hopper --window 50 --restarts 8 --seed 2 --iterations 1",
+    "walker_500": "--env walker --restarts 8 --ilqr-iterations 40 --iterations 1",
+    "walker_terrain_160": f"--env walker --horizon 160 --terrain {SLOPES} {ROUGH} {WALKER} --ilqr-iterations 20 "
+    "--samples 11 --iterations 1",
 }
-CASES["feedback-slope"] = "--variant feedback --horizon 160 --slope 10"  # needs a plan up it, see docs/gps.md
+# What docs/gps.md shows, per task: cases, seeds, flags. Other seeds run as the first of their case
+SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
+    "cartpole": [
+        ("full", FIVE, "--iterations 24"),
+        (f"{OTHERS} policy-gradient", ONE, "--iterations 24"),
+    ],
+    "hopper": [
+        ("feedback", FIVE, f"{HOPPER} {BRIEF} --imitation 14 --iterations 19"),
+        ("feedback-only", FIVE, f"{HOPPER} {LONGER} --iterations 30"),
+        ("feedback-unbounded feedback-tail feedback-narrow feedback-before", TWO, f"{HOPPER} {LONGER} --iterations 20"),
+        ("feedback-stiff", TWO, f"{HOPPER} {BRIEF} --imitation 16 --iterations 16"),
+        ("feedback-few", TWO, f"{HOPPER} {BRIEF} --imitation 16 --iterations 22"),
+        (f"full {OTHERS}", THREE, f"{HOPPER} {LONGER} --iterations 25"),
+        ("policy-gradient", THREE, f"{HOPPER} {LONGER} --iterations 40"),
+        ("adaptive", ONE, f"{HOPPER} {LONGER} --adaptive 5 --iterations 15"),
+    ],
+    "walker": [
+        ("feedback", FIVE, f"{WALKER} {BRIEF} --imitation 28 --iterations 31"),
+        ("feedback-short", FIVE, f"{WALKER} {BRIEF} --imitation 24 --iterations 34"),
+        (f"full {OTHERS} policy-gradient adaptive", ONE, f"{WALKER} {BRIEF} --horizon 160 --iterations 24"),
+        ("feedback-terrain", FIVE, TERRAIN),
+        ("feedback-slope feedback-rough feedback-guides feedback-practice", TWO, TERRAIN),
+    ],
+    "swimmer": [
+        ("feedback", (1,), f"{SWIMMER} {BRIEF} --horizon 160 --hidden 200 --imitation 20 --iterations 24"),
+        ("feedback", (2,), f"{SWIMMER} {BRIEF} --horizon 160 --hidden 100 --noise 0.03 --imitation 20 --iterations 24"),
+    ],
+}
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
@@ -111,7 +153,7 @@ class Args:
     train_only: bool = False
     """only train: several such commands may run side by side"""
     list: bool = False
-    """only print a command for each of the runs"""
+    """only print a command for each plan and each run"""
     draw_only: bool = False
     """train nothing: collect, draw and tabulate the runs there are"""
     record: Path | None = None
@@ -179,9 +221,13 @@ def jobs(args: Args) -> dict[str, list[str]]:
     """The flags of each run, by its name."""
     result = {}
     for env in args.env:
-        seeds, cases, flags = SUITE.get(env, ((1,), ("full",), "--iterations 30"))
-        for case, seed in product(args.cases or cases, args.seeds or seeds):
-            result[f"{env}__{case}__{seed}"] = [*flags.split(), *args.arguments]
+        suite = SUITE.get(env, [("full", ONE, "--iterations 30")])
+        known = {(case, seed): flags for cases, seeds, flags in suite for case in cases.split() for seed in seeds}
+        default, first = suite[0][2], {case: flags for cases, _, flags in reversed(suite) for case in cases.split()}
+        for case in args.cases or dict.fromkeys(case for case, _ in known):
+            for seed in args.seeds or [seed for own, seed in known if own == case] or ONE:
+                flags = known.get((case, seed), first.get(case, default))
+                result[f"{env}__{case}__{seed}"] = [*flags.split(), *args.arguments]
     return result
 
 
@@ -193,7 +239,10 @@ def train_all(args: Args) -> None:
 
 
 def commands(args: Args) -> Iterator[str]:
-    """One for each run, of one thread."""
+    """One for each plan that the runs start from, then one for each run, of one thread."""
+    for name, plan in PLANS.items():
+        if name.split("_")[0] in args.env:
+            yield shlex.join(["python", "gps.py", *plan.split(), "--run-dir", f"runs/plans/{name}"])
     runs = args.runs.relative_to(ROOT) if args.runs.is_relative_to(ROOT) else args.runs
     rest = ["--", *args.arguments] if args.arguments else []
     for name in jobs(args):

@@ -293,6 +293,20 @@ def test_perturbed_starts(search: gps.Search) -> None:
     torch.testing.assert_close(torch.corrcoef(away.mT), torch.eye(len(expected)).to(away), atol=0.2, rtol=0.0)
 
 
+def test_lessons_are_means_of_the_guides_within_the_bound(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gps, "BLEND", 10.0)
+    other = search.guides[0]._replace(u=search.guides[0].u + 1.0)
+    monkeypatch.setattr(search, "guides", [search.guides[0], other])
+    monkeypatch.setattr(search, "lessons", ())
+    monkeypatch.setattr(search.args, "tail", 0)
+    S = search.measure(*search.guides[0].sample(search.system, 0 * search.noise(1)))
+    bound = 0.5 * other.u.abs().max().item()
+    monkeypatch.setattr(search.args, "bound", bound)
+    search.learn(S)
+    expected = (other.u - 1.0).clamp(-bound, bound) / 2 + other.u.clamp(-bound, bound) / 2
+    torch.testing.assert_close(search.lessons[1], expected)
+
+
 def test_active_set(search: gps.Search) -> None:
     """All guiding samples, the newest of the best policy, and a planted sample of high weight."""
     other = search.network.theta + 0.01
@@ -455,7 +469,11 @@ HOPPING = (
 
 def test_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A guide on each, which is sampled there; trajectory i of the policy goes over terrain i % 3; a plan of each."""
-    run(gps, tmp_path, *HOPPING, *SLOPES)
+    taught, learn = list[list[int]](), gps.Search.learn
+    with monkeypatch.context() as patch:
+        patch.setattr(gps.Search, "learn", lambda s, S: (taught.append(S.source.tolist()), learn(s, S))[1])
+        run(gps, tmp_path, *HOPPING, *SLOPES)
+    assert taught[0] == [0, 1]  # every third of 0, 0, 1, 1, 2, 2
     state = load(tmp_path / "checkpoint.pt", "gps")
     search = gps.Search(gps.Args(**state["args"]), environment("hopper", 1))
     restore(search, state)
@@ -502,6 +520,10 @@ def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyP
     start, S = whole["modules"]["search"]["guides"][0][0][0], whole["modules"]["samples"]
     own = S["samples"][0][S["samples"][5] > 0]
     assert len(own) >= 6 and len(own[:, 1].unique(dim=0)) == len(own) and (own[:, 0] == start).all()
+    search = gps.Search(gps.Args(**whole["args"]), environment("hopper", 1))
+    restore(search, load(tmp_path / "whole" / "checkpoint.pt", "gps"))
+    monkeypatch.setattr(search, "noise", lambda count: torch.zeros(count, 8, 3).double())
+    assert len(search.draw(search.network.theta).x[:, 1].unique(dim=0)) == 6
     run(gps, tmp_path / "parts", *arguments, "--stop-after", 1)
     gps.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
     parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)

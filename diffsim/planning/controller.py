@@ -56,7 +56,12 @@ class LinearGaussian(NamedTuple):
 
 
 def nearest_feedback(
-    system: System, guides: Sequence[LinearGaussian], x: Tensor, scale: Tensor
+    system: System,
+    guides: Sequence[LinearGaussian],
+    x: Tensor,
+    scale: Tensor,
+    bound: float = math.inf,
+    blend: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What controllers do where they look most like states, whatever the time.
 
@@ -66,15 +71,29 @@ def nearest_feedback(
     Args:
         x: (m, nx) states.
         scale: (obs_dim,) in which differences of observations are measured.
+        bound: of each controller's actions.
+        blend: 0 for the action of the one controller that is nearest, or the distance b of a mean: each controller's
+            nearest step, at distance d, has a weight in proportion to exp(-(d / b)^2). Who cannot see which of them
+            knows the ground can do no better than such a mean.
 
     Returns:
-        Mean actions (m, nu); L (m, nu, nu); root mean square distance (m,) of the observations, in their scale.
+        Mean actions (m, nu); of the nearest step of all, L (m, nu, nu) and the root mean square distance (m,) of the
+        observations, in their scale.
     """
-    path, u, K, L = (torch.cat([guide[i][: len(guide.u)] for guide in guides]) for i in range(4))
-    looks, own = (system.observe(states) / scale for states in (path, x))
-    distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
-    tangent = system.difference(x, path[t]) * system.counts
-    return u[t] + (K[t] @ tangent.unsqueeze(-1)).squeeze(-1), L[t], distance / own.shape[1] ** 0.5
+    own, parts = system.observe(x) / scale, []
+    for guide in guides:
+        path = guide.x[: len(guide.u)]
+        looks = system.observe(path) / scale
+        distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
+        tangent = (system.difference(x, path[t]) * system.counts).unsqueeze(-1)
+        u = (guide.u[t] + (guide.K[t] @ tangent).squeeze(-1)).clamp(-bound, bound)
+        parts.append((u, guide.L[t], distance / own.shape[1] ** 0.5))
+    u, L, distance = (torch.stack(part) for part in zip(*parts, strict=True))
+    nearest, rows = distance.argmin(0), torch.arange(len(x), device=x.device)
+    if blend:
+        weight = torch.softmax(-(distance / blend).square(), 0).unsqueeze(-1)
+        return (weight * u).sum(0), L[nearest, rows], distance[nearest, rows]
+    return u[nearest, rows], L[nearest, rows], distance[nearest, rows]
 
 
 @torch.no_grad()

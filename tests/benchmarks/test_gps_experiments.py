@@ -62,10 +62,30 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
     experiments.main([*options, "--list", "--", "--horizon", "160"])
     lines = capsys.readouterr().out.splitlines()
     part = "--env hopper --cases adaptive --seeds 2 --runs there --train-only -- --horizon 160"
-    assert len(lines) == 4 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
+    assert len(lines) == 5 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
+    assert lines[0].startswith("python gps.py --env hopper") and lines[0].endswith("--run-dir runs/plans/hopper_500")
     assert experiments.CASES["adaptive"].startswith("--variant full --adaptive")
     for flags in experiments.CASES.values():
         gps.parse(gps.Args, ["--env", "hopper", *flags.split()])
+
+
+def test_the_list_holds_the_runs_that_the_page_shows() -> None:
+    """Of each task, case and seed in results/; a case that has other flags for a seed keeps them."""
+    jobs = experiments.jobs(experiments.Args())
+    runs = read_csv(experiments.RESULTS / "cpu" / "gps_runs.csv")
+    assert {"__".join((row["env"], row["variant"], row["seed"])) for row in runs} <= jobs.keys()
+    runs = read_csv(experiments.RESULTS / "cpu" / "gps_terrain.csv")
+    assert {"__".join((row["env"], row["variant"], row["seed"])) for row in runs} <= jobs.keys()
+    one, two, other = (experiments.jobs(experiments.Args(env=("swimmer",), seeds=(seed,))) for seed in (1, 2, 7))
+    assert "200" in one["swimmer__feedback__1"] and "100" in two["swimmer__feedback__2"]
+    assert other["swimmer__feedback__7"] == one["swimmer__feedback__1"]
+    files = {path.stem for path in (experiments.ROOT / "benchmarks" / "plans").glob("*.npz")}
+    assert files == {*experiments.PLANS, "swimmer_500"}
+    for flags in experiments.PLANS.values():
+        gps.parse(gps.Args, flags.split())
+    for name, flags in jobs.items():
+        env, case, _ = name.split("__")
+        gps.parse(gps.Args, ["--env", env, *experiments.CASES[case].split(), *flags])
 
 
 def test_a_finished_run_is_kept(runs: Path) -> None:

@@ -91,3 +91,25 @@ def test_on_a_terrain_the_place_does_not_count(rng: np.random.Generator) -> None
     torch.testing.assert_close(one[0], expected)
     moved = nearest_feedback(system, [guide], far, scale)[0] - nearest_feedback(system, [guide], near, scale)[0]
     torch.testing.assert_close(moved[0], 2.0 * guide.K[0, :, 0])
+
+
+def test_a_mean_of_the_controllers_that_are_near(rng: np.random.Generator) -> None:
+    """Of each its nearest step, within the bound, with weights that fall with the squared distance."""
+    system = task_system("hopper")
+    guides, starts = [], system.start() + 0.2 * normal(rng, 3, 1, 12)
+    for x in starts:
+        u = 5.0 * normal(rng, 2, 3)
+        L = normal(rng, 2, 3, 3)
+        guides.append(LinearGaussian(torch.cat((x, x + 9.0, x)), u, normal(rng, 2, 3, 12), L, u.sum(), u.sum()))
+    x, scale = starts[1] + 0.05 * normal(rng, 4, 12), torch.full((len(system.observed),), 0.5).double()
+    distance = ((system.observe(x) - system.observe(starts)) / 0.5).square().mean(2).sqrt()  # (3, 4)
+    actions = torch.stack([(g.u[0] + (x - g.x[0]) @ g.K[0].mT).clamp(-2, 2) for g in guides])
+    weight = torch.exp(-((distance / 0.4) ** 2))
+    u, L, nearest = nearest_feedback(system, guides, x, scale, 2.0, 0.4)
+    torch.testing.assert_close(u, (weight.unsqueeze(2) * actions).sum(0) / weight.sum(0).unsqueeze(1))
+    assert weight.sum(0).min() > 0 and (weight / weight.sum(0)).max() < 0.999
+    best = distance.argmin(0)
+    torch.testing.assert_close(nearest, distance.min(0).values)
+    assert torch.equal(L, torch.stack([guides[i].L[0] for i in best]))
+    hard = nearest_feedback(system, guides, x, scale, 2.0)[0]
+    torch.testing.assert_close(hard, actions[best, torch.arange(4)])
