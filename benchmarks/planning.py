@@ -5,7 +5,7 @@
     python benchmarks/planning.py --robots walker --starts 256 --draw-only
 
 A start is a random action sequence from the task's start state; a smaller number takes the first ones of a larger. All
-are optimised side by side, by gps.py's cost. Writes planning.csv and, with --update-results, the table of docs/gps.md,
+are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes planning.csv and, with --update-results, the table of docs/gps.md,
 which puts the machines side by side.
 """
 
@@ -25,14 +25,13 @@ from tables import ROOT, Row, digits, markdown, read_csv
 import diffsim
 from diffsim.planning import ilqr, starting_actions
 from diffsim.training import Count
-from diffsim.training.flags import Natural
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
 
 Robot = Literal["cartpole", "hopper", "walker"]
 STEPS: dict[Robot, int] = {"cartpole": 240, "hopper": 100, "walker": 100}
-KEY = ("task", "T", "starts", "iterations", "seed", "threads")
+KEY = ("task", "T", "starts", "iterations", "seed")
 
 
 @dataclass
@@ -42,27 +41,28 @@ class Args(CommonFlags):
     starts: tuple[Count, ...] = (1, 4, 16, 64)  # at once
     iterations: Count = 30  # of iLQR
     seed: int = 1  # of the random starts
-    threads: Natural = 1  # of the simulator on a CPU (0: as many as have work)
 
 
 def measure(args: Args, robot: Robot, starts: int) -> Row:
     """Seconds of an iteration and the costs in the end, of so many starts; those that diverge are left out."""
-    T, flags = STEPS[robot], ["--env", robot, "--device", args.device, "--threads", str(args.threads)]
+    T, flags = STEPS[robot], ["--env", robot, "--device", args.device, "--threads", "1"]
     search = gps.Search(gps.parse(gps.Args, [*flags, "--horizon", str(T)]), diffsim.make(robot, 1, device=args.device))
     system, rng = search.system, torch.Generator().manual_seed(args.seed)
     u = starting_actions(starts, T, system.nu, system.control_dt, rng).to(system.device)
     x, u, finite = system.rollout(system.start().expand(starts, -1), T, lambda t, _: u[:, t])
     x, u = x[finite.all(1)], u[finite.all(1)]
     ilqr(system, search.cost, x, u, 1)  # compiles the kernels
-    before, times = system.steps, [time.perf_counter()]
+    # Of a CPU the process's own time, to which other programs on the cores add nothing: it has one thread.
+    clock = time.process_time if args.device == "cpu" else time.perf_counter
+    before, times = system.steps, [clock()]
 
     def show(iteration: int, costs: torch.Tensor) -> None:
         costs.sum().item()  # waits for the device
-        times.append(time.perf_counter())
+        times.append(clock())
 
     costs = ilqr(system, search.cost, x, u, args.iterations, show=show).cost.tolist()
     seconds, done = times[-1] - times[0], len(times) - 1
-    case = dict(task=robot, T=T, starts=starts, iterations=args.iterations, seed=args.seed, threads=args.threads)
+    case = dict(task=robot, T=T, starts=starts, iterations=args.iterations, seed=args.seed)
     speed = dict(seconds=seconds / done, ms_per_start=1e3 * seconds / done / len(x))
     speed["steps_per_second"] = (system.steps - before) / seconds
     return case | dict(finite=len(x), done=done) | speed | dict(best=min(costs), median=median(costs))
