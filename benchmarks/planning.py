@@ -5,8 +5,8 @@
     python benchmarks/planning.py --robots walker --starts 256 --draw-only
 
 A start is a random action sequence from the task's start state; a smaller number takes the first ones of a larger. All
-are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes planning.csv and, with --update-results, the table of docs/gps.md,
-which puts the machines side by side.
+are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes planning.csv and, with --update-results,
+the table of docs/gps.md, which puts the machines side by side.
 """
 
 from __future__ import annotations
