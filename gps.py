@@ -237,8 +237,7 @@ class Search:
         if args.variant == "feedback":
             self.learn(guiding.pick(slice(0, args.samples * len(plans), len(plans))))  # more would outweigh own ones
             self.learn(own)
-        guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
-        return self.metrics(own) | guides
+        return self.metrics(own) | {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
 
     def iterate(self, iteration: int) -> dict[str, float]:
         """Lines 6 to 17, or what a variant does in their place; returns metrics."""
@@ -308,8 +307,6 @@ class Search:
         """Trajectories, --samples of them, from starts near the guides'; restart's that join S from any state."""
         args, system, count = self.args, self.system, self.args.samples
         self.control_steps, noise = self.control_steps + count * args.horizon, self.noise(count)
-        if kinds := args.practice:
-            system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
         x = torch.cat([guide.x[:-1] for guide in self.guides])
         start = x[:1].expand(count, -1)  # has no part in the importance weights
         if source >= 0 and args.variant == "restart":
@@ -317,6 +314,8 @@ class Search:
         elif args.perturb:
             away = torch.randn(count, system.nd, generator=self.rng, dtype=REAL).to(x.device)
             start = system.retract(start, args.perturb * system.difference(x, x[:1]).std(0) * away)
+        if kinds := args.practice:
+            system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
         return self.roll_out(system, theta, noise, start, source)
 
     def metrics(self, samples: Samples) -> dict[str, float]:
@@ -356,8 +355,10 @@ class Search:
         return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
 
     def learn(self, samples: Samples) -> float:
-        """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share."""
-        # Of the step that looks most alike: at its own time a late policy would be told to jump.
+        """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share.
+
+        By the step that looks most like a state: the policy does not see the time. Far away feedback means nothing.
+        """
         x = samples.x[:, :-1].flatten(0, 1)
         guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
         u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std, self.args.bound, BLEND)
@@ -368,13 +369,12 @@ class Search:
 
     def imitate(self) -> tuple[Tensor, dict[str, float]]:
         """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides."""
-        # An error counts by its cost under iLQR's values, beyond a deviation linearly: few would rule a square.
         index = torch.randperm(len(self.lessons[0]), generator=self.rng)[:LESSONS]
         obs, u, inverse = (part[index.to(part.device)] for part in self.lessons)
 
         def objective(theta: Tensor) -> Tensor:
-            e = inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)
-            return 1 - (1 + e.square().sum((1, 2))).sqrt().mean()
+            e = inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)  # counts by what it costs: L L' ~ Q_uu^-1
+            return 1 - (1 + e.square().sum((1, 2))).sqrt().mean()  # beyond a standard deviation linearly
 
         fit, value = maximise(objective, self.student, self.args.pretraining // 10)
         self.student = (self.student + fit) / 2  # a fit alone swings with what its policy visited last

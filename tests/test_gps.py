@@ -463,7 +463,7 @@ SLOPES = "level", "incline:15:-1", "incline:-15:-1"  # all but the first begin b
 HOPPING = (
     "--env hopper --horizon 8 --window 4 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 "
     "--guiding-samples 6 --samples 6 --active 12 --stored 16 --lbfgs-iterations 2 --iterations 2 --eval-every 0 "
-    "--eval-episodes 2 --quiet --terrain"
+    "--eval-episodes 2 --perturb 0 --quiet --terrain"
 ).split()
 
 
