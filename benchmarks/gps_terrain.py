@@ -23,7 +23,7 @@ from statistics import mean
 
 import common
 from common import Line, Panel, parse, plot
-from gps_experiments import CONTROLLERS, RUN, controllers, environment, load_search
+from gps_experiments import RUN, controllers, environment, load_search
 from tables import Row, digits, markdown
 from torch import Tensor
 
@@ -128,9 +128,11 @@ def panels(rows: list[dict[str, str]]) -> list[list[Panel]]:
     """Of one task and number of steps: what is walked over, by the ground of training; below, by the controller."""
     cases = [case for case in GROUNDS if any(row["variant"] == case for row in rows)]
     grounds = {GROUNDS[case]: dict(variant=case, controller="policy") for case in cases}
-    acts = {name: dict(variant=cases[-1], controller=name) for name in CONTROLLERS}
+    last = {f"its {name.upper()}": dict(variant=cases[-1], controller=name) for name in ("ddp", "tbdp")}
+    acts = {GROUNDS[cases[-1]]: grounds[GROUNDS[cases[-1]]]} | last
+    colours = [f"C{i}" for i in range(len(cases))]
     grid = list[list[Panel]]()
-    for lines, styles in ((grounds, [f"C{i}" for i in range(len(cases))]), (acts, list(CONTROLLERS.values()))):
+    for lines, styles in ((grounds, colours), (acts, [colours[-1], "k", "m"])):
         grid.append([])
         for terrain, sizes in SIZES.items():
             drawn = []

@@ -309,9 +309,9 @@ def report(args: Args, name: Name) -> None:
         rows = [row for row in rows if everywhere or row["machine"] == args.directory.name]
         args.publish("results", markdown(rows, columns), f"{page}.md", everywhere)
         return draw(args, page, learners, tasks)
-    rows = table(args, learners, tasks)
-    beside = ratios(args, learners, tasks)
-    text = f"{markdown(rows)}\n" + (f"{markdown(beside)}\n" if beside else "")
+    rows, beside = table(args, learners, tasks), ratios(args, learners, tasks)
+    parts = [beside] if name == "pfpn" else [rows, beside]  # every learner of pfpn has a partner
+    text = "".join(f"{markdown(part)}\n" for part in parts if part)
     page = "pfpn.md" if "pfpn_ppo" in learners else "experiments.md"
     args.publish(name, f"{text}![{title}]({args.link(name)})\n", page)
     if compared := [env for env in tasks if env in {row["task"] for row in rows}]:

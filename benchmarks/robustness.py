@@ -49,7 +49,8 @@ MOST = 2**10  # times as much is given up
 TOLERANCE = 0.02  # of the smallest push
 KEY = ("checkpoint", "task", "learner", "contact", "seed")
 CURVE_KEY = (*KEY, "test", "level")  # level: of a push in multiples of the smallest, of a cube in kg
-COLUMNS = ("task", "learner", "contact", "seed", "mass", "forward N", "sideways N", "forward m/s", "sideways m/s")
+GROUP = ("task", "learner", "contact", "mass")  # of a row of the table
+EACH = ("seed", "forward N", "sideways N", "forward m/s", "sideways m/s")  # in it of each seed
 
 
 @dataclass
@@ -262,10 +263,14 @@ def panels(rows: list[dict[str, str]]) -> list[Panel]:
 
 
 def table(rows: list[dict[str, str]]) -> str:
-    """A line for each policy: the smallest pushes, and the change of the whole robot's speed that they would cause."""
-    tasks = [*diffsim.TASKS]
-    order = sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"]))
-    return markdown(order, COLUMNS)
+    """A line for each learner on a task: each seed's smallest pushes, and the change of speed that they would cause."""
+    tasks, groups = [*diffsim.TASKS], dict[tuple[str, ...], list[dict[str, str]]]()
+    for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"])):
+        groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
+    names = {name: name.replace("seed", "seeds").replace(" ", ", ") for name in EACH}
+    each = ({names[name]: " ".join(seed.get(name, "") for seed in seeds) for name in EACH} for seeds in groups.values())
+    rows = [seeds[0] | cells for seeds, cells in zip(groups.values(), each, strict=True)]
+    return markdown(rows, (*GROUP, *names.values()))
 
 
 def main(args: Args) -> None:

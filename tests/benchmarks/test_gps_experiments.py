@@ -64,7 +64,7 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
     part = "--env hopper --cases adaptive --seeds 2 --runs there --train-only -- --horizon 160"
     assert len(lines) == 5 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
     assert lines[0].startswith("python gps.py --env hopper") and lines[0].endswith("--run-dir runs/plans/hopper_500")
-    assert experiments.CASES["adaptive"].startswith("--variant full --adaptive")
+    assert experiments.CASES["adaptive"].startswith("--variant full --perturb 0 --adaptive")
     for flags in experiments.CASES.values():
         gps.parse(gps.Args, ["--env", "hopper", *flags.split()])
 
