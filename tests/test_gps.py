@@ -431,6 +431,19 @@ def test_variants(variant: str, tmp_path: Path) -> None:
     assert moved == (variant in ("policy-gradient", "dagger"))
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("variant", ["full", "feedback"])
+def test_a_gpu_plans_and_learns_as_the_cpu_does(variant: str, tmp_path: Path) -> None:
+    """The same plan, the same samples, and policies that differ by rounding alone."""
+    flags = [*TINY, "--variant", variant, *"--adaptive 1 --adaptive-iterations 2 --device".split()]
+    one, other = (run(gps, tmp_path / device, *flags, device)["modules"] for device in ("cpu", "cuda"))
+    for part in ("x", "u", "K", "L"):
+        place = LinearGaussian._fields.index(part)
+        torch.testing.assert_close(other["search"]["guides"][0][place].cpu(), one["search"]["guides"][0][place])
+    assert other["search"]["control_steps"] == one["search"]["control_steps"]
+    torch.testing.assert_close(other["policy"]["theta"].cpu(), one["policy"]["theta"], rtol=1e-3, atol=1e-3)
+
+
 def test_seeds_and_adaptive_guides(tmp_path: Path) -> None:
     arguments = [*TINY, *"--guides 2 --adaptive 1 --adaptive-iterations 2 --stored 60 --seed".split()]
     one, other = (run(gps, tmp_path / str(seed), *arguments, seed)["modules"] for seed in (1, 2))
@@ -468,7 +481,7 @@ def test_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         float(read_progress(tmp_path)[0]["sim_model_steps"])
     )
     monkeypatch.setattr(search, "noise", lambda count, rng=None: torch.zeros(count, 8, 3).double())
-    S = search.follow(search.guides, 6)
+    search.args.perturb, S = 0.0, search.follow(search.guides, 6)
     own = search.draw(search.network.theta)
     for i, guide in enumerate(search.guides):
         assert (S.source == i).sum() == 2
@@ -501,7 +514,7 @@ def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return f"incline:{40 * torch.rand(1, generator=rng).item() - 20}:-1"
 
     monkeypatch.setattr(gps, "random_terrain", random_terrain)
-    arguments = [*HOPPING, "level", "--practice", *kinds]
+    arguments = [*HOPPING, "level", "--practice", *kinds, "--perturb", "0"]
     whole = run(gps, tmp_path / "whole", *arguments)
     assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
     start, S = whole["modules"]["search"]["guides"][0][0][0], whole["modules"]["samples"]

@@ -1,0 +1,38 @@
+"""Planning from many starts at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import planning
+import pytest
+from tables import read_csv
+
+
+def test_more_starts_contain_the_fewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each trajectory is optimised as if it were alone, so that the best of more is at least as good."""
+    flags = "--robots cartpole --starts 1 3 --iterations 3 --output".split()
+    args = planning.parse(planning.Args, None, [*flags, str(tmp_path)])
+    planning.main(args)
+    one, three = read_csv(args.csv("planning"))
+    assert (one["starts"], three["starts"], three["finite"], three["done"]) == ("1", "3", "3", "3")
+    assert one["best"] == one["median"] and float(three["best"]) <= float(one["best"]) <= 1.0001 * float(one["median"])
+    assert float(three["best"]) < float(three["median"])
+    for row in (one, three):
+        per_start = 1e3 * float(row["seconds"]) / int(row["starts"])
+        assert float(row["ms_per_start"]) == pytest.approx(per_start, rel=0.01) and per_start > 0
+        # An iteration takes T nd Jacobian rows and 11 rollouts of T steps, of each start.
+        steps = float(row["steps_per_second"]) * float(row["seconds"])
+        assert steps == pytest.approx(int(row["starts"]) * 240 * (4 + 11), rel=0.35)
+    assert "| cartpole | 240 | 3 |" in capsys.readouterr().out
+
+
+def test_machines_stand_side_by_side() -> None:
+    def row(starts: str, seconds: str) -> dict[str, str]:
+        ms = f"{1e3 * float(seconds) / int(starts):g}"
+        return dict(task="walker", T="100", starts=starts, seconds=seconds, ms_per_start=ms, best="1", median="2")
+
+    few, many = planning.table({"cpu": [row("16", "4"), row("4", "1")], "h200": [row("16", "0.5")]})
+    assert (few["starts"], few["cpu, ms per iteration"], few["h200, ms per iteration"]) == ("4", "1000", "")
+    assert (many["cpu, ms per start"], many["h200, ms per start"]) == ("250", "31.25")
+    assert list(many)[-2:] == ["best", "median"] and (many["best"], many["median"]) == ("1", "2")
