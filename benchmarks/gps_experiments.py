@@ -51,11 +51,12 @@ import matplotlib.pyplot as plt  # noqa: E402
 # and fewer samples
 CASES: dict[str, str] = {variant: f"--variant {variant} --perturb 0" for variant in get_args(gps.Variant)}
 CASES |= {"adaptive": "--variant full --perturb 0 --adaptive 10 --adaptive-iterations 10"}
-CASES |= {"feedback": "--variant feedback"}
+CASES |= {"full-80": "--variant full --perturb 0"}  # on a GPU
 ABLATIONS = {"only": "--imitation 1000", "unbounded": "--bound 100", "tail": "--tail 0", "narrow": "--spread 1"}
 ABLATIONS |= {"stiff": "--tracking 0.05", "before": "--bound 100 --tail 0 --spread 1 --tracking 0.05"}
 ABLATIONS |= {"short": "--horizon 160", "few": "--samples 4 --guiding-samples 10 --active 40"}
-CASES |= {f"feedback-{name}": f"--variant feedback {flags}" for name, flags in ABLATIONS.items()}
+CASES |= {f"feedback-{name}": f"--variant feedback --perturb 0 {flags}" for name, flags in ABLATIONS.items()}
+CASES |= {"feedback-start": "--variant feedback", "feedback-long": "--variant feedback --samples 20 --active 120"}
 ABLATED = [f"feedback-{name}" for name in ABLATIONS if name != "short"]
 FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
 # On which ground the walker trains: one slope, as in Figure 3; rough ground, as in Figure 4; many terrains, with a
@@ -85,7 +86,7 @@ PLANS = {  # of benchmarks/plans/: runs of gps.py that write such a plan.npz; th
 SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
     "cartpole": [
         ("full", FIVE, "--iterations 24"),
-        (f"{OTHERS} policy-gradient", ONE, "--iterations 24"),
+        (f"{OTHERS} policy-gradient", THREE, "--iterations 24"),
     ],
     "hopper": [
         ("feedback", FIVE, f"{HOPPER} {BRIEF} --imitation 14 --iterations 19"),
@@ -96,17 +97,22 @@ SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
         (f"full {OTHERS}", THREE, f"{HOPPER} {LONGER} --iterations 25"),
         ("policy-gradient", THREE, f"{HOPPER} {LONGER} --iterations 40"),
         ("adaptive", ONE, f"{HOPPER} {LONGER} --adaptive 5 --iterations 15"),
+        ("full-80", ONE, f"{HOPPER} {BRIEF} --iterations 80 --device cuda"),
+        ("feedback-start", TWO, f"{HOPPER} {BRIEF} --imitation 14 --iterations 19"),
     ],
     "walker": [
         ("feedback", FIVE, f"{WALKER} {BRIEF} --imitation 28 --iterations 31"),
         ("feedback-short", FIVE, f"{WALKER} {BRIEF} --imitation 24 --iterations 34"),
-        (f"full {OTHERS} policy-gradient adaptive", ONE, f"{WALKER} {BRIEF} --horizon 160 --iterations 24"),
+        (f"full {OTHERS} policy-gradient adaptive", THREE, f"{WALKER} {BRIEF} --horizon 160 --iterations 24"),
+        ("feedback-long", FIVE, f"{WALKER} {BRIEF} --imitation 60 --iterations 90 --device cuda"),
+        ("feedback-start", TWO, f"{WALKER} {BRIEF} --horizon 160 --imitation 24 --iterations 34"),
         ("feedback-terrain", FIVE, TERRAIN),
         ("feedback-slope feedback-rough feedback-guides feedback-practice", TWO, TERRAIN),
     ],
     "swimmer": [
         ("feedback", (1,), f"{SWIMMER} {BRIEF} --horizon 160 --hidden 200 --imitation 20 --iterations 24"),
         ("feedback", (2,), f"{SWIMMER} {BRIEF} --horizon 160 --hidden 100 --noise 0.03 --imitation 20 --iterations 24"),
+        ("feedback-start", TWO, f"{SWIMMER} {BRIEF} --horizon 160 --iterations 24"),
     ],
 }
 RUN = ("env", "variant", "seed")
@@ -115,11 +121,11 @@ KEPT = (  # columns of progress.csv
     "gps_guides gps_guides_std eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
-PLANNED = "full", "feedback", "feedback-short"  # cases whose generalisation is measured
+PLANNED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
 COMPARED = "full", "feedback", "feedback-few"  # cases whose samples are
 TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (600, 1200)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
-DRAWN = (*FIGURE_2, "feedback-short")
+DRAWN = (*FIGURE_2, "feedback-short", "feedback-long")
 COLOURS = {case: f"C{i}" for i, case in enumerate(CASES)}
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 STYLES = {"plan": ("k", 2.0, 3), "guides": ("0.6", 0.8, 1), "policy": ("C0", 0.8, 2)}  # colour, width, order
@@ -430,7 +436,8 @@ def diagnose(runs: dict[tuple[str, ...], list[dict[str, str]]]) -> list[Row]:
         row["pretrained"] = f"{mean(number(rows[0]['gps_objective']) for rows in seeds):.1f}"
         row["end"] = f"{mean(ends):.1f}"
         row["accepted"] = f"{mean(sum(number(row['gps_accepted']) == 1 for row in rows) for rows in seeds):.1f}"
-        table.append(row | {k: f"{mean(number(row.get(name, '')) for row in late):.3g}" for k, name in cells.items()})
+        means = {k: mean(number(row.get(name, "")) for row in late) for k, name in cells.items()}
+        table.append(row | {k: "" if math.isnan(value) else f"{value:.3g}" for k, value in means.items()})
     return table
 
 

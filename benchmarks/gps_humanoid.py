@@ -6,7 +6,7 @@
 Figure 5 of the paper, of runs of gps.py in folders TASK__CASE__SEED. The policy, the DDP controller and that of the
 step that looks most alike (TBDP) run for 8 s, until the task says that they fell: from the guides' start with the
 policy's noise; without noise from starts that differ by a part of the plan's deviations; and over four rough grounds of
-each kind that no training saw. Writes gps_humanoid.csv and, with --update-results, the table of docs/gps.md.
+each kind that no training saw. Writes gps_humanoid.csv and, with --update-results, the table of docs/gps_terrain.md.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def main(args: common.CheckpointFlags) -> None:
         for row in measure((path / "checkpoint.pt" if path.is_dir() else path).resolve()):
             print(", ".join(digits(value) for value in row.values()), flush=True)
             args.merge("gps_humanoid", [row], KEY)
-    args.publish("gps humanoid", markdown(table(args.read("gps_humanoid"))), "gps.md", everywhere=True)
+    args.publish("gps humanoid", markdown(table(args.read("gps_humanoid"))), "gps_terrain.md", everywhere=True)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ as a task's observations do; velocities and angles are the world's. None sees th
 never sinks 0.45 m below its start's height over the ground. It has walked over a terrain if it stands to the end and
 has come at least 90 % as far as the guides. It keeps the guides' return if it stands, and that is within a quarter.
 
-Writes gps_terrain.csv, gps_terrain.png and, with --update-results, the table of docs/gps.md.
+Writes gps_terrain.csv, gps_terrain.png and, with --update-results, the table of docs/gps_terrain.md.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def main(args: Args) -> None:
     rows = [row for row in rows if row["env"] == tasks[0]]
     if rows:
         plot(args.picture("gps_terrain"), panels([row for row in rows if row["T"] == rows[0]["T"]]))
-        args.publish("gps terrain", markdown(table(rows)), "gps.md")
+        args.publish("gps terrain", markdown(table(rows)), "gps_terrain.md")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@
 
 A start is a random action sequence from the task's start state; a smaller number takes the first ones of a larger. All
 are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes planning.csv and, with --update-results,
-the table of docs/gps.md, which puts the machines side by side.
+the table of docs/gps_terrain.md, which puts the machines side by side.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def main(args: Args) -> None:
             print("  " + ", ".join(f"{column} {digits(value)}" for column, value in row.items()), flush=True)
             args.merge("planning", [row], KEY)
     machines = {name: read_csv(path) for name, path in args.machines("planning").items()}
-    args.publish("planning starts", markdown(table(machines)), "gps.md", everywhere=True)
+    args.publish("planning starts", markdown(table(machines)), "gps_terrain.md", everywhere=True)
 
 
 if __name__ == "__main__":
