@@ -1,8 +1,8 @@
 """Planning from many starts at once: how long an iteration of iLQR takes, and whether more starts find better plans.
 
-    python benchmarks/planning.py                       cartpole, hopper and walker from 1, 4, 16 and 64 starts
-    python benchmarks/planning.py --device cuda         on a GPU
-    python benchmarks/planning.py --robots walker --starts 256 --draw-only
+    python benchmarks/starts.py                       cartpole, hopper and walker from 1, 4, 16 and 64 starts
+    python benchmarks/starts.py --device cuda         on a GPU
+    python benchmarks/starts.py --robots walker --starts 256 --draw-only
 
 A start is a random action sequence from the task's start state; a smaller number takes the first ones of a larger. All
 are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes planning.csv and, with --update-results,

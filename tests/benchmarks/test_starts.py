@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import planning
 import pytest
+import starts
 from tables import read_csv
 
 
 def test_more_starts_contain_the_fewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each trajectory is optimised as if it were alone, so that the best of more is at least as good."""
     flags = "--robots cartpole --starts 1 3 --iterations 3 --output".split()
-    args = planning.parse(planning.Args, None, [*flags, str(tmp_path)])
-    planning.main(args)
+    args = starts.parse(starts.Args, None, [*flags, str(tmp_path)])
+    starts.main(args)
     one, three = read_csv(args.csv("planning"))
     assert (one["starts"], three["starts"], three["finite"], three["done"]) == ("1", "3", "3", "3")
     assert one["best"] == one["median"] and float(three["best"]) <= float(one["best"]) <= 1.0001 * float(one["median"])
@@ -32,7 +32,7 @@ def test_machines_stand_side_by_side() -> None:
         ms = f"{1e3 * float(seconds) / int(starts):g}"
         return dict(task="walker", T="100", starts=starts, seconds=seconds, ms_per_start=ms, best="1", median="2")
 
-    few, many = planning.table({"cpu": [row("16", "4"), row("4", "1")], "h200": [row("16", "0.5")]})
+    few, many = starts.table({"cpu": [row("16", "4"), row("4", "1")], "h200": [row("16", "0.5")]})
     assert (few["starts"], few["cpu, ms per iteration"], few["h200, ms per iteration"]) == ("4", "1000", "")
     assert (many["cpu, ms per start"], many["h200, ms per start"]) == ("250", "31.25")
     assert list(many)[-2:] == ["best", "median"] and (many["best"], many["median"]) == ("1", "2")
