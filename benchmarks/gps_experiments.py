@@ -56,7 +56,8 @@ ABLATIONS = {"only": "--imitation 1000", "unbounded": "--bound 100", "tail": "--
 ABLATIONS |= {"stiff": "--tracking 0.05", "before": "--bound 100 --tail 0 --spread 1 --tracking 0.05"}
 ABLATIONS |= {"short": "--horizon 160", "few": "--samples 4 --guiding-samples 10 --active 40"}
 CASES |= {f"feedback-{name}": f"--variant feedback --perturb 0 {flags}" for name, flags in ABLATIONS.items()}
-CASES |= {"feedback-start": "--variant feedback", "feedback-long": "--variant feedback --samples 20 --active 120"}
+CASES |= {"feedback-start": "--variant feedback"}
+CASES |= dict.fromkeys(("feedback-long", "feedback-long-cpu"), "--variant feedback --samples 20 --active 120")
 ABLATED = [f"feedback-{name}" for name in ABLATIONS if name != "short"]
 FIGURE_2 = [case for case in CASES if not case.startswith("feedback-")]
 # On which ground the walker trains: one slope, as in Figure 3; rough ground, as in Figure 4; many terrains, with a
@@ -105,6 +106,7 @@ SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
         ("feedback-short", FIVE, f"{WALKER} {BRIEF} --imitation 24 --iterations 34"),
         (f"full {OTHERS} policy-gradient adaptive", THREE, f"{WALKER} {BRIEF} --horizon 160 --iterations 24"),
         ("feedback-long", FIVE, f"{WALKER} {BRIEF} --imitation 60 --iterations 90 --device cuda"),
+        ("feedback-long-cpu", (2, 4), f"{WALKER} {BRIEF} --imitation 60 --iterations 150"),
         ("feedback-start", TWO, f"{WALKER} {BRIEF} --horizon 160 --imitation 24 --iterations 34"),
         ("feedback-terrain", FIVE, TERRAIN),
         ("feedback-slope feedback-rough feedback-guides feedback-practice", TWO, TERRAIN),
