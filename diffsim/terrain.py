@@ -113,17 +113,21 @@ def random_terrain(kind: str, rng: torch.Generator) -> str:
     It begins between x = 0.5 and 1.5 m.
 
     Raises:
-        TerrainError: level ground, or a place or a seed.
+        TerrainError: level ground, a place or a seed, or what is no number.
     """
     name, *numbers = kind.split(":")
     if (name, len(numbers)) not in {("incline", 1), ("step", 1), ("rough", 1), ("rough", 2)}:
         usage = "incline:DEGREES, step:CENTIMETRES or rough:DEGREES[:SEGMENT]"
         raise TerrainError(f"kind of terrain {kind!r} must be {usage}")
+    try:
+        most, *_ = map(float, numbers)
+    except ValueError as error:
+        raise TerrainError(f"kind of terrain {kind!r}: {error}") from error
     size, place = torch.rand(2, generator=rng, dtype=torch.float64).tolist()
     if name == "rough":
         seed = int(torch.randint(2**31, (1,), generator=rng))
         return ":".join((name, *numbers, *["1"] * (2 - len(numbers)), f"{seed}", f"{0.5 + place:.4f}"))
-    return f"{name}:{(2 * size - 1) * float(numbers[0]):.6g}:{0.5 + place:.4f}"
+    return f"{name}:{(2 * size - 1) * most:.6g}:{0.5 + place:.4f}"
 
 
 def check_terrain(vertices: ArrayLike) -> Array:

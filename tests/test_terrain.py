@@ -443,6 +443,9 @@ def test_random_terrains_are_of_their_kind():
     for kind in ("level", "incline", "incline:10:1", "step:5:1", "rough:10:1:3", "hill:3"):
         with pytest.raises(TerrainError, match="kind of terrain .* must be incline:DEGREES"):
             random_terrain(kind, rng)
+    for kind in ("incline:x", "step:x", "rough:x", "rough:10:x"):
+        with pytest.raises(TerrainError, match=f"kind of terrain '{kind}': could not convert .* 'x'"):
+            random_terrain(kind, rng)
 
 
 def test_pictures_show_it():
