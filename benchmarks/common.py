@@ -126,9 +126,14 @@ class Case(NamedTuple):
         }
 
 
+def checkpoint_of(path: Path) -> Path:
+    """A checkpoint, or that of a run."""
+    return (path / "checkpoint.pt" if path.is_dir() else path).resolve()
+
+
 def load_case(path: Path, num_envs: int, device: str) -> Case:
     """The policy of a checkpoint or of a run's; one of another task than ours ends the benchmark with one line."""
-    path = (path / "checkpoint.pt" if path.is_dir() else path).resolve()
+    path = checkpoint_of(path)
     saved = load_policy(path)
     name = saved.args["env"]
     if name not in diffsim.TASKS:

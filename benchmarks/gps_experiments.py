@@ -124,7 +124,7 @@ KEPT = (  # columns of progress.csv
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
 PLANNED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
-COMPARED = "full", "feedback", "feedback-few"  # cases whose samples are
+COMPARED = "full", "feedback", "feedback-start", "feedback-few"  # cases whose samples are
 TARGETS = {"cartpole": (-1000, -830, -520), "hopper": (600, 1200)}  # returns to which learners are compared
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
 DRAWN = (*FIGURE_2, "feedback-short", "feedback-long")
@@ -353,15 +353,13 @@ def collect(args: Args) -> None:
         for name in ("generalisation", "paths"):
             tables[name] += [run | row for row in read_csv(directory / f"{name}.csv")]
             older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(directory / f"{name}.csv")}
-    first: dict[str, tuple[str, ...]] = {}  # one run a task is drawn, every fourth step
-    learned = [
-        row for case in ("feedback", "feedback-short", "full") for row in tables["paths"] if row["variant"] == case
-    ]
-    drawn = [r for r in learned if (r["variant"], r["seed"]) == first.setdefault(r["env"], (r["variant"], r["seed"]))]
-    tables["paths"] = [row | {k: f"{float(row[k]):.4g}" for k in "xy"} for row in drawn if int(row["step"]) % 4 == 0]
+    for row in tables["paths"]:
+        row |= {k: f"{float(row[k]):.4g}" for k in "xy"}
     for name, rows in tables.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
         rows += [row for row in read_csv(args.table(name)) if tuple(row[key] for key in RUN) not in here]
+        if name == "paths":
+            rows = one_run_a_task(rows)
         known = older | {line for line in origins(args.table(name)) if line.endswith(f"; {LISTED}\n")}
         write_csv(args.table(name), sorted(rows, key=lambda row: tuple(row[key] for key in RUN)), older=sorted(known))
 
@@ -472,6 +470,18 @@ def compare(args: Args) -> list[Row]:
 def first_pass(rows: list[dict[str, str]], target: float, T: float) -> float:
     passed = (row for row in rows if number(row["return"]) * T / float(row.get("length") or T) >= target)
     return next((float(row["control_steps"]) for row in passed), math.inf)
+
+
+def one_run_a_task(rows: list[Row]) -> list[Row]:
+    """Every fourth step of one run of each task, of the first of these cases that there is."""
+    first: dict[str, tuple[str, str]] = {}
+    order = [row for case in ("feedback", "feedback-short", "full") for row in rows if row["variant"] == case]
+    own = [
+        row
+        for row in order
+        if (row["variant"], row["seed"]) == first.setdefault(row["env"], (row["variant"], row["seed"]))
+    ]
+    return [row for row in own if int(row["step"]) % 4 == 0]
 
 
 # Pictures -------------------------------------------------------------------------------------------------------------

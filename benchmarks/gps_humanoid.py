@@ -95,7 +95,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 def main(args: common.CheckpointFlags) -> None:
     for path in args.measured:
-        for row in measure((path / "checkpoint.pt" if path.is_dir() else path).resolve()):
+        for row in measure(common.checkpoint_of(path)):
             print(", ".join(digits(value) for value in row.values()), flush=True)
             args.merge("gps_humanoid", [row], KEY)
     args.publish("gps humanoid", markdown(table(args.read("gps_humanoid"))), "gps_terrain.md", everywhere=True)

@@ -46,6 +46,7 @@ SHOWN = {  # in the table
     "rough, 1 m (degrees)": (10.0,),
     "rough, 2 m (degrees)": (10.0,),
 }
+ALL = f"all {sum(map(len, SIZES.values()))}"  # the table's last row
 GROUNDS = {  # of training, by the cases of gps_experiments.py; guides are shown of the last
     "feedback": "level",
     "feedback-short": "level",
@@ -103,22 +104,24 @@ def measure(path: Path, steps: int) -> Iterator[Row]:
             yield row | dict(median_return=returns.median().item(), guides=guides)
 
 
-def share(rows: list[dict[str, str]], column: str, size: float, **keys: object) -> float:
-    """Mean [%] over seeds of a column, of the rows with this size and these keys; nan if there are none."""
-    own = [row for row in rows if float(row["size"]) == size and all(row[key] == keys[key] for key in keys)]
+def share(rows: list[dict[str, str]], column: str, size: float | None, **keys: object) -> float:
+    """Mean [%] of a column over the rows with this size, None: any, and these keys; nan if there are none."""
+    own = [row for row in rows if size in (None, float(row["size"])) and all(row[key] == keys[key] for key in keys)]
     return 100 * mean(float(row[column]) for row in own) if own else math.nan
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """Of one task: a row for each terrain, columns for the policies trained on each ground, and the last's guides."""
     cases, result = [case for case in GROUNDS if any(row["variant"] == case for row in rows)], list[Row]()
+    shown: list[tuple[str, float | None]] = [(terrain, size) for terrain, sizes in SHOWN.items() for size in sizes]
     for T in dict.fromkeys(row["T"] for row in rows):
-        for terrain, size in ((terrain, size) for terrain, sizes in SHOWN.items() for size in sizes):
+        for terrain, size in [*shown, (ALL, None)]:
             cells = {GROUNDS[case]: dict(variant=case, controller="policy") for case in cases}
             cells |= {f"its {name.upper()}": dict(variant=cases[-1], controller=name) for name in ("ddp", "tbdp")}
-            row: dict[str, object] = {"steps": T, "terrain": terrain, "size": f"{size:g}"}
+            row: dict[str, object] = {"steps": T, "terrain": terrain, "size": "" if size is None else f"{size:g}"}
+            here = {"T": T} if size is None else {"T": T, "terrain": terrain}
             for column, keys in cells.items():
-                walked, kept = (share(rows, c, size, T=T, terrain=terrain, **keys) for c in ("walked", "kept"))
+                walked, kept = (share(rows, c, size, **here, **keys) for c in ("walked", "kept"))
                 row[column] = "" if math.isnan(walked) else f"{walked:.0f} ({kept:.0f})"
             result.append(row)
     return result
@@ -145,7 +148,7 @@ def panels(rows: list[dict[str, str]]) -> list[list[Panel]]:
 
 def main(args: Args) -> None:
     for path in args.measured:
-        for row in measure((path / "checkpoint.pt" if path.is_dir() else path).resolve(), args.steps):
+        for row in measure(common.checkpoint_of(path), args.steps):
             print(", ".join(digits(value) for value in row.values()), flush=True)
             args.merge("gps_terrain", [row], KEY)
     rows = [row for row in args.read("gps_terrain") if row["variant"] in GROUNDS]

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from statistics import mean, median, pstdev
 from typing import Literal
 
@@ -162,6 +162,7 @@ LEARNER_PAGES = {
     "bptt": "bptt.md",
     "mbpo": "mbpo.md",
 }
+PAIRS = {name: (f"pfpn_{name}", f"pfpn_gaussian_{name}") for name in ("ppo", "shac", "sac")}  # by their algorithms
 KEPT = ("return", "each seed", "explicit, substeps x4", "kept")
 RESULT_COLUMNS = ("task", "seeds", *KEPT[:2], "published", "training (s)", "return passes", "kept")
 SETTINGS = ("integrator", "substeps", "seeds", "iterations", "training (s)")
@@ -247,8 +248,7 @@ def table(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> lis
 def ratios(args: Args, learners: Sequence[str], tasks: Sequence[TaskName]) -> list[Row]:
     """Of PFPN and the Gaussian policy, by each algorithm: the best return within control steps that all runs made."""
     rows = list[Row]()
-    for env, algorithm in product(tasks, ("ppo", "shac", "sac")):
-        names = [f"{policy}_{algorithm}" for policy in ("pfpn", "pfpn_gaussian")]
+    for env, (algorithm, names) in product(tasks, PAIRS.items()):
         both = [curves(args, name, env) for name in names if name in learners]
         if len(both) == 2 and all(both):
             end = min(run["control_steps"][-1] for runs in both for run in runs)
@@ -310,7 +310,7 @@ def report(args: Args, name: Name) -> None:
         args.publish("results", markdown(rows, columns), f"{page}.md", everywhere)
         return draw(args, page, learners, tasks)
     rows, beside = table(args, learners, tasks), ratios(args, learners, tasks)
-    parts = [beside] if name == "pfpn" else [rows, beside]  # every learner of pfpn has a partner
+    parts = [beside] if set(learners) <= {*chain(*PAIRS.values())} else [rows, beside]
     text = "".join(f"{markdown(part)}\n" for part in parts if part)
     page = "pfpn.md" if "pfpn_ppo" in learners else "experiments.md"
     args.publish(name, f"{text}![{title}]({args.link(name)})\n", page)

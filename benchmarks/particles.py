@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import CommonFlags, Line, Panel, parse, plot
+from common import CommonFlags, Line, Panel, checkpoint_of, parse, plot
 from tables import ROOT, markdown, read_csv
 from torch import Tensor, nn
 
@@ -133,7 +133,7 @@ def measure(args: Args) -> None:
 
 def resample(path: Path, dead: float, args: Args) -> dict[str, object]:
     """Returns of the policy with its noise before and after a resampling by the weights that were seen before it."""
-    path = path / "checkpoint.pt" if path.is_dir() else path
+    path = checkpoint_of(path)
     state = checkpoint.load(path, "pfpn")
     flags = ["--device", args.device, "--resampling-interval", "1", "--dead", str(dead)]
     settings = pfpn.parse(pfpn.Args, ["--evaluate", str(path), *flags])

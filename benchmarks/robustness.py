@@ -267,10 +267,9 @@ def table(rows: list[dict[str, str]]) -> str:
     tasks, groups = [*diffsim.TASKS], dict[tuple[str, ...], list[dict[str, str]]]()
     for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"])):
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
-    names = {name: name.replace("seed", "seeds").replace(" ", ", ") for name in EACH}
-    each = ({names[name]: " ".join(seed.get(name, "") for seed in seeds) for name in EACH} for seeds in groups.values())
-    rows = [seeds[0] | cells for seeds, cells in zip(groups.values(), each, strict=True)]
-    return markdown(rows, (*GROUP, *names.values()))
+    each = ({name: ", ".join(seed.get(name, "") for seed in seeds) for name in EACH} for seeds in groups.values())
+    lines = [seeds[0] | cells for seeds, cells in zip(groups.values(), each, strict=True)]
+    return markdown(lines, (*GROUP, *EACH))
 
 
 def main(args: Args) -> None:

@@ -5,7 +5,7 @@
     python benchmarks/starts.py --robots walker --starts 256 --draw-only
 
 A start is a random action sequence from the task's start state; a smaller number takes the first ones of a larger. All
-are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes planning.csv and, with --update-results,
+are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes starts.csv and, with --update-results,
 the table of docs/gps_terrain.md, which puts the machines side by side.
 """
 
@@ -92,8 +92,8 @@ def main(args: Args) -> None:
         for starts in args.starts:
             row = measure(args, robot, starts)
             print("  " + ", ".join(f"{column} {digits(value)}" for column, value in row.items()), flush=True)
-            args.merge("planning", [row], KEY)
-    machines = {name: read_csv(path) for name, path in args.machines("planning").items()}
+            args.merge("starts", [row], KEY)
+    machines = {name: read_csv(path) for name, path in args.machines("starts").items()}
     args.publish("planning starts", markdown(table(machines)), "gps_terrain.md", everywhere=True)
 
 

@@ -221,7 +221,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     check_ranges(args)
     try:
         args.check()
-    except ValueError as error:
+    except TerrainError as error:
         fail(error)
     if args.capture_video and distributed.rank() == 0:
         try:

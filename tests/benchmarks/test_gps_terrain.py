@@ -88,6 +88,9 @@ def test_table_means_over_seeds() -> None:
         "its DDP": "0 (50)",
         "its TBDP": "25 (50)",
     }
+    other = keys | dict(variant="feedback-terrain", controller="policy", terrain="step (cm)", size="2.0", kept="1")
+    *_, last = gps_terrain.table([*rows, other | dict(seed="1", walked="1"), other | dict(seed="2", walked="0.5")])
+    assert (last["terrain"], last["11 terrains, random"], last["level"]) == ("all 15", "75 (75)", "20 (50)")
 
 
 def test_until_a_fall() -> None:

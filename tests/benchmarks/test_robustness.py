@@ -169,7 +169,7 @@ def test_the_command_writes_pushes_and_curves(tmp_path: Path, capsys: pytest.Cap
     line = f"| hopper | shac | soft | 15.8 | 1 | {row['forward N']} |  | {row['forward m/s']} |  |"
     assert line in capsys.readouterr().out
     other = row | {"checkpoint": "policies/hopper__2", "seed": "2", "forward N": "7", "learner": "shac"}
-    assert f"| hopper | shac | soft | 15.8 | 1 2 | {row['forward N']} 7 |" in robustness.table([other, row])
+    assert f"| hopper | shac | soft | 15.8 | 1, 2 | {row['forward N']}, 7 |" in robustness.table([other, row])
     assert robustness.table([row | {"learner": "sapo"}, row]).count("| hopper |") == 2
 
 

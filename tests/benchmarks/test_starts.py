@@ -14,7 +14,7 @@ def test_more_starts_contain_the_fewer(tmp_path: Path, capsys: pytest.CaptureFix
     flags = "--robots cartpole --starts 1 3 --iterations 3 --output".split()
     args = starts.parse(starts.Args, None, [*flags, str(tmp_path)])
     starts.main(args)
-    one, three = read_csv(args.csv("planning"))
+    one, three = read_csv(args.csv("starts"))
     assert (one["starts"], three["starts"], three["finite"], three["done"]) == ("1", "3", "3", "3")
     assert one["best"] == one["median"] and float(three["best"]) <= float(one["best"]) <= 1.0001 * float(one["median"])
     assert float(three["best"]) < float(three["median"])
