@@ -29,6 +29,7 @@ from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration
 from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
+from diffsim.planning.lbfgs import maximise
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
 from diffsim.tasks import TASKS
@@ -40,7 +41,6 @@ from diffsim.training.errors import fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
 from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, parse
-from diffsim.training.lbfgs import maximise
 from diffsim.training.normalizer import ObsNormalizer
 from diffsim.training.run import Run
 

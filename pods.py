@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim.planning import REAL, AfterStep, Cost, Dynamics, Sum, System, ilqr
-from diffsim.simulator import Simulator
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Task
 from diffsim.training import (
     ClippedAdam,

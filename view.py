@@ -13,7 +13,8 @@ by 1 m/s; minus and equals change the speed; space pauses; enter starts a new ep
 
 from __future__ import annotations
 
-from diffsim import DiffEnv, render, startup, web  # first: from here on Ctrl-C ends in one line
+from diffsim import DiffEnv, startup  # first: from here on Ctrl-C ends in one line
+from diffsim.view import render, web
 
 # isort: split
 import copy

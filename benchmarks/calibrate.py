@@ -31,7 +31,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim import DiffEnv
-from diffsim.scene import FACTORS
+from diffsim.robot.scene import FACTORS
 from diffsim.training import Count, NonNegative, Positive, fail
 from diffsim.training.evaluation import SEED
 

@@ -21,7 +21,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim import DiffEnv
-from diffsim.scene import FACTORS
+from diffsim.robot.scene import FACTORS
 from diffsim.training import Count, NonNegative, fail
 from diffsim.training.evaluation import SEED
 from diffsim.training.variation import VARIED, soft_factors

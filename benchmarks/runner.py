@@ -24,7 +24,7 @@ from motions import RUNS
 from tables import ROOT, read_csv
 
 import diffsim
-from diffsim.launcher import available_cores
+from diffsim.sim.launcher import available_cores
 from diffsim.training import checkpoint
 from diffsim.training.evaluation import FINER, kept
 

@@ -42,7 +42,7 @@ from tables import ROOT, Row, markdown, read_csv
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
-from diffsim.launcher import available_cores
+from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Contact
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script

@@ -37,10 +37,11 @@ from torch import Tensor
 from worlds import Array, Flags, World
 
 import diffsim
-from diffsim import DiffEnv, Integration, Scene, Simulator, render
+from diffsim import DiffEnv, Integration, Scene, Simulator
 from diffsim.tasks import Task
 from diffsim.training import Count, Positive, fail
 from diffsim.training.evaluation import FINER, SEED, travels
+from diffsim.view import render
 
 KEY = ("checkpoint", "task", "learner", "contact", "seed", "condition")
 SHOWN = 5.0  # s of an episode in the picture

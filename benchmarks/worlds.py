@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from diffsim import Scene, Simulator, load_scene
-from diffsim.launcher import available_cores
-from diffsim.training.gait import contact_bodies
+from diffsim.sim.launcher import available_cores
+from diffsim.view.gait import contact_bodies
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

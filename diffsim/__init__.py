@@ -15,15 +15,15 @@ import torch
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
-from diffsim.clip import Clip, read_clip
 from diffsim.env import DiffEnv
-from diffsim.integration import Integration
-from diffsim.mjcf import load_scene
 from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
-from diffsim.scene import Scene, SceneError
-from diffsim.screen import RenderMode
-from diffsim.simulator import Simulator, check_device
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import Scene, SceneError
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator, check_device
 from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation
+from diffsim.tasks.imitation.clip import Clip, read_clip
+from diffsim.view.screen import RenderMode
 
 __all__ = [
     "TASKS",

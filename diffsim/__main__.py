@@ -21,8 +21,10 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from diffsim import TASKS, check, load_scene, render, startup
-from diffsim.launcher import available_cores
+from diffsim import TASKS, load_scene, startup
+from diffsim.robot.report import report as report_robot
+from diffsim.sim.launcher import available_cores
+from diffsim.view import render
 
 POLICIES = files("diffsim") / "policies"
 DEMO_EPISODES = 8  # of which the one of median return is filmed
@@ -48,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.command == "demo":
         demo(args.task, args.output)
     elif args.command == "check":
-        text, fits = check.report(args.robot)
+        text, fits = report_robot(args.robot)
         print(text)
         sys.exit(0 if fits else 1)
     elif args.command == "export":

@@ -13,13 +13,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from diffsim.integration import Integration, check_count
-from diffsim.launcher import check_memory
-from diffsim.scene import Scene
-from diffsim.screen import RENDER_MODES, Frames, RenderMode, Screen
-from diffsim.simulator import Simulator, check_device
+from diffsim.robot.scene import Scene
+from diffsim.sim.integration import Integration, check_count
+from diffsim.sim.launcher import check_memory
+from diffsim.sim.simulator import Simulator, check_device
 from diffsim.tasks import Task
 from diffsim.terrain import Elevation
+from diffsim.view.screen import RENDER_MODES, Frames, RenderMode, Screen
 
 
 def check_seed(seed: int) -> int:

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.env import DiffEnv
-from diffsim.screen import Frames
+from diffsim.view.screen import Frames
 
 Array = NDArray[np.floating[Any]]
 Info = dict[str, Any]

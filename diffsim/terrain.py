@@ -21,10 +21,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from diffsim.integration import is_real
+from diffsim.sim.integration import is_real
 
 if TYPE_CHECKING:
-    from diffsim.scene import Scene
+    from diffsim.robot.scene import Scene
 
 Array = NDArray[np.float64]
 

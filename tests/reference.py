@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.integration import Integration
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
+from diffsim.sim.integration import Integration
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 import diffsim
-from diffsim.integration import Integration
-from diffsim.mjcf import load_scene
-from diffsim.scene import Scene
-from diffsim.simulator import Simulator
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import Scene
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 Array = NDArray[np.float64]

@@ -13,12 +13,12 @@ import warp as wp
 from scenes import BALL, HINGE, OSCILLATOR, acting_states, leg_scene, parse, run, task_scene
 
 import diffsim
-from diffsim.integration import INTEGRATORS, Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
-from diffsim.simulator import Simulator
+from diffsim.sim.integration import INTEGRATORS, Integration
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import SHAC_TASKS, TASKS
 
 SETTINGS = [  # and the order of each

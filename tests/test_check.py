@@ -11,7 +11,7 @@ import pytest
 from scenes import parse, pendulum, robot, task_scene, tendon
 
 from diffsim.__main__ import main
-from diffsim.check import report
+from diffsim.robot.report import report
 from diffsim.tasks import TASKS
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"

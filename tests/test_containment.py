@@ -8,8 +8,8 @@ import torch
 from scenes import BALL, PENDULUM, acting_states, parse, task_scene
 
 import diffsim
-from diffsim.integration import INTEGRATORS, Integration
-from diffsim.simulator import Simulator
+from diffsim.sim.integration import INTEGRATORS, Integration
+from diffsim.sim.simulator import Simulator
 
 BAD, GOOD = 2, [0, 1, 3, 4]
 

@@ -10,8 +10,8 @@ import torch
 from scenes import acceleration, free_states, parse, run
 from test_gradient import check_gradients
 
-from diffsim.integration import Integration
-from diffsim.simulator import Simulator
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 
 # A free box of three unlike sides, two more on hinges about unlike axes, one of them on a slide besides. It is fast in
 # its fluid, so that both parts of the law count.

@@ -35,8 +35,8 @@ from scenes import (
     without_ground,
 )
 
-from diffsim.integration import Integration
-from diffsim.simulator import Simulator
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 TREES = [(base, seed) for base in ("floating", "fixed", "planar", "ball") for seed in range(6)]

@@ -12,7 +12,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 import diffsim
-from diffsim.integration import INTEGRATORS
+from diffsim.sim.integration import INTEGRATORS
 from diffsim.tasks import TASKS
 
 HOPPER = f"{diffsim.__path__[0]}/assets/hopper.xml"

@@ -11,11 +11,11 @@ from scenes import leg_scene, run, task_scene, varied_robot
 from test_accuracy import source
 
 import diffsim
-from diffsim.integration import Integration
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.model import model_of
-from diffsim.scene import FACTORS
-from diffsim.simulator import Simulator
+from diffsim.robot.scene import FACTORS
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 
 SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
 

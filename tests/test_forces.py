@@ -24,11 +24,11 @@ from test_dynamics import mujoco_acceleration, relative_error
 from test_gradient import check_gradients
 
 import diffsim
-from diffsim.integration import Integration
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.model import model_of
-from diffsim.scene import FACTORS
-from diffsim.simulator import Simulator
+from diffsim.robot.scene import FACTORS
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 
 SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
 TREES = [("fixed", 0), ("planar", 1), ("ball", 1)]  # in which some bodies are welded to others; the last one floats

@@ -19,12 +19,12 @@ from torch import Tensor
 
 import diffsim
 import gps
-from diffsim import render
 from diffsim.planning import LinearGaussian, save_demonstration
+from diffsim.planning.lbfgs import maximise
 from diffsim.terrain import named_terrains
 from diffsim.training import evaluate, load_policy
 from diffsim.training.checkpoint import load, restore
-from diffsim.training.lbfgs import maximise
+from diffsim.view import render
 
 SMALL = (
     "--env cartpole --horizon 30 --restarts 3 --screening 4 --ilqr-iterations 20 --pretraining 40 --hidden 8 "

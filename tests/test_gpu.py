@@ -13,14 +13,14 @@ import warp as wp
 from scenes import task_scene
 
 import diffsim
-from diffsim.integration import Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
-from diffsim.launcher import default_division
-from diffsim.scene import FACTORS
-from diffsim.simulator import Simulator
+from diffsim.robot.scene import FACTORS
+from diffsim.sim.integration import Integration
+from diffsim.sim.launcher import default_division
+from diffsim.sim.simulator import Simulator
 from diffsim.terrain import rough
 
 HORIZON = 32

@@ -25,9 +25,9 @@ from scenes import (
 )
 
 from diffsim.env import DiffEnv
-from diffsim.integration import Integration
-from diffsim.scene import FACTORS
-from diffsim.simulator import Simulator
+from diffsim.robot.scene import FACTORS
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]

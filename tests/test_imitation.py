@@ -20,7 +20,7 @@ import mbpo
 import pods
 import shac
 from diffsim import Clip, read_clip
-from diffsim.tasks.humanoid_imitation import END_EFFECTORS, STRAY, HumanoidImitation
+from diffsim.tasks.imitation.task import END_EFFECTORS, STRAY, HumanoidImitation
 from diffsim.training import export_policy, load_policy, make_policy_env, parse
 
 REAL = torch.float64

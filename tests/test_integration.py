@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from diffsim.integration import INTEGRATORS, Integration
+from diffsim.sim.integration import INTEGRATORS, Integration
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scenes import task_scene
 
-from diffsim.kinematics import Kinematics, difference, matrix
+from diffsim.tasks.imitation.kinematics import Kinematics, difference, matrix
 
 REAL = torch.float64
 

@@ -18,8 +18,9 @@ import warp as wp
 import diffsim
 import shac
 from diffsim import __main__ as command
-from diffsim import render, startup
+from diffsim import startup
 from diffsim.training import load_policy
+from diffsim.view import render
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}

@@ -15,7 +15,7 @@ import diffsim
 from diffsim import DiffEnv, Scene, Simulator, load_scene
 from diffsim.tasks import TASKS
 from diffsim.tasks.mirror import reflections
-from diffsim.training.gait import trace
+from diffsim.view.gait import trace
 
 MIRRORED = ("ant", "humanoid", "humanoid_mtu")
 ASSETS = Path(diffsim.__file__).parent / "assets"

@@ -20,8 +20,8 @@ from scenes import (
     tree_scene,
 )
 
-from diffsim.mjcf import load_scene
-from diffsim.scene import SceneError
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import SceneError
 
 
 def test_welded_bodies_are_merged():

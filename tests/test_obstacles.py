@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import MUSCLE, parse, pendulum, robot, tendon
 
-from diffsim.scene import SceneError
+from diffsim.robot.scene import SceneError
 
 FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
 MESH = """<asset><mesh name="tetra" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>"""

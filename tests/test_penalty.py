@@ -12,9 +12,9 @@ import reference
 import torch
 from scenes import parse, pendulum, robot
 
-from diffsim.mjcf import load_scene
-from diffsim.scene import PENALTY_CONSTANTS, Scene
-from diffsim.simulator import Simulator
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
+from diffsim.sim.simulator import Simulator
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 BALL = robot('<body pos="0 0 1"><freejoint/><geom name="ball" size="0.1" mass="2" {}/></body>', "<custom>{}</custom>")

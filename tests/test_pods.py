@@ -17,7 +17,7 @@ from torch import Tensor
 
 import diffsim
 import pods
-from diffsim.simulator import Simulator
+from diffsim.sim.simulator import Simulator
 from diffsim.training import export_policy, parse
 
 SMALL = (

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 import diffsim.tasks
-from diffsim import render
-from diffsim.mjcf import load_scene
-from diffsim.render import Renderer, film, render_frames, save_video
+from diffsim.robot.mjcf import load_scene
 from diffsim.training.evaluation import Evaluation
+from diffsim.view import render
+from diffsim.view.render import Renderer, film, render_frames, save_video
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"

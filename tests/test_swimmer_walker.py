@@ -10,8 +10,8 @@ import torch
 from scenes import task_scene
 
 import diffsim
-from diffsim.integration import Integration
-from diffsim.simulator import Simulator
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 REAL = torch.float64

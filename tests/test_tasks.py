@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 import diffsim.tasks
-from diffsim.mjcf import load_scene
+from diffsim.robot.mjcf import load_scene
 from diffsim.tasks import SHAC_TASKS, TASKS, Task
 
 Array = NDArray[np.float64]

@@ -14,12 +14,12 @@ from test_accuracy import source
 from test_gradient import check_gradients, gradients
 
 import diffsim
-from diffsim import render, web
-from diffsim.integration import Integration
 from diffsim.planning.system import System
-from diffsim.scene import Scene
-from diffsim.simulator import Simulator
+from diffsim.robot.scene import Scene
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
 from diffsim.terrain import Elevation, TerrainError, incline, named_terrains, random_terrain, rough, slabs, step
+from diffsim.view import render, web
 
 IMPLICIT = Integration("implicit", 8, 0.5)  # of the ball; the hopper is explicit, so that two kernels do for all
 # A valley, a ridge, a wall and a short segment; a ball of 0.1 m fits between all of them.

@@ -19,9 +19,9 @@ import torch
 
 import diffsim
 import view
-from diffsim import render, web
-from diffsim.mjcf import load_scene
+from diffsim.robot.mjcf import load_scene
 from diffsim.training import load_policy
+from diffsim.view import render, web
 
 ASSETS = Path(diffsim.__file__).parent / "assets"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

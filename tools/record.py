@@ -15,7 +15,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from diffsim.clip import Clip, tangent
+from diffsim.tasks.imitation.clip import Clip, tangent
 from diffsim.training import evaluate, fail, load_policy, make_policy_env, parse_command_line
 
 SETTLING = 3.0  # s at the start of the episode that are left out

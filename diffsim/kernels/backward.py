@@ -34,7 +34,7 @@ from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec, module_options
 from diffsim.kernels.terrain import terrain_contact
-from diffsim.scene import FACTORS
+from diffsim.robot.scene import FACTORS
 
 
 @cache

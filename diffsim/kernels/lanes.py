@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
 
 SPHERE = 0.5  # what a contact sphere or a muscle costs, in links
 POWERS = (1, 2, 4, 8, 16)

@@ -10,7 +10,7 @@ import warp as wp
 
 from diffsim.kernels.model import types
 from diffsim.kernels.spec import KernelSpec
-from diffsim.scene import FACTORS
+from diffsim.robot.scene import FACTORS
 
 K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))
 

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from diffsim.kernels.lanes import Division
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
 
 
 @cache

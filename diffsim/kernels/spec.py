@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from diffsim.kernels.lanes import Division
-from diffsim.scene import FACTORS, Scene
+from diffsim.robot.scene import FACTORS, Scene
 
 MAX_SPEED = 1e5  # m/s and rad/s; what is faster has blown up, and its squares would soon leave float32
 

@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from diffsim.integration import Integration
-from diffsim.scene import Scene
-from diffsim.simulator import Simulator, check_device
+from diffsim.robot.scene import Scene
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator, check_device
 
 REAL = torch.float64  # a dynamic program multiplies hundreds of Jacobians
 BATCH = 8192  # environments of one backward pass: bounds the memory of its checkpoints

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from .ant import Ant
-from .base import Accuracy, Contact, Firm, Task
-from .cartpole import CartPole
-from .half_cheetah import HalfCheetah
-from .hopper import Hopper
-from .humanoid import Humanoid
-from .humanoid_imitation import HumanoidImitation
-from .humanoid_mtu import HumanoidMTU
-from .swimmer import Swimmer
-from .walker import Walker
+from diffsim.tasks.ant import Ant
+from diffsim.tasks.base import Accuracy, Contact, Firm, Task
+from diffsim.tasks.cartpole import CartPole
+from diffsim.tasks.half_cheetah import HalfCheetah
+from diffsim.tasks.hopper import Hopper
+from diffsim.tasks.humanoid import Humanoid
+from diffsim.tasks.humanoid_mtu import HumanoidMTU
+from diffsim.tasks.imitation.task import HumanoidImitation
+from diffsim.tasks.swimmer import Swimmer
+from diffsim.tasks.walker import Walker
 
 TASKS: dict[str, type[Task]] = {
     task.name: task

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ..integration import Integration
-from .base import Firm
-from .locomotion import Locomotion
+from diffsim.sim.integration import Integration
+from diffsim.tasks.base import Firm
+from diffsim.tasks.locomotion import Locomotion
 
 
 class Ant(Locomotion):

@@ -12,8 +12,8 @@ from typing import ClassVar, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from ..integration import Integration
-from .mirror import Mirror
+from diffsim.sim.integration import Integration
+from diffsim.tasks.mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
 Contact = Literal["soft", "firm"]

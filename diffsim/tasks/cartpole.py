@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from ..integration import Integration
-from .base import Task
+from diffsim.sim.integration import Integration
+from diffsim.tasks.base import Task
 
 
 class CartPole(Task):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..integration import Integration
-from .base import Firm, Task
+from diffsim.sim.integration import Integration
+from diffsim.tasks.base import Firm, Task
 
 
 class HalfCheetah(Task):

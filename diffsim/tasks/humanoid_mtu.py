@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ..integration import Integration
-from .base import height_reward
-from .locomotion import Locomotion
+from diffsim.sim.integration import Integration
+from diffsim.tasks.base import height_reward
+from diffsim.tasks.locomotion import Locomotion
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # of a ball joint, wxyz
 LEG = (*UPRIGHT, 0.0, *UPRIGHT, 0.0, 0.0)  # hip, knee, ankle, two toes

@@ -11,9 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..mjcf import load_scene
-from .base import Task
-from .mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections, signs
+from diffsim.robot.mjcf import load_scene
+from diffsim.tasks.base import Task
+from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections, signs
 
 FORWARD_VELOCITY = 5  # column of the observation: v_x
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .base import Task
+from diffsim.tasks.base import Task
 
 
 class Walker(Task):

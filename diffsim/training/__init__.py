@@ -25,12 +25,12 @@ from diffsim.training.flags import (
     parse,
     parse_penalty,
 )
-from diffsim.training.gait import Gait, describe
 from diffsim.training.likeliest import Likeliest
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run, episode_metrics
+from diffsim.view.gait import Gait, describe
 
 __all__ = [
     "ClippedAdam",

@@ -16,7 +16,7 @@ from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import ENOUGH, FINER, Evaluation, evaluate, kept
 from diffsim.training.flags import Args, Flags, parse_penalty
-from diffsim.training.gait import describe
+from diffsim.view.gait import describe
 
 L = TypeVar("L", bound=Learner)
 

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffsim import render
 from diffsim.env import DiffEnv
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
+from diffsim.view import render
 
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's

@@ -19,16 +19,16 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import torch
 import tyro
 
-from diffsim import render
-from diffsim.clip import Clip, read_clip
 from diffsim.env import ActionError
-from diffsim.launcher import TooLargeError
+from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError, end_in_one_line
 from diffsim.tasks import TASKS, HumanoidImitation
+from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.terrain import TerrainError
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, parse_command_line
 from diffsim.training.variation import parse_ranges
+from diffsim.view import render
 
 LARGEST = torch.finfo(torch.float32).max
 RANDOMISED = ("stiffness=0.45:2.2", "friction=0.85:1.17")  # with --contact firm

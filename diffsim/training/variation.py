@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from diffsim.env import DiffEnv
-from diffsim.integration import is_real
-from diffsim.mjcf import load_scene
-from diffsim.scene import FACTORS, PENALTY_CONSTANTS, Scene
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import FACTORS, PENALTY_CONSTANTS, Scene
+from diffsim.sim.integration import is_real
 
 # What --randomise may name, and the factors of the simulator that it draws, each by itself.
 VARIED = {

@@ -12,7 +12,7 @@ from learners import refusal
 from tables import read_csv
 
 import diffsim
-from diffsim.scene import FACTORS
+from diffsim.robot.scene import FACTORS
 
 POLICIES = Path(diffsim.__file__).parent / "policies"
 

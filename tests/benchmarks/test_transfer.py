@@ -231,7 +231,7 @@ def test_what_cannot_be_compared(name: str, message: str, tmp_path: Path, capsys
 
 def test_a_video_shows_both_worlds(tmp_path: Path) -> None:
     try:
-        diffsim.render.check_opengl()
+        diffsim.view.render.check_opengl()
     except RuntimeError as error:
         pytest.skip(str(error))
     saved = load_policy(POLICIES / "hopper.pt")

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 import diffsim
-from diffsim import render
 from diffsim.training import Evaluation, evaluate, evaluation
+from diffsim.view import render
 
 
 @pytest.fixture(scope="module")

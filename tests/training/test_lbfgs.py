@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from diffsim.training.lbfgs import maximise
+from diffsim.planning.lbfgs import maximise
 
 
 def test_the_best_finite_point_is_returned() -> None:

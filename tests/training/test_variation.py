@@ -14,7 +14,7 @@ import diffsim
 import ppo_baseline
 import shac
 from diffsim import TASKS
-from diffsim.scene import FACTORS
+from diffsim.robot.scene import FACTORS
 from diffsim.training import parse
 from diffsim.training.flags import RANDOMISED
 from diffsim.training.variation import Range, Variation, parse_ranges, soft_factors

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffsim.kinematics import difference
+from diffsim.tasks.imitation.kinematics import difference
 
 CONTROL_DT = 1 / 60  # s
 SHORTEST = 6  # frames

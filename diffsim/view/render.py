@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
 from diffsim.terrain import slabs
 
 Frame = NDArray[np.uint8]  # (height, width, 3)

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.integration import is_real
+from diffsim.sim.integration import is_real
 from diffsim.terrain import TerrainError, check_terrain
 
 Array = NDArray[np.float64]

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.ground import disabled_flags, enabled_flags, ground_pairs, pair_law
-from diffsim.penalty import mass_matrix
-from diffsim.scene import MUSCLE_MODELS, PENALTY_CONSTANTS
+from diffsim.robot.constants import mass_matrix
+from diffsim.robot.ground import disabled_flags, enabled_flags, ground_pairs, pair_law
+from diffsim.robot.scene import MUSCLE_MODELS, PENALTY_CONSTANTS
 
 Kind = mujoco.mjtObj
 NUMERICS = (*PENALTY_CONSTANTS, "muscle_strength")

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.scene import Array, Index, Scene
+from diffsim.robot.scene import Array, Index, Scene
 from diffsim.training.evaluation import Evaluation
 
 Flags = NDArray[np.bool_]

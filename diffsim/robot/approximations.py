@@ -5,10 +5,10 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from diffsim.ground import PairLaw, ground_pairs, pair_law, self_pairs
-from diffsim.obstacles import is_motor, label
-from diffsim.penalty import CARRIERS, STEP, asked, mass_matrix, recovery
-from diffsim.scene import Scene
+from diffsim.robot.constants import CARRIERS, STEP, asked, mass_matrix, recovery
+from diffsim.robot.ground import PairLaw, ground_pairs, pair_law, self_pairs
+from diffsim.robot.refuse import is_motor, label
+from diffsim.robot.scene import Scene
 
 GEOM = mujoco.mjtObj.mjOBJ_GEOM
 

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.render import Renderer, add_terrain, hide_planes
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
+from diffsim.view.render import Renderer, add_terrain, hide_planes
 
 RenderMode = Literal["rgb_array", "human"]
 FRAME_SIZE = (480, 352)  # width and height in pixels; video encoders want multiples of 16

@@ -7,11 +7,11 @@ from typing import NoReturn
 
 import torch
 
-from diffsim.integration import Integration, check_count, is_real
 from diffsim.kernels.lanes import Division
-from diffsim.launcher import WARP_DTYPE, Launcher, check_memory
-from diffsim.scene import FACTORS, Scene
-from diffsim.stepper import ExtrapolatedStepper, State, Stepper
+from diffsim.robot.scene import FACTORS, Scene
+from diffsim.sim.integration import Integration, check_count, is_real
+from diffsim.sim.launcher import WARP_DTYPE, Launcher, check_memory
+from diffsim.sim.stepper import ExtrapolatedStepper, State, Stepper
 
 
 class Simulator:

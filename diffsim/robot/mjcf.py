@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from diffsim.approximations import approximations
-from diffsim.ground import PairLaw, disabled_flags, ground_pairs, pair_law
-from diffsim.obstacles import floating, is_motor, obstacles, text
-from diffsim.penalty import contact_constants, limit_constants, mobilities
-from diffsim.scene import Array, Scene, SceneError
+from diffsim.robot.approximations import approximations
+from diffsim.robot.constants import contact_constants, limit_constants, mobilities
+from diffsim.robot.ground import PairLaw, disabled_flags, ground_pairs, pair_law
+from diffsim.robot.refuse import floating, is_motor, obstacles, text
+from diffsim.robot.scene import Array, Scene, SceneError
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:

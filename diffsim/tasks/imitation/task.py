@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..clip import Clip, read_clip
-from ..kinematics import Kinematics, difference, matrix
-from ..mjcf import load_scene
-from .base import Task
-from .humanoid import Humanoid
+from diffsim.robot.mjcf import load_scene
+from diffsim.tasks.base import Task
+from diffsim.tasks.humanoid import Humanoid
+from diffsim.tasks.imitation.clip import Clip, read_clip
+from diffsim.tasks.imitation.kinematics import Kinematics, difference, matrix
 
 END_EFFECTORS = ("right_hand", "left_hand", "right_foot_inner", "left_foot_inner")  # the middle of each geom
 STRAY = 0.5  # m; the episode ends when the root is further from the reference's

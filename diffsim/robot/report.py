@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from diffsim.approximations import named
-from diffsim.mjcf import load_scene
-from diffsim.penalty import CARRIERS
-from diffsim.scene import PENALTY_CONSTANTS, Scene, SceneError
+from diffsim.robot.approximations import named
+from diffsim.robot.constants import CARRIERS
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import PENALTY_CONSTANTS, Scene, SceneError
 
 # Where a constant comes from that the file does not name.
 SOURCES = {

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
-from diffsim.integration import Integration
-from diffsim.launcher import Launcher, check_memory
+from diffsim.sim.integration import Integration
+from diffsim.sim.launcher import Launcher, check_memory
 
 State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 

@@ -15,9 +15,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.render import GROUND
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
 from diffsim.terrain import slabs
+from diffsim.view.render import GROUND
 
 MAX_BYTES = 700_000  # of poses; what is longer keeps every second control step, or fewer
 HIDDEN_GROUP = 3  # geoms from this group on are not drawn, as in MuJoCo

@@ -11,13 +11,13 @@ import torch
 import warp as wp
 
 from diffsim import startup
-from diffsim.integration import Integration
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import Division, divide
 from diffsim.kernels.model import model_of
 from diffsim.kernels.spec import kernel_spec
-from diffsim.scene import Scene
+from diffsim.robot.scene import Scene
+from diffsim.sim.integration import Integration
 
 WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
 # Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
