@@ -142,7 +142,8 @@ def test_readme_has_the_return_of_every_task() -> None:
 
 def test_every_csv_file_says_where_it_comes_from() -> None:
     paths = sorted((ROOT / "results").glob("*/*.csv"))
-    assert paths and not [path for path in (ROOT / "results").rglob("*") if path.is_file() and path not in [*paths, LOG]]
+    files = {path for path in (ROOT / "results").rglob("*") if path.is_file()}
+    assert paths and files == {*paths, LOG}
     for path in paths:
         origin = path.read_text().splitlines()[0]
         assert re.match(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python \w+", origin), path
