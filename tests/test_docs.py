@@ -32,7 +32,7 @@ class Table(NamedTuple):
     header: list[str]
     rows: list[list[str]]
     source: Path | None  # the csv file named between the table and the next table or heading
-    curves: str | None = None  # the machine whose training curves are named there
+    curves: str = ""  # the machine whose training curves are named there
 
     def columns(self) -> list[str]:
         """Those that the csv file has, too."""
@@ -47,7 +47,7 @@ def tables(page: Path) -> Iterator[Table]:
         below = re.split(r"^#", text, flags=re.MULTILINE)[0]
         source = re.search(r"results/\w+/\w+\.csv", below)
         curves = re.search(r"results/([\w<>]+)/<learner>_<task>\.csv", below)
-        yield Table(header, rows, ROOT / source[0] if source and not curves else None, curves[1] if curves else None)
+        yield Table(header, rows, ROOT / source[0] if source and not curves else None, curves[1] if curves else "")
 
 
 def seeds(header: list[str], cells: list[str]) -> list[list[str]]:
