@@ -230,6 +230,13 @@ def test_relative_links_and_pictures_exist(page: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{page.name}: {link} has no such heading"
 
 
+def test_readme_is_short_and_begins_with_the_commands_of_a_fresh_machine() -> None:
+    text = README.read_text()
+    first = FENCE.findall(text)[0][1].splitlines()
+    expected = ["pip install -e . && python shac.py --env ant --seed 1", 'pip install -e ".[test]" && pytest']
+    assert [line.split("  ")[0] for line in first] == expected and len(text.split()) <= 1000
+
+
 def test_what_is_where_names_all_scripts_and_packages_once() -> None:
     (section,) = re.findall(r"^## What is where\n\n```\n(.*?)^```$", README.read_text(), re.MULTILINE | re.DOTALL)
     first = [line.split()[0] for line in section.splitlines() if re.match(r" *[\w./]+ {2}", line)]
