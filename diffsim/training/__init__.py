@@ -15,7 +15,18 @@ from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
 from diffsim.training.likeliest import Likeliest
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Decay, Finite, Fraction, Natural, NonNegative, Positive, Repeats, SomeWidths, Widths
+from diffsim.training.ranges import (
+    Count,
+    Decay,
+    Finite,
+    Fraction,
+    Natural,
+    NonNegative,
+    Positive,
+    Repeats,
+    SomeWidths,
+    Widths,
+)
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run
 from diffsim.view.gait import Gait, describe
