@@ -41,7 +41,7 @@ from diffsim.training.errors import fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
 from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, parse
-from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.layers import ObsNormalizer
 from diffsim.training.run import Run
 
 Variant = Literal[

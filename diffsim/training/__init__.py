@@ -25,8 +25,7 @@ from diffsim.training.flags import (
     parse,
     parse_penalty,
 )
-from diffsim.training.likeliest import Likeliest
-from diffsim.training.normalizer import ObsNormalizer, moments
+from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run, episode_metrics

@@ -14,8 +14,7 @@ import torch
 from torch import nn
 
 from diffsim.training.errors import fail
-from diffsim.training.likeliest import Likeliest
-from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.layers import Likeliest, ObsNormalizer
 
 FORMAT = 2
 
