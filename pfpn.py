@@ -25,8 +25,8 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, Ensemble, ReplayBuffer, Run, Transition, distributed, evaluate, evaluate_checkpoint
-from diffsim.training.errors import fail
-from diffsim.training.flags import Count, Fraction, Natural, NonNegative, ParallelFlags, Positive, Widths, parse
+from diffsim.training.errors import command, fail
+from diffsim.training.flags import Count, Fraction, Natural, NonNegative, ParallelFlags, Positive, Repeats, Widths, parse
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 
 # The settings of ppo_baseline.py, shac.py and sac_baseline.py, so that only the policy differs.
@@ -68,7 +68,7 @@ Estimator = Literal["implicit", "straight-through", "mixed"]
 class Args(ParallelFlags):
     """The policy and the algorithms. Defaults: of PPO on the humanoid."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "log_particles")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "critic_lr", "temperature_lr", "entropy_coef")
 
     algorithm: Literal["ppo", "shac", "sac"] = "ppo"
     """what trains the policy: rewards alone, the simulator's gradient, or a replay buffer"""
@@ -109,7 +109,7 @@ class Args(ParallelFlags):
     """discount factor"""
     trace_decay: Fraction = 0.95
     """lambda of PPO's advantages and of SHAC's values"""
-    epochs: Count = 5
+    epochs: Repeats = 5
     """passes over a window's samples: of PPO, of SHAC's critic; SAC: updates per control step (per task)"""
     minibatch_size: Count = 8192
     """samples of an update (per task; PPO on a CPU: at most 2048)"""
@@ -744,6 +744,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, learner.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:
