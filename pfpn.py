@@ -24,10 +24,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, Ensemble, ReplayBuffer, Run, Transition, distributed, evaluate, evaluate_checkpoint
+from diffsim.training import ClippedAdam, Ensemble, Run, distributed, evaluate, evaluate_checkpoint, parse
 from diffsim.training.errors import command, fail
-from diffsim.training.flags import Count, Fraction, Natural, NonNegative, ParallelFlags, Positive, Repeats, Widths, parse
+from diffsim.training.flags import Count, Fraction, Natural, NonNegative, ParallelFlags, Positive, Repeats, Widths
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
+from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of ppo_baseline.py, shac.py and sac_baseline.py, so that only the policy differs.
 # fmt: off
@@ -204,12 +205,12 @@ class Bins(Mixture):
 
 
 class Head(nn.Module):
-    """Features of a network (..., inputs) -> a mixture of n components for each of m actions. What depends on the state:
+    """Features of a network (..., inputs) -> the mixture of each of m actions. What of it depends on the state:
 
-    pfpn      the weights alone (Figure 2)
+    pfpn      the weights (Figure 2)
     discrete  the weights; the components are points, which stay where they are
     gmm       weights, locations and scales
-    gaussian  the location of the only component; with SAC its scale too, as in the other scripts
+    gaussian  the location of its only component; with SAC its scale too, as in the other scripts
     """
 
     def __init__(self, args: Args, inputs: int, actions: int) -> None:
