@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, Ensemble, Run, distributed, evaluate, evaluate_checkpoint, parse
 from diffsim.training.errors import command, fail
-from diffsim.training.flags import Count, Fraction, Natural, NonNegative, ParallelFlags, Positive, Repeats, Widths
+from diffsim.training.flags import Count, Fraction, Natural, NonNegative, ParallelFlags, Positive, Repeats, SomeWidths
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.replay import ReplayBuffer, Transition
 
@@ -98,9 +98,9 @@ class Args(ParallelFlags):
     """parallel environments N, over all processes of torchrun (per task; PPO on a CPU: at most 256)"""
     horizon: Count = 32
     """control steps of a window (1/60 s each) (per task)"""
-    hidden: Widths = (256, 128, 64)
+    hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of the policy, which PPO's value shares (per task)"""
-    critic_hidden: Widths = (128, 128)
+    critic_hidden: SomeWidths = (128, 128)
     """units of the hidden layers of SHAC's and SAC's critics (per task)"""
     lr: Positive = 3e-4
     """learning rate of the policy; of PPO the initial one, of SHAC too (per task)"""
@@ -136,21 +136,26 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        sac, discrete = self.algorithm == "sac", self.policy == "discrete"
-        if self.policy != "gaussian" and not 2 <= self.particles <= 1000:
-            fail(f"--particles must be from 2 to 1,000 with --policy {self.policy}, not {self.particles}")
-        if self.dead == 1:
-            fail("--dead 1: with equal weights all particles would be dead")
-        if discrete and sac:
-            fail("--policy discrete has no density, whose entropy --algorithm sac needs")
-        if discrete and self.algorithm == "shac" and self.estimator == "implicit":
-            fail("--policy discrete has no implicit gradient: choose --estimator straight-through or mixed")
-        if sac and self.estimator == "mixed":
-            fail("--estimator mixed needs the rewards of a window, which --algorithm sac has not")
-        if sac and distributed.size() > 1:
-            fail("--algorithm sac is one process alone: a replay buffer is not shared among ranks")
-        if sac and self.buffer_size < self.horizon * self.num_envs:
-            fail(f"--buffer-size {self.buffer_size} holds no window of {self.horizon} steps of {self.num_envs}")
+        sac, discrete, window = self.algorithm == "sac", self.policy == "discrete", self.horizon * self.num_envs
+        few = self.policy != "gaussian" and not 2 <= self.particles <= 1000
+        pathless = discrete and self.algorithm == "shac" and self.estimator == "implicit"
+        for wrong, message in (
+            (few, f"--particles must be from 2 to 1,000 with --policy {self.policy}, not {self.particles}"),
+            (self.dead == 1, "--dead 1: with equal weights all particles would be dead"),
+            (discrete and sac, "--policy discrete has no density, whose entropy --algorithm sac needs"),
+            (pathless, "--policy discrete has no implicit gradient: choose --estimator straight-through or mixed"),
+            (
+                sac and self.estimator == "mixed",
+                "--estimator mixed needs the rewards of a window: not with --algorithm sac",
+            ),
+            (
+                sac and distributed.size() > 1,
+                "--algorithm sac is one process alone: ranks do not share a replay buffer",
+            ),
+            (sac and self.buffer_size < window, f"--buffer-size {self.buffer_size} holds no window of {window} steps"),
+        ):
+            if wrong:
+                fail(message)
 
 
 # Policies -------------------------------------------------------------------------------------------------------------
@@ -270,7 +275,7 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
     return layer
 
 
-def mlp(inputs: int, hidden: Widths, activation: type[nn.Module] = nn.ELU, norm: bool = False) -> nn.Sequential:
+def mlp(inputs: int, hidden: Sequence[int], activation: type[nn.Module] = nn.ELU, norm: bool = False) -> nn.Sequential:
     """Linear, activation and, if asked for, LayerNorm per hidden layer."""
     layers: list[nn.Module] = []
     for width in hidden:
@@ -280,7 +285,7 @@ def mlp(inputs: int, hidden: Widths, activation: type[nn.Module] = nn.ELU, norm:
 
 
 class Actor(nn.Module):
-    """pi(a|s), of normalized observations; with PPO also V(s), in units of its normalizer, of the same features."""
+    """pi(a|s), of normalized observations."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
         super().__init__()
@@ -288,16 +293,10 @@ class Actor(nn.Module):
         activation = nn.ReLU if args.algorithm == "sac" else nn.ELU
         self.body = mlp(obs_dim, args.hidden, activation, norm=args.algorithm == "shac")
         self.head = Head(args, args.hidden[-1], action_dim)
-        self.value = nn.Linear(args.hidden[-1], 1) if args.algorithm == "ppo" else None
 
     def forward(self, obs: Tensor) -> Mixture:
         mixture: Mixture = self.head(self.body(obs))
         return mixture
-
-    def both(self, obs: Tensor) -> tuple[Mixture, Tensor]:
-        assert self.value is not None
-        features = self.body(obs)
-        return self.head(features), self.value(features).squeeze(-1)
 
     def deterministic(self) -> nn.Sequential:
         """The locations of the largest weights, of observations as they come, with the same weights."""
@@ -452,12 +451,15 @@ class Learner:
         self.actor = Actor(args, env.task.obs_dim, env.scene.nu).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
-        self.optimizer = ClippedAdam(self.actor, self.max_grad_norm, self.betas, args.lr)
+        self.optimizer = self.adam(self.actor, args.lr)
+
+    def adam(self, module: nn.Module, lr: float) -> ClippedAdam:
+        return ClippedAdam(module, self.max_grad_norm, self.betas, lr)
 
     def add_critic(self, critic: nn.Module) -> None:
         self.critic = critic.to(self.env.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.critic_optimizer = ClippedAdam(self.critic, self.max_grad_norm, self.betas, self.args.critic_lr)
+        self.critic_optimizer = self.adam(self.critic, self.args.critic_lr)
 
     def schedule(self, iteration: int) -> None:
         """Set the learning rates of an iteration."""
@@ -519,12 +521,20 @@ class PPO(Learner):
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__(args, env)
+        self.value = nn.Linear(args.hidden[-1], 1).to(
+            env.device
+        )  # V(s), in units of its normalizer, of the same features
+        self.optimizer = self.adam(nn.ModuleList((self.actor, self.value)), args.lr)
         self.return_normalizer = ObsNormalizer().to(env.device)
         sizes = (env.task.obs_dim,), (env.scene.nu,), (), (), ()  # see update
         self.samples = [torch.zeros(args.horizon * env.num_envs, *size, device=env.device) for size in sizes]
 
+    def both(self, obs: Tensor) -> tuple[Mixture, Tensor]:
+        features = self.actor.body(obs)
+        return self.actor.head(features), self.value(features).squeeze(-1)
+
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
-        mixture, value = self.actor.both(self.actor.normalizer(obs))
+        mixture, value = self.both(self.actor.normalizer(obs))
         self.resampling.record(mixture)
         u, _ = sample(mixture)
         return u, u, mixture.log_prob(u), value
@@ -534,7 +544,7 @@ class PPO(Learner):
         """Act for a window, and keep its samples with their advantages and value targets."""
         args, normalizer = self.args, self.actor.normalizer
         window, (u, log_prob, value) = self.collect()
-        next_value = self.return_normalizer.inverse(self.actor.both(normalizer(window.next_obs))[1])
+        next_value = self.return_normalizer.inverse(self.both(normalizer(window.next_obs))[1])
         next_value = next_value.masked_fill(window.terminated, 0.0)
         target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
         advantage = target - self.return_normalizer.inverse(value)
@@ -555,10 +565,11 @@ class PPO(Learner):
 
     def update(self, obs: Tensor, u: Tensor, log_prob: Tensor, advantage: Tensor, target: Tensor) -> dict[str, Tensor]:
         """One step on a minibatch of normalized s_t, u, its log probability, the advantage and the value's target."""
-        mixture, value = self.actor.both(obs)
+        mixture, value = self.both(obs)
         log_ratio = mixture.log_prob(u) - log_prob
-        kl = (log_ratio.detach().expm1() - log_ratio.detach()).mean()  # estimated; not below zero
-        adapt(self.optimizer.lr, distributed.average(kl), self.target_kl, self.lr_bounds)
+        kl = distributed.average((log_ratio.detach().expm1() - log_ratio.detach()).mean())  # estimated; not below zero
+        up, down = (x.to(kl.dtype) for x in (kl < self.target_kl / 2, kl > 2 * self.target_kl))
+        self.optimizer.lr.mul_(1.5 ** (up - down)).clamp_(*self.lr_bounds)
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - self.clip_coef, 1 + self.clip_coef)
         policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()
@@ -570,12 +581,6 @@ class PPO(Learner):
             loss = loss - self.args.entropy_coef * entropy
         found = {"losses/policy": policy_loss, "losses/value": value_loss, "losses/kl": kl, "charts/entropy": entropy}
         return {name: value.detach() for name, value in found.items()} | {"grad/norm": self.optimizer.step(loss)}
-
-
-@torch.no_grad()
-def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) -> None:
-    """Divides lr by 1.5 where kl is beyond twice the target, and multiplies it by 1.5 below half of it."""
-    lr.mul_(1.5 ** ((kl < target / 2).to(lr.dtype) - (kl > 2 * target).to(lr.dtype))).clamp_(*bounds)
 
 
 class SHAC(Learner):
@@ -619,12 +624,7 @@ class SHAC(Learner):
         return {"losses/actor": loss.detach(), "charts/entropy": entropy.detach().mean(), "grad/norm": norm}
 
     def loss(self, window: Window, chosen: Tensor, entropy: Tensor) -> Tensor:
-        """Eq. 5: each environment's window is cut at its dones, and the discount starts anew after them.
-
-        Args:
-            window: of (H, N) steps.
-            chosen, entropy: (H, N) log probabilities of the chosen components, and the policy's entropies.
-        """
+        """Eq. 5, cut at the dones, with the chosen components' log probabilities and the policy's entropies (H, N)."""
         args, reward, done, next_value = self.args, window.reward, window.done, self.next_values(window)
         t = torch.arange(len(done), device=done.device).unsqueeze(1)
         starts, ends = done.roll(1, 0), done.clone()
@@ -667,7 +667,7 @@ class SAC(Learner):
         critics = [mlp(obs_dim + action_dim, hidden, nn.ReLU).append(nn.Linear(hidden[-1], 1)) for _ in range(2)]
         self.add_critic(Ensemble(critics))
         self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)
-        self.temperature_optimizer = ClippedAdam(self.temperature, self.max_grad_norm, lr=args.temperature_lr)
+        self.temperature_optimizer = self.adam(self.temperature, args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
 
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:

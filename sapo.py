@@ -35,6 +35,7 @@ from diffsim.training import (
     Positive,
     Repeats,
     Run,
+    SomeWidths,
     Widths,
     command,
     distributed,
@@ -70,7 +71,11 @@ SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
 class Args(ParallelFlags):
     """The algorithm. With --no-entropy --no-state-std --critics 1 --activation elu it is SHAC."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "actor_lr", "critic_lr", "final_lr", "temperature_lr")
+    MAY_CHANGE = (
+        *ParallelFlags.MAY_CHANGE,
+        *("horizon", "actor_lr", "critic_lr", "final_lr", "temperature_lr", "betas", "max_grad_norm", "gamma"),
+        *("td_lambda", "target_alpha", "target_entropy", "critic_iterations", "critic_minibatches"),
+    )
 
     entropy: bool = True
     """the policy's entropy is part of the reward"""
@@ -102,9 +107,9 @@ class Args(ParallelFlags):
     """learning rate of the temperature's logarithm"""
     horizon: Count = 32
     """control steps h of a window (1/60 s each)"""
-    actor_hidden: Widths = (256, 128)
+    actor_hidden: SomeWidths = (256, 128)
     """units of the actor's hidden layers (per task)"""
-    critic_hidden: Widths = (128, 128)
+    critic_hidden: SomeWidths = (128, 128)
     """units of the critics' hidden layers (per task)"""
     actor_lr: Positive = 2e-3
     """initial learning rate of the actor (per task)"""
