@@ -144,14 +144,8 @@ class Args(ParallelFlags):
             (self.dead == 1, "--dead 1: with equal weights all particles would be dead"),
             (discrete and sac, "--policy discrete has no density, whose entropy --algorithm sac needs"),
             (pathless, "--policy discrete has no implicit gradient: choose --estimator straight-through or mixed"),
-            (
-                sac and self.estimator == "mixed",
-                "--estimator mixed needs the rewards of a window: not with --algorithm sac",
-            ),
-            (
-                sac and distributed.size() > 1,
-                "--algorithm sac is one process alone: ranks do not share a replay buffer",
-            ),
+            (sac and self.estimator == "mixed", "--estimator mixed needs the rewards of a window: not --algorithm sac"),
+            (sac and distributed.size() > 1, "--algorithm sac is one process: ranks do not share a replay buffer"),
             (sac and self.buffer_size < window, f"--buffer-size {self.buffer_size} holds no window of {window} steps"),
         ):
             if wrong:
@@ -285,7 +279,7 @@ def mlp(inputs: int, hidden: Sequence[int], activation: type[nn.Module] = nn.ELU
 
 
 class Actor(nn.Module):
-    """pi(a|s), of normalized observations."""
+    """pi(a|s), of normalized observations; with PPO also V(s), in units of its normalizer, of the same features."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
         super().__init__()
@@ -293,10 +287,16 @@ class Actor(nn.Module):
         activation = nn.ReLU if args.algorithm == "sac" else nn.ELU
         self.body = mlp(obs_dim, args.hidden, activation, norm=args.algorithm == "shac")
         self.head = Head(args, args.hidden[-1], action_dim)
+        self.value = nn.Linear(args.hidden[-1], 1) if args.algorithm == "ppo" else None
 
     def forward(self, obs: Tensor) -> Mixture:
         mixture: Mixture = self.head(self.body(obs))
         return mixture
+
+    def both(self, obs: Tensor) -> tuple[Mixture, Tensor]:
+        assert self.value is not None
+        features = self.body(obs)
+        return self.head(features), self.value(features).squeeze(-1)
 
     def deterministic(self) -> nn.Sequential:
         """The locations of the largest weights, of observations as they come, with the same weights."""
@@ -451,15 +451,12 @@ class Learner:
         self.actor = Actor(args, env.task.obs_dim, env.scene.nu).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
-        self.optimizer = self.adam(self.actor, args.lr)
-
-    def adam(self, module: nn.Module, lr: float) -> ClippedAdam:
-        return ClippedAdam(module, self.max_grad_norm, self.betas, lr)
+        self.optimizer = ClippedAdam(self.actor, self.max_grad_norm, self.betas, args.lr)
 
     def add_critic(self, critic: nn.Module) -> None:
         self.critic = critic.to(self.env.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.critic_optimizer = self.adam(self.critic, self.args.critic_lr)
+        self.critic_optimizer = ClippedAdam(self.critic, self.max_grad_norm, self.betas, self.args.critic_lr)
 
     def schedule(self, iteration: int) -> None:
         """Set the learning rates of an iteration."""
@@ -521,20 +518,12 @@ class PPO(Learner):
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__(args, env)
-        self.value = nn.Linear(args.hidden[-1], 1).to(
-            env.device
-        )  # V(s), in units of its normalizer, of the same features
-        self.optimizer = self.adam(nn.ModuleList((self.actor, self.value)), args.lr)
         self.return_normalizer = ObsNormalizer().to(env.device)
         sizes = (env.task.obs_dim,), (env.scene.nu,), (), (), ()  # see update
         self.samples = [torch.zeros(args.horizon * env.num_envs, *size, device=env.device) for size in sizes]
 
-    def both(self, obs: Tensor) -> tuple[Mixture, Tensor]:
-        features = self.actor.body(obs)
-        return self.actor.head(features), self.value(features).squeeze(-1)
-
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
-        mixture, value = self.both(self.actor.normalizer(obs))
+        mixture, value = self.actor.both(self.actor.normalizer(obs))
         self.resampling.record(mixture)
         u, _ = sample(mixture)
         return u, u, mixture.log_prob(u), value
@@ -544,7 +533,7 @@ class PPO(Learner):
         """Act for a window, and keep its samples with their advantages and value targets."""
         args, normalizer = self.args, self.actor.normalizer
         window, (u, log_prob, value) = self.collect()
-        next_value = self.return_normalizer.inverse(self.both(normalizer(window.next_obs))[1])
+        next_value = self.return_normalizer.inverse(self.actor.both(normalizer(window.next_obs))[1])
         next_value = next_value.masked_fill(window.terminated, 0.0)
         target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
         advantage = target - self.return_normalizer.inverse(value)
@@ -565,7 +554,7 @@ class PPO(Learner):
 
     def update(self, obs: Tensor, u: Tensor, log_prob: Tensor, advantage: Tensor, target: Tensor) -> dict[str, Tensor]:
         """One step on a minibatch of normalized s_t, u, its log probability, the advantage and the value's target."""
-        mixture, value = self.both(obs)
+        mixture, value = self.actor.both(obs)
         log_ratio = mixture.log_prob(u) - log_prob
         kl = distributed.average((log_ratio.detach().expm1() - log_ratio.detach()).mean())  # estimated; not below zero
         up, down = (x.to(kl.dtype) for x in (kl < self.target_kl / 2, kl > 2 * self.target_kl))
@@ -667,7 +656,7 @@ class SAC(Learner):
         critics = [mlp(obs_dim + action_dim, hidden, nn.ReLU).append(nn.Linear(hidden[-1], 1)) for _ in range(2)]
         self.add_critic(Ensemble(critics))
         self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)
-        self.temperature_optimizer = self.adam(self.temperature, args.temperature_lr)
+        self.temperature_optimizer = ClippedAdam(self.temperature, self.max_grad_norm, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
 
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
