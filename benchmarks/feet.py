@@ -71,7 +71,8 @@ def measure(case: Case, args: Args) -> None:
 
 
 def line(rows: list[dict[str, str]], style: str, label: str, width: float) -> Line:
-    return Line(*np.array([(float(row["first"]), float(row["second"])) for row in rows]).T, style, label, width)
+    first, second = ([float(row[name]) for row in rows] for name in ("first", "second"))
+    return Line(first, second, style, label, width)
 
 
 def report(args: Args) -> str:

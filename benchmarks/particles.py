@@ -138,7 +138,7 @@ def group(rows: Sequence[dict[str, str]], *names: str) -> dict[str, list[dict[st
 def panel(rows: Sequence[dict[str, str]], each: str, x: str, y: str, title: str) -> Panel:
     """A line for each value of a column."""
     points = [np.array([(float(row[x]), float(row[y])) for row in own]).T for own in group(rows, each).values()]
-    return Panel([Line(*own, f"C{k % 10}-", width=0.8) for k, own in enumerate(points)], title, x, y)
+    return Panel([Line(own[0], own[1], f"C{k % 10}-", width=0.8) for k, own in enumerate(points)], title, x, y)
 
 
 def draw(args: Args) -> None:
