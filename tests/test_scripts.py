@@ -30,7 +30,9 @@ from diffsim.training.progress import COLUMNS, column
 NOT_COMPARED = {"seconds"}
 SCALARS = {
     "shac": "losses/actor losses/critic time/update_actor time/update_critic",
-    "sapo": "losses/actor losses/critic charts/entropy charts/temperature time/update_actor time/update_critic",
+    "sapo": (
+        "losses/actor losses/critic charts/reward charts/entropy charts/temperature time/update_actor time/update_critic"
+    ),
     "bptt": "losses/actor time/update",
     "ppo_baseline": "losses/policy losses/value losses/kl charts/learning_rate charts/std time/roll_out time/update",
     "pfpn": (
