@@ -240,12 +240,13 @@ class Head(nn.Module):
         return self.likeliest.get_parameter("loc")
 
     def forward(self, features: Tensor) -> Mixture:
-        out = self.linear(features).unflatten(-1, (-1, *self.shape))  # logits, locations or both
-        logits, loc = out[..., 0, :, :], out[..., -1, :, :]
+        out = self.linear(features)
         if self.policy == "gaussian":
-            logits = torch.zeros_like(loc)
-        elif self.policy != "gmm":
-            loc = self.loc
+            logits, loc = torch.zeros_like(out).unsqueeze(-1), out.unsqueeze(-1)
+        elif self.policy == "gmm":
+            logits, loc = out.unflatten(-1, (2, *self.shape)).unbind(-3)
+        else:
+            logits, loc = out.unflatten(-1, self.shape), self.loc
         scale = self.scale(features).unflatten(-1, self.shape).clamp(*LOG_STD) if self.scale else self.log_std
         return (Bins if self.policy == "discrete" else Mixture)(logits, loc, scale, self.squashed)
 
@@ -500,8 +501,7 @@ class Learner:
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
     """SHAC's Eq. 7 of (H, N) steps, backward in time: the value's targets; minus the value, PPO's advantages.
 
-    A done ends the return as the window's end does. next_value is V(s_{t+1}), before any reset: zero where the episode
-    terminated, but not where its time ran out.
+    A done ends the return as the window's end does. next_value is V(s_{t+1}) before any reset, 0 where terminated.
     """
     returns = torch.empty_like(reward)
     following = next_value[-1]
@@ -533,8 +533,8 @@ class PPO(Learner):
         """Act for a window, and keep its samples with their advantages and value targets."""
         args, normalizer = self.args, self.actor.normalizer
         window, (u, log_prob, value) = self.collect()
-        next_value = self.return_normalizer.inverse(self.actor.both(normalizer(window.next_obs))[1])
-        next_value = next_value.masked_fill(window.terminated, 0.0)
+        mixture, next_value = self.actor.both(normalizer(window.next_obs))
+        next_value = self.return_normalizer.inverse(next_value).masked_fill(window.terminated, 0.0)
         target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
         advantage = target - self.return_normalizer.inverse(value)
         self.return_normalizer.update(target)
@@ -542,7 +542,7 @@ class PPO(Learner):
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
         self.keep(normalizer(window.obs), u, log_prob, advantage, self.return_normalizer(target))
         normalizer.update(window.obs)
-        return {}
+        return {"charts/entropy": mixture.entropy().mean()}
 
     def learn(self) -> dict[str, Tensor]:
         """Descend the clipped loss in epochs of minibatches."""
@@ -565,11 +565,10 @@ class PPO(Learner):
         value_loss = (value - target).square().mean()
         bound_loss = (mixture.loc.abs() - 1.1).clamp(min=0).square().mean(-1).sum(-1).mean()
         loss = policy_loss + self.value_coef * value_loss + self.bound_coef * bound_loss
-        entropy = mixture.entropy().mean()
         if self.args.entropy_coef:
-            loss = loss - self.args.entropy_coef * entropy
-        found = {"losses/policy": policy_loss, "losses/value": value_loss, "losses/kl": kl, "charts/entropy": entropy}
-        return {name: value.detach() for name, value in found.items()} | {"grad/norm": self.optimizer.step(loss)}
+            loss = loss - self.args.entropy_coef * mixture.entropy().mean()
+        found = {"losses/policy": policy_loss.detach(), "losses/value": value_loss.detach(), "losses/kl": kl}
+        return found | {"grad/norm": self.optimizer.step(loss)}
 
 
 class SHAC(Learner):
