@@ -438,7 +438,8 @@ def test_sac_target_counts_the_entropy_of_what_follows() -> None:
 
 
 def test_skipped_updates_are_those_of_all_optimizers() -> None:
-    learner = build("--algorithm sac --num-envs 8 --critic-hidden 4 --minibatch-size 8 --buffer-size 64", lambda _, a: a, 8, steps=3)
+    flags = "--algorithm sac --num-envs 8 --critic-hidden 4 --minibatch-size 8 --buffer-size 64"
+    learner = build(flags, lambda _, action: action, 8, steps=3)
     learner.temperature_optimizer.skip_norm = 0.0
     learner.interact()
     assert learner.learn()["grad/skipped"] == 3
