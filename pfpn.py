@@ -24,10 +24,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, Ensemble, Run, distributed, evaluate, evaluate_checkpoint, parse
-from diffsim.training.errors import command, fail
-from diffsim.training.flags import Count, Fraction, Natural, NonNegative, ParallelFlags, Positive, Repeats, SomeWidths
+from diffsim.training import ClippedAdam, Ensemble, Run, command, distributed, evaluate, evaluate_checkpoint, fail
+from diffsim.training.flags import ParallelFlags, parse
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
+from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Positive, Repeats, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of ppo_baseline.py, shac.py and sac_baseline.py, so that only the policy differs.
