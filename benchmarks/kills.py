@@ -55,7 +55,7 @@ def start(script: str, *arguments: object) -> subprocess.Popen[bytes]:
 
 def finish(process: subprocess.Popen[bytes]) -> None:
     if process.wait():
-        raise SystemExit(f"{process.args} ended with exit code {process.returncode}")
+        raise SystemExit(f"{process.args!r} ended with exit code {process.returncode}")
 
 
 def same(a: Any, b: Any) -> bool:
