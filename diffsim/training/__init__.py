@@ -9,7 +9,7 @@ from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint, make_policy_env
 from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, export_policy, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
-from diffsim.training.errors import fail, parse_command_line
+from diffsim.training.errors import command, fail, parse_command_line
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import (
     Count,
@@ -30,7 +30,6 @@ from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run, episode_metrics
-from diffsim.view.gait import Gait, describe
 
 __all__ = [
     "ClippedAdam",
@@ -42,7 +41,6 @@ __all__ = [
     "Finite",
     "Flags",
     "Fraction",
-    "Gait",
     "Learner",
     "Likeliest",
     "Natural",
@@ -56,7 +54,7 @@ __all__ = [
     "Stateful",
     "Transition",
     "Widths",
-    "describe",
+    "command",
     "distributed",
     "episode_metrics",
     "evaluate",
