@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def show(saved: SavedPolicy, args: Args) -> None:
     torch.set_num_threads(1)  # operations this small gain nothing from more
-    changes = {} if args.substeps is None else {"substeps": args.substeps}
+    changes: dict[str, Any] = {} if args.substeps is None else {"substeps": args.substeps}
     task, name = saved.args["env"], f"{saved.script}.py, iteration {saved.iteration}"
     if args.viewer:
         print(f"{task}, {name}", (__doc__ or "").rstrip().rpartition("\n\n")[2], sep="\n")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,6 +20,7 @@ from diffsim.robot.scene import Array, Index, Scene
 
 Flags = NDArray[np.bool_]
 Frames = NDArray[np.intp]
+Rows = NDArray[np.floating[Any]]
 
 EPISODES = 8  # how many are looked at
 SETTLING = 1.0  # s at the start of an episode that are left out
@@ -127,7 +128,7 @@ class Gait:
         return f"{self.verdict}; {duty}{cost}peak joint speed {self.peak_joint_speed:.1f} rad/s, {depth}"
 
 
-def describe(scene: Scene, control_dt: float, episodes: Iterable[tuple[Array, Array]]) -> Gait | None:
+def describe(scene: Scene, control_dt: float, episodes: Iterable[tuple[Rows, Rows]]) -> Gait | None:
     """The gait of the first EPISODES episodes; None without contact with a plane, or if none lasts over a second.
 
     Args:

@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from importlib import import_module
@@ -173,7 +173,7 @@ def render_frames(
         ValueError, RuntimeError: as Renderer does; qpos or ctrl has another shape.
     """
     with Renderer(scene, width, height, camera, fast) as renderer:
-        return np.stack(list(_draw_all(renderer, qpos, ctrl)))
+        return np.stack([*_draw_all(renderer, qpos, ctrl)])
 
 
 def film(
@@ -213,19 +213,16 @@ def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float
     Raises:
         ValueError: no frames, another suffix, or an mp4 whose width or height is not a multiple of 16.
         OSError: the file cannot be written.
-        RuntimeError: the encoder is missing or fails.
+        RuntimeError: the encoder is missing.
     """
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise ValueError("a video needs at least one frame")
-    size = first.shape[1], first.shape[0]
-    with whole_file(check_video(path, size)) as part:
-        if part.suffix == ".gif":
-            _write_gif(part, itertools.chain([first], frames), fps)
-        else:
-            _write_mp4(part, itertools.chain([first], frames), size, fps)
-    return Path(path)
+    path = check_video(path, first.shape[1::-1])
+    with whole_file(path) as part:
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(part, itertools.chain([first], frames), fps)
+    return path
 
 
 @contextmanager
@@ -257,7 +254,7 @@ def check_size(width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def check_video(path: str | os.PathLike[str], size: tuple[int, int] = VIDEO_SIZE) -> Path:
+def check_video(path: str | os.PathLike[str], size: Sequence[int] = VIDEO_SIZE) -> Path:
     """The path, if a video of this name and size can be encoded here; raises what save_video does."""
     path = Path(path)
     if path.suffix not in (".mp4", ".gif"):
@@ -280,26 +277,26 @@ def check_video(path: str | os.PathLike[str], size: tuple[int, int] = VIDEO_SIZE
     return path
 
 
-def _write_mp4(path: Path, frames: Iterable[Frame], size: tuple[int, int], fps: float) -> None:
+def _write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> None:
     from imageio_ffmpeg import get_ffmpeg_exe
 
-    rate = Fraction(fps).limit_denominator()
-    source = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {rate} -i -"
+    height, width, _ = (first := next(frames)).shape
+    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {Fraction(fps).limit_denominator()} -i -"
     # faststart: browsers begin to play before they have loaded all of it.
     target = "-vcodec libx264 -pix_fmt yuv420p -crf 15 -preset veryfast -movflags +faststart"
     command = [get_ffmpeg_exe(), "-y", "-v", "error", *source.split(), *target.split(), os.fspath(path)]
     with TemporaryFile() as log:
         with suppress(BrokenPipeError), subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as ffmpeg:
             assert ffmpeg.stdin
-            for frame in frames:
-                ffmpeg.stdin.write(np.ascontiguousarray(frame))
+            for frame in itertools.chain([first], frames):
+                ffmpeg.stdin.write(frame.tobytes())
         if ffmpeg.returncode or not path.is_file() or path.stat().st_size == 0:
             log.seek(0)
             said = log.read().decode(errors="replace").strip().rpartition("\n")[2]
             raise OSError(f"ffmpeg fails: {said or f'exit status {ffmpeg.returncode}'}")
 
 
-def _write_gif(path: Path, frames: Iterable[Frame], fps: float) -> None:
+def _write_gif(path: Path, frames: Iterator[Frame], fps: float) -> None:
     from PIL import Image
 
     stride = math.ceil(fps / 50 - 1e-6)
