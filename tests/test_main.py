@@ -200,6 +200,17 @@ def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch
         diffsim.make("cartpole", 1)
 
 
+def test_an_import_changes_nothing_in_its_host() -> None:
+    program = """
+import signal, sys, threading
+before = sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT)
+import diffsim, diffsim.training
+assert before == (sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT))
+assert "diffsim.view.gait" not in sys.modules  # no training needs it
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | PATH)
+
+
 def test_a_full_kernel_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     env = diffsim.make("cartpole", 1, substeps=1)
     monkeypatch.setattr(startup, "_is_compiled", lambda *_: False)
