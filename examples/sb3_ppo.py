@@ -54,7 +54,7 @@ class DiffVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         return [getattr(self.env.unwrapped, attr_name)] * len([*self._get_indices(indices)])
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, *args: Any, **kwargs: Any) -> Any:
         raise NotImplementedError("the environments are one batch: use env itself")
 
     env_method = set_attr
