@@ -28,7 +28,6 @@ from diffsim.training.ranges import (
 )
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run
-from diffsim.view.gait import Gait, describe
 
 __all__ = [
     "ClippedAdam",
@@ -40,7 +39,6 @@ __all__ = [
     "Finite",
     "Flags",
     "Fraction",
-    "Gait",
     "Learner",
     "Likeliest",
     "Natural",
@@ -57,7 +55,6 @@ __all__ = [
     "UsageError",
     "Widths",
     "command",
-    "describe",
     "distributed",
     "evaluate",
     "evaluate_checkpoint",
