@@ -1,4 +1,4 @@
-"""What the benchmarks share: their flags, where their files go, and how their pictures are drawn."""
+"""What the benchmarks share: their flags, where their files go, their tables, and how their pictures are drawn."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypeVar, get_args
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import tables
@@ -63,6 +63,14 @@ class CommonFlags:
     def merge(self, name: str, rows: Sequence[Row], key: Sequence[str]) -> list[dict[str, str]]:
         return tables.merge_csv(self.csv(name), rows, key, self.device)
 
+    def keep(self, name: str, row: Row, key: Sequence[str]) -> None:
+        """Print a row, and merge it, as soon as it is measured."""
+        print(
+            "  " + ", ".join(f"{k} {tables.digits(v)}" for k, v in row.items() if k == "task" or k not in ABOUT),
+            flush=True,
+        )
+        self.merge(name, [row], key)
+
     def machines(self, name: str) -> dict[str, Path]:
         """The csv files of a name by their machines: all of the tree of results, or the one of --output."""
         paths = [self.csv(name)] if self.output else sorted(self.directory.parent.glob(f"*/{name}.csv"))
@@ -104,6 +112,9 @@ class CheckpointFlags(CommonFlags):
         return () if self.draw_only else self.checkpoints
 
 
+ABOUT = ("checkpoint", "task", "learner", "contact", "seed", "iteration")  # columns that say which policy a row is of
+
+
 class Case(NamedTuple):
     """A policy with the task on which it was trained."""
 
@@ -114,16 +125,12 @@ class Case(NamedTuple):
 
     @property
     def about(self) -> dict[str, object]:
-        """The csv's columns that say which policy it is."""
+        """The cells of ABOUT."""
         args = self.saved.args
-        return {
-            "checkpoint": self.label,
-            "task": self.env.task.name,
-            "learner": " ".join((self.saved.script, *(args[name] for name in ("algorithm", "policy") if name in args))),
-            "contact": " ".join((args.get("contact", "soft"), *args.get("penalty", ()))),
-            "seed": args["seed"],
-            "iteration": self.saved.iteration,
-        }
+        learner = " ".join((self.saved.script, *(args[name] for name in ("algorithm", "policy") if name in args)))
+        contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
+        values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
+        return dict(zip(ABOUT, values, strict=True))
 
 
 def checkpoint_of(path: Path) -> Path:
@@ -151,7 +158,7 @@ def machine(device: str) -> str:
 
 
 def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = None) -> F:
-    """The command line, checked; anything wrong ends the benchmark with one line."""
+    """The command line, checked; anything wrong ends the benchmark with one line, before anything is measured."""
     startup.end_in_one_line(startup.KernelCacheError)
     args = parse_command_line(kind, argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
     check_ranges(args)
@@ -162,19 +169,32 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
         check_device("cpu" if args.draw_only else args.device)
     except ValueError as error:
         fail(error)
+    if args.update_results and (found := tables.unknown(tables.origin(args.device))):
+        fail(f"--update-results needs a known machine, known versions and a committed revision, not {found}")
     torch.set_num_threads(1)  # as in training: idle threads of torch disturb the simulator's
     return args
 
 
-def measured(
-    args: F, name: str, measure: Callable[[F, TaskName], Iterable[Row]], key: Sequence[str]
-) -> list[dict[str, str]]:
-    """All rows of a csv file; those of the tasks asked for are measured, and it has each as soon as it is there."""
+class Part(NamedTuple):
+    """One table of a benchmark: what measures it, and where it goes."""
+
+    csv: str
+    measure: Callable[[Any, TaskName], Iterable[Row]]  # of the flags and a task
+    key: tuple[str, ...]  # columns in which a new row and the one that it replaces agree
+    table: str = ""  # its name in a page
+    page: str = ""
+    shown: Callable[[list[dict[str, str]]], Sequence[Row]] = list  # what the page shows of the rows
+
+
+def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
+    """All rows of a part's csv file; those of the tasks asked for are measured, and each is kept at once."""
     for env in () if args.draw_only else args.env:
-        for row in measure(args, env):
-            print("  " + ", ".join(f"{column} {tables.digits(value)}" for column, value in row.items()), flush=True)
-            args.merge(name, [row], key)
-    return sorted(args.read(name), key=lambda row: LEARNT.index(row["task"].split()[0]))
+        for row in part.measure(args, env):
+            args.keep(part.csv, row, part.key)
+    rows = sorted(args.read(part.csv), key=lambda row: LEARNT.index(row["task"].split()[0]))
+    if part.page:
+        args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
+    return rows
 
 
 Numbers = Sequence[float] | np.ndarray
@@ -187,6 +207,14 @@ class Line(NamedTuple):
     label: str = ""  # equal ones are one entry of the picture's legend
     width: float = 1.5
     notes: Sequence[str] = ()  # beside the points
+
+
+def lines(rows: Iterable[Mapping[str, str]], x: str, y: str, by: str) -> list[Line]:
+    """A line for each value of the column `by`, through its rows in their order."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        found.setdefault(row[by], []).append((float(row[x]), float(row[y])))
+    return [Line(*np.array(points).T, f"C{k}o-", label) for k, (label, points) in enumerate(found.items())]
 
 
 class Panel(NamedTuple):

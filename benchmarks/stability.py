@@ -16,7 +16,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -25,9 +25,9 @@ import motions
 import mujoco
 import numpy as np
 import torch
-from common import Line, Panel, TaskName, measured, parse, plot
+from common import Line, Panel, Part, TaskName, lines, measured, parse, plot
 from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay, simulator
-from tables import Row, markdown
+from tables import Row
 from torch import Tensor
 
 import diffsim
@@ -35,7 +35,7 @@ from diffsim import Scene, Simulator
 from diffsim.tasks import Contact
 from diffsim.training import Count
 
-Part = Literal["step", "sweeps", "horizon", "long"]
+PartName = Literal["step", "sweeps", "horizon", "long"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 HORIZONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -56,7 +56,7 @@ NEEDS_GROUND = list(SWEEPS)[:5]
 
 @dataclass
 class Args(PolicyFlags):
-    parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long")  # tables to measure
+    parts: tuple[PartName, ...] = ("step", "sweeps", "horizon", "long")  # tables to measure
     contact: Contact = "soft"  # constants of contact and limits; firm of the tasks that have such
     states: Count = 8  # start states
     steps: Count = 1_000_000  # control steps of the table "long", over all of its 64 environments
@@ -67,14 +67,20 @@ def label(args: Args, name: TaskName) -> str:
     return name if args.contact == "soft" else f"{name} {args.contact}"
 
 
+def unconstrained(scene: Scene) -> mujoco.MjModel:
+    """MuJoCo's model without its contact and limits, for energies."""
+    model = mujoco.MjModel.from_xml_path(scene.path)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    return model
+
+
 class Case(motions.Case):
     """With MuJoCo's model for the energies, and a reference so fine that it is stable."""
 
     def __init__(self, args: Args, name: TaskName) -> None:
         super().__init__(args, name, diffsim.TASKS[name].penalty(args.contact))
         self.label = label(args, name)
-        self.model = mujoco.MjModel.from_xml_path(self.scene.path)
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+        self.model = unconstrained(self.scene)
 
     @cached_property
     def reference(self) -> Simulator:
@@ -102,8 +108,13 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
             stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        row = {"task": case.label, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
-        yield row | {"largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
+        yield {
+            "task": case.label,
+            "integrator": integrator,
+            "fewest substeps": fewest or f"over {counts[-1]}",
+            "largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "",
+            "default": default,
+        }
 
 
 def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple[float, int]:
@@ -125,6 +136,17 @@ def stored(scene: Scene, model: mujoco.MjModel, qpos: Tensor) -> Array:
     beyond = np.maximum(scene.lower[links] - joints, 0) + np.maximum(joints - scene.upper[links], 0)
     ground = (np.minimum(motions.heights(model, qpos), 0) ** 2).sum(1) if scene.ncontact else 0.0
     return 0.5 * (scene.k_limit[links] * beyond**2).sum(1) + 0.5 * scene.k_n * ground
+
+
+def energies(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> tuple[Array, Array]:
+    """(N,) energy at the start, springs included, and the largest one along qpos (T, N, nq), qvel (T, N, nv).
+
+    Potential energy has no zero: its least value along the path is taken off.
+    """
+    start = mechanics(model, qpos[0], qvel[0])[1] + stored(scene, model, qpos[0])
+    path = np.array([mechanics(model, q, v)[:2] for q, v in zip(qpos, qvel, strict=True)])
+    floor = (path[:, 1] - path[:, 0]).min(0)
+    return start - floor, path[:, 1].max(0) - floor
 
 
 def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, Tensor, Tensor, Tensor]:
@@ -179,23 +201,23 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
             sim = simulator(scene, integration(integrator, case.task.substeps), case.n, horizon=8)
             if "action" in sweep:
                 energy, bad = case.kinetic(sim, actions)
-                within = energy < 2 * limit
+                bounded = energy < 2 * limit
             else:
-                q, v, bad = replay(sim, qpos, qvel, actions)
-                before = mechanics(model, qpos, qvel)[1] + stored(scene, model, qpos)
-                # Potential energy has no zero; with its least value along the path taken off, all of it is motion.
-                path = np.array([mechanics(model, a, b)[:2] for a, b in zip(q, v, strict=True)])
-                floor = (path[:, 1] - path[:, 0]).min(0)
-                within = bool((path[:, 1] - floor <= 1.1 * (before - floor) + 1e-3).all())
+                *path, bad = replay(sim, qpos, qvel, actions)
+                start, largest = energies(scene, model, *path)
+                bounded = bool((largest <= 1.1 * start + 1e-3).all())
             norm, lost = gradient_norm(sim, qpos, qvel, actions)
-            row = {
+            yield {
                 "task": case.label,
                 "integrator": integrator,
                 "sweep": sweep,
                 "value": float(value),
                 "finite": bad == 0,
+                "contained": bad,
+                "energy bounded": bounded,
+                "gradient": norm,
+                "gradients not finite": lost,
             }
-            yield row | {"contained": bad, "energy bounded": within, "gradient": norm, "gradients not finite": lost}
 
 
 def summary(rows: list[dict[str, str]]) -> list[Row]:
@@ -233,14 +255,14 @@ def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
                 bad += int(sim.nonfinite.sum())
                 total = total + task.reward(task.observe(q, v, action), action).mean() / horizon
             found = [g.flatten() for g in torch.autograd.grad(total, weights, allow_unused=True) if g is not None]
-            lost = int(sim.nonfinite_gradients.sum()) - before
-            row = {
+            yield {
                 "task": case.label,
                 "integrator": integrator,
                 "horizon": horizon,
                 "gradient": torch.cat(found).norm().item(),
+                "gradients not finite": int(sim.nonfinite_gradients.sum()) - before,
+                "contained": bad,
             }
-            yield row | {"gradients not finite": lost, "contained": bad}
 
 
 @torch.no_grad()
@@ -254,34 +276,35 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
         bad += info["nonfinite"].sum()
         fastest = torch.maximum(fastest, env.qvel.abs().max())
         returns += info["episode"]["r"][info["_episode"]].tolist()
-    row = {
+    yield {
         "task": label(args, name),
         "control steps": 64 * math.ceil(args.steps / 64),
         "contained": int(bad),
         "largest velocity": fastest.item(),
+        "episodes": len(returns),
+        "median return": float(np.median(returns)) if returns else math.nan,
     }
-    yield row | {"episodes": len(returns), "median return": float(np.median(returns)) if returns else math.nan}
 
 
 def draw(args: Args, rows: list[dict[str, str]]) -> None:
     panels = list[Panel]()
     for name in dict.fromkeys(row["task"] for row in rows):
-        lines = list[Line]()
-        for k, kind in enumerate(INTEGRATORS):
-            found = [row for row in rows if row["task"] == name and row["integrator"] == kind]
-            x, y = ([float(row[column]) for row in found] for column in ("horizon", "gradient"))
-            lines.append(Line(x, y, f"C{k}o-", kind))
-        ends = [float(row["gradient"]) for row in rows if row["task"] == name]
-        lines.append(Line((32, 32), (min(ends), max(ends)), "k--", "SHAC's window", 0.8))
-        panels.append(Panel(lines, name, "control steps", "" if panels else "|gradient of the mean reward|", log="xy"))
+        own = [row for row in rows if row["task"] == name]
+        ends = [float(row["gradient"]) for row in own]
+        window = Line((32, 32), (min(ends), max(ends)), "k--", "SHAC's window", 0.8)
+        curves = [*lines(own, "horizon", "gradient", "integrator"), window]
+        panels.append(Panel(curves, name, "control steps", "" if panels else "|gradient of the mean reward|", log="xy"))
     plot(args.picture("stability"), [panels], (3.4, 3.2))
 
 
-MEASURES: dict[Part, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, ...]]] = {
-    "step": (measure_step, ("task", "integrator")),
-    "sweeps": (measure_sweeps, ("task", "integrator", "sweep", "value")),
-    "horizon": (measure_horizon, ("task", "integrator", "horizon")),
-    "long": (measure_long, ("task",)),
+PAGE = "stability.md"
+PARTS: dict[PartName, Part] = {
+    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE),
+    "sweeps": Part(
+        "stability_sweeps", measure_sweeps, ("task", "integrator", "sweep", "value"), "sweeps", PAGE, summary
+    ),
+    "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon")),
+    "long": Part("stability_long", measure_long, ("task",), "long", PAGE),
 }
 
 
@@ -289,10 +312,8 @@ def main(args: Args) -> None:
     if args.contact == "firm":
         args.env = tuple(name for name in args.env if hasattr(diffsim.TASKS[name], "firm"))
     for part in args.parts:
-        rows = measured(args, f"stability_{part}", *MEASURES[part])
-        if part != "horizon":
-            args.publish(part, markdown(summary(rows) if part == "sweeps" else rows), "stability.md")
-        elif rows:
+        rows = measured(args, PARTS[part])
+        if part == "horizon" and rows:
             draw(args, rows)
 
 

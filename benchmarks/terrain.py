@@ -11,25 +11,24 @@ exceed that of the start, springs included, by 10 %.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-import mujoco
 import numpy as np
 import torch
-from common import CommonFlags, TaskName, Tasks, measured, parse
-from motions import INTEGRATORS, Array, idle, integration, mechanics, replay, simulator, state_errors
+from common import CommonFlags, Part, TaskName, Tasks, measured, parse
+from motions import INTEGRATORS, Array, idle, integration, replay, simulator, state_errors
 from speed import race, random_states, timer
-from stability import gradient_norm, stored
-from tables import Row, markdown
+from stability import energies, gradient_norm, unconstrained
+from tables import Row
 
 import diffsim
 from diffsim import Scene
 from diffsim.terrain import rough
 from diffsim.training import Count
 
-Part = Literal["cost", "accuracy", "extremes"]
+PartName = Literal["cost", "accuracy", "extremes"]
 SUBSTEPS = (4, 8, 16, 32)
 FINER = 512  # substeps of the reference
 SPEEDS = (1.0, 10.0)  # m/s
@@ -73,7 +72,7 @@ EXTREMES = {
 @dataclass
 class Args(CommonFlags):
     env: Tasks = ("hopper", "ant")  # tasks
-    parts: tuple[Part, ...] = ("cost", "accuracy", "extremes")  # tables to measure
+    parts: tuple[PartName, ...] = ("cost", "accuracy", "extremes")  # tables to measure
     num_envs: Count = 64  # environments
     repeats: Count = 5  # turns of all grounds in each of nine states; the fastest counts
 
@@ -126,33 +125,29 @@ def measure_accuracy(args: Args, name: TaskName) -> Iterator[Row]:
 
 def measure_extremes(args: Args, name: TaskName) -> Iterator[Row]:
     task, flat, n = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene, args.num_envs
-    model = mujoco.MjModel.from_xml_path(flat.path)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model = unconstrained(flat)
     states, rest = random_states(name, n, 3)[-1], idle(flat).expand(90, n, flat.nu)
     for ground, profile in EXTREMES.items():
         scene = flat.with_terrain(profile)
         for speed in SPEEDS:
             qpos, qvel = thrown(scene, states[0], 0.2), states[1].clone()
             qvel[:, 0] = speed
-            before = mechanics(model, qpos, qvel)[1] + stored(scene, model, qpos)
             for integrator in INTEGRATORS[:3]:
                 sim = simulator(scene, integration(integrator, task.substeps), n, horizon=8)
                 q, v, bad = replay(sim, qpos, qvel, rest)
-                path = np.array([mechanics(model, a, b)[:2] for a, b in zip(q, v, strict=True)])
-                floor = (path[:, 1] - path[:, 0]).min(0)  # potential energy has no zero
-                gained = ((path[:, 1] - floor) / (before - floor)).max(0)
+                start, largest = energies(scene, model, q, v)
                 norms, lost = zip(*(gradient_norm(sim, q[k], v[k], rest) for k in range(10, 90, 10)), strict=True)
-                row: dict[str, object] = {"task": name, "ground": ground, "speed (m/s)": speed}
-                row |= {"integrator": integrator, "contained": bad, "gained energy": int((gained > 1.1).sum())}
-                row |= {"largest energy": gained.max(), "gradient": max(norms), "gradients not finite": sum(lost)}
-                yield row
-
-
-MEASURES: dict[Part, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, ...]]] = {
-    "cost": (measure_cost, ("task", "ground")),
-    "accuracy": (measure_accuracy, ("task", "ground", "integrator")),
-    "extremes": (measure_extremes, ("task", "ground", "speed (m/s)", "integrator")),
-}
+                yield {
+                    "task": name,
+                    "ground": ground,
+                    "speed (m/s)": speed,
+                    "integrator": integrator,
+                    "contained": bad,
+                    "gained energy": int((largest > 1.1 * start).sum()),
+                    "largest energy": (largest / start).max(),
+                    "gradient": max(norms),
+                    "gradients not finite": sum(lost),
+                }
 
 
 def summary(rows: list[dict[str, str]]) -> list[Row]:
@@ -169,10 +164,20 @@ def summary(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
+PAGE = "physics.md"
+PARTS: dict[PartName, Part] = {
+    "cost": Part("terrain_cost", measure_cost, ("task", "ground"), "terrain_cost", PAGE),
+    "accuracy": Part("terrain_accuracy", measure_accuracy, ("task", "ground", "integrator"), "terrain_accuracy", PAGE),
+    "extremes": Part(
+        *("terrain_extremes", measure_extremes, ("task", "ground", "speed (m/s)", "integrator")),
+        *("terrain_extremes", PAGE, summary),
+    ),
+}
+
+
 def main(args: Args) -> None:
     for part in args.parts:
-        rows = measured(args, f"terrain_{part}", *MEASURES[part])
-        args.publish(f"terrain_{part}", markdown(summary(rows) if part == "extremes" else rows), "physics.md")
+        measured(args, PARTS[part])
 
 
 if __name__ == "__main__":
