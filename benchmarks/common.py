@@ -91,7 +91,7 @@ class CommonFlags:
         """
         print(text)
         name = name if everywhere or self.directory.name == "cpu" else f"{name}_{self.directory.name}"
-        if self.update_results and f"<!-- {name} -->" in (DOCS / page).read_text():
+        if self.update_results and page and f"<!-- {name} -->" in (DOCS / page).read_text():
             tables.fill(DOCS / page, name, text)
 
 
@@ -192,8 +192,7 @@ def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
         for row in part.measure(args, env):
             args.keep(part.csv, row, part.key)
     rows = sorted(args.read(part.csv), key=lambda row: LEARNT.index(row["task"].split()[0]))
-    if part.page:
-        args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
+    args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
     return rows
 
 
@@ -210,11 +209,12 @@ class Line(NamedTuple):
 
 
 def lines(rows: Iterable[Mapping[str, str]], x: str, y: str, by: str) -> list[Line]:
-    """A line for each value of the column `by`, through its rows in their order."""
+    """A line for each value of the column `by`, through its rows by their x."""
     found: dict[str, list[tuple[float, float]]] = {}
     for row in rows:
         found.setdefault(row[by], []).append((float(row[x]), float(row[y])))
-    return [Line(*np.array(points).T, f"C{k}o-", label) for k, (label, points) in enumerate(found.items())]
+    curves = {label: np.array(sorted(points)) for label, points in found.items()}
+    return [Line(curve[:, 0], curve[:, 1], f"C{k}o-", label) for k, (label, curve) in enumerate(curves.items())]
 
 
 class Panel(NamedTuple):

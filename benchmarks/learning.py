@@ -35,7 +35,7 @@ from diffsim.training.evaluation import ENOUGH
 
 
 class Returns(NamedTuple):
-    """Of a task. Published: Georgiev et al. 2024, "Adaptive Horizon Actor-Critic", 10 seeds, best point of the curve."""
+    """A task's returns; those published are of Georgiev et al. 2024, "Adaptive Horizon Actor-Critic", 10 seeds."""
 
     target: int  # to which learners are compared
     timed: Sequence[int] = ()  # those whose passing is timed

@@ -4,8 +4,9 @@
     python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
     python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
-    python benchmarks/speed.py --parts contact                an iteration of SHAC on soft and on firm ground
-    python benchmarks/speed.py --parts policies --env ant     an iteration of pfpn.py with each policy
+    python benchmarks/speed.py --parts training --env ant -- --contact firm    what follows "--" goes to the script
+    python benchmarks/speed.py --parts training --script pfpn -- --policy gaussian
+    python benchmarks/speed.py --parts terrain --env hopper ant                cost against the size of a terrain
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
 A machine that does something else meanwhile gives wrong numbers.
@@ -16,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
-import math
 import os
 import subprocess
 import sys
@@ -27,35 +27,35 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Literal, TypeVar, get_args
+from typing import Literal, TypeVar
 
 import mujoco
+import numpy as np
 import torch
-from common import CommonFlags, Panel, Part, TaskName, lines, measured, parse, plot
+from common import Panel, Part, TaskName, lines, measured, plot
 from motions import CONTROL_DT, shac, simulator
+from runner import ScriptFlags, parse
 from tables import ROOT, Row, read_csv
 
 import diffsim
-from diffsim import DiffEnv, Scene, Simulator
+from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
 from diffsim.sim.launcher import available_cores
-from diffsim.tasks import Contact
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
 from diffsim.training.assess import make_env
 
-sys.path.append(str(ROOT))
-import pfpn  # noqa: E402
-
 Precision = Literal["float32", "float64"]
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
-PartName = Literal["physics", "scaling", "training", "time", "contact", "policies"]
+PartName = Literal["physics", "scaling", "training", "time", "terrain"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; larger settings of the scaling table are left out
+TERRAINS = ((50, 1.0, "1 m"), (500, 1.0, "1 m"), (500, 0.01, "1 cm"))  # vertices, m between them
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
 
 @dataclass
-class Args(CommonFlags):
+class Args(ScriptFlags):
+    device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
     parts: tuple[PartName, ...] = ("physics", "training")  # tables to measure
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
     scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
@@ -63,7 +63,8 @@ class Args(CommonFlags):
     dtype: tuple[Precision, ...] = ("float32", "float64")  # precisions of the physics table
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
-    iterations: Count = 27  # SHAC iterations of the training table, after three that are not counted
+    script: str = "shac"  # of the training table, in the repository's root, without .py
+    iterations: Count = 27  # of the training table, after three that are not counted
 
 
 State = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -105,9 +106,14 @@ def timer(sim: Simulator) -> Callable[[State], Times]:
 
 
 def race(competitors: Mapping[K, Callable[[State], Times]], states: Sequence[State], repeats: int) -> dict[K, Times]:
-    """In each state all take their turn, many times, and each one's fastest counts; medians over the states."""
+    """In each state all take their turn, many times, and each one's fastest counts; medians over the states.
+
+    The first state compiles and fills caches, and does not count.
+    """
     found: dict[K, list[Times]] = {key: [] for key in competitors}
-    for state in states:
+    for call in competitors.values():
+        call(states[0])
+    for state in states[1:]:
         turns = [{key: call(state) for key, call in competitors.items()} for _ in range(repeats)]
         for key in competitors:
             found[key].append({what: min(turn[key][what] for turn in turns) for what in turns[0][key]})
@@ -147,15 +153,12 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
         for (muscles, scene), dtype, (place, count) in product(scenes.items(), args.dtype, threads.items()):
             sim = simulator(scene, default, num_envs, DTYPES[dtype], device=args.device, threads=count)
             competitors[muscles, dtype, place] = timer(sim)
-        states, per_substep = random_states(name, num_envs, args.states + 1), num_envs * default.substeps
-        race(competitors, states[:1], 1)  # compiles and fills caches
-        times = race(competitors, states[1:], args.repeats)
+        times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
+        per_substep = num_envs * default.substeps
         mj = times.pop(reference)["mj_step"] / per_substep
         for (muscles, precision, place), t in times.items():
             forward, backward = t["forward"] / per_substep, t["backward"] / per_substep
-            alone, bare = times[muscles, precision, next(iter(threads))], times.get(("none", precision, place), t)
-            share = {kind: 1 - bare[kind] / t[kind] for kind in ("forward", "backward")}
-            row: Row = {
+            yield {
                 "task": name,
                 "environments": num_envs,
                 "precision": precision,
@@ -166,9 +169,27 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
                 "backward/forward": backward / forward,
                 "mj_step, one core (us/substep)": mj,
                 "mj_step/forward": mj / forward,
-                "one thread/this": (alone["forward"] + alone["backward"]) / (t["forward"] + t["backward"]),
             }
-            yield {**row, **{f"muscles' share, {kind}": value if muscles else "" for kind, value in share.items()}}
+
+
+def level(count: int, spacing: float) -> np.ndarray:
+    """The plane z = 0 as a terrain of so many vertices."""
+    return np.stack([spacing * (np.arange(count) - count // 2), np.zeros(count)], 1)
+
+
+def measure_terrain(args: Args, name: TaskName) -> Iterator[Row]:
+    """A control step on level terrains of several sizes, on one thread."""
+    setting, num_envs = diffsim.TASKS[name].integration("default"), args.num_envs[0]
+    scenes = {"plane": (flat := diffsim.make(name, num_envs=1).scene), "2 vertices": flat.with_terrain(level(2, 1.0))}
+    for count, spacing, words in TERRAINS:
+        scenes[f"{count} vertices, {words} apart"] = flat.with_terrain(level(count, spacing))
+    sims = {ground: simulator(x, setting, num_envs, device=args.device, threads=1) for ground, x in scenes.items()}
+    competitors = {ground: timer(sim) for ground, sim in sims.items()}
+    times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
+    for ground, t in times.items():
+        per_substep = {f"{kind} (us/substep)": us / num_envs / setting.substeps for kind, us in t.items()}
+        ratio = sum(t.values()) / sum(times["plane"].values())
+        yield {"task": name, "ground": ground, **per_substep, "times the plane": ratio}
 
 
 def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: int) -> list[float]:
@@ -243,84 +264,43 @@ def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
         points = [
             {**row, unit: str(1e6 / float(row["differentiated control steps/s"]))}
             | {"curve": f"{row['task']}, {row['technique']}"}
-            for row in sorted(rows, key=lambda row: int(row[x]))
+            for row in rows
             if row[fixed] == value
         ]
         panels.append(Panel(lines(points, x, unit, "curve"), "", f"{x} ({fixed} {value})", unit, "xy"))
     plot(args.picture("speed"), [panels], (4.5, 3.6))
 
 
-def milliseconds(call: Callable[[], object], env: DiffEnv, steps: bool = True) -> float:
-    """Of a half of an iteration, captured and timed alone; whether it steps the environment."""
-    captured = graph.capture(call, env.device, env if steps else None)
-    return 1e3 * median(timed(captured, env.device, warmup=4, calls=20))
-
-
-def shac_learner(name: TaskName, *flags: str, factors: bool = False) -> tuple[shac.SHAC, DiffEnv]:
-    settings = parse_script(shac.Args, ["--env", name, *flags])
-    env = make_env(settings, settings.num_envs, settings.horizon, factors=factors)
-    return shac.SHAC(settings, env), env
-
-
 def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
-    """Table 12: the parts of one iteration of SHAC."""
-    learner, env = shac_learner(name, "--device", args.device)
-    settings = learner.args
+    """Table 12: the parts of one iteration of SHAC, each captured and timed alone."""
+    settings = parse_script(shac.Args, ["--env", name, "--device", args.device])
+    env = make_env(settings, settings.num_envs, settings.horizon)
+    learner = shac.SHAC(settings, env)
 
     def forward() -> torch.Tensor:
         noise = learner.actor.sample_noise(settings.horizon, settings.num_envs)
         rollout = shac.collect(env, learner.actor, noise)
         return shac.actor_loss(rollout.reward, learner.next_values(rollout), rollout.done, settings.gamma)
 
-    first = milliseconds(lambda: forward().detach(), env)
-    both = milliseconds(lambda: learner.actor_optimizer.step(forward()), env)
-    critic = milliseconds(learner.update_critic, env, steps=False)
-    row = {"task": name, "environments": settings.num_envs}
-    row |= {"forward, ms": first, "backward, ms": both - first, "critic, ms": critic}
+    calls: list[Callable[[], object]] = [
+        graph.capture(lambda: forward().detach(), env.device, env),
+        graph.capture(lambda: learner.actor_optimizer.step(forward()), env.device, env),
+        graph.capture(learner.update_critic, env.device),
+    ]
+    first, both, critic = (1e3 * median(timed(call, env.device, warmup=4, calls=20)) for call in calls)
+    row: Row = {"task": name, "environments": settings.num_envs, "forward, ms": first, "backward, ms": both - first}
     published = zip(("forward", "backward", "critic"), TABLE_12.get(name, ()), strict=False)
-    yield row | {f"published {part}, s (TITAN X)": value for part, value in published}
+    yield {**row, "critic, ms": critic, **{f"published {part}, s (TITAN X)": seconds for part, seconds in published}}
 
 
-def measure_contact(args: Args, name: TaskName) -> Iterator[Row]:
-    """An iteration of SHAC on soft and on firm ground."""
-    if not hasattr(diffsim.TASKS[name], "firm"):
-        return
-    times = dict[str, float]()
-    for contact in get_args(Contact):
-        learner, env = shac_learner(name, "--device", args.device, "--contact", contact, factors=contact == "firm")
-        times[contact] = milliseconds(learner.update_actor, env) + milliseconds(learner.update_critic, env, steps=False)
-    row: Row = {"task": name, "environments": env.num_envs} | {f"{c}, ms": ms for c, ms in times.items()}
-    yield {**row, "firm / soft": times["firm"] / times["soft"]}
-
-
-def measure_policies(args: Args, name: TaskName) -> Iterator[Row]:
-    """An iteration of pfpn.py with each policy, beside a Gaussian's."""
-    for algorithm, learner_class in pfpn.ALGORITHMS.items():
-        gaussian = math.nan
-        for policy in ("gaussian", "pfpn", "gmm", *(["discrete"] if algorithm == "ppo" else [])):
-            flags = ["--env", name, "--device", args.device, "--algorithm", algorithm, "--policy", policy]
-            settings = parse_script(pfpn.Args, flags)
-            gc.collect()  # the policy before
-            if args.device != "cpu":
-                torch.cuda.reset_peak_memory_stats()
-            env = make_env(settings, settings.num_envs, settings.horizon)
-            learner = learner_class(settings, env)
-            ms = milliseconds(learner.interact, env) + milliseconds(learner.learn, env, steps=False)
-            gaussian = ms if policy == "gaussian" else gaussian
-            row: Row = {"task": name, "algorithm": algorithm, "policy": policy, "environments": settings.num_envs}
-            memory = torch.cuda.max_memory_allocated() / 2**20 if args.device != "cpu" else ""
-            yield {**row, "iteration, ms": ms, "of the Gaussian's": ms / gaussian, "torch's peak memory, MiB": memory}
-
-
-def run_shac(cache: str, directory: Path, arguments: list[str]) -> tuple[float, float]:
-    """Seconds from the start of shac.py to the end of its first iteration, and its peak memory in MiB."""
-    command = [sys.executable, str(ROOT / "shac.py"), "--run-dir", str(directory), "--quiet", *arguments]
-    start, first, ended = time.perf_counter(), None, 0
+def start(command: Sequence[str], directory: Path, cache: str) -> tuple[float, float]:
+    """Seconds from a script's start to the end of its first iteration, and its peak memory in MiB."""
+    began, first, ended = time.perf_counter(), None, 0
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"WARP_CACHE_PATH": cache})
     while not ended:
         ended, status, usage = os.wait4(process.pid, os.WNOHANG)
         if first is None and read_csv(directory / "progress.csv"):
-            first = time.perf_counter() - start
+            first = time.perf_counter() - began
         time.sleep(0.01)
     process.returncode = os.waitstatus_to_exitcode(status)
     if first is None or process.returncode:
@@ -329,42 +309,41 @@ def run_shac(cache: str, directory: Path, arguments: list[str]) -> tuple[float, 
 
 
 def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
+    """Iterations of a script in a process of its own, which is never evaluated."""
     techniques = {"cpu, 1 thread": ["--threads", "1"], "cpu, all cores": ["--threads", str(available_cores())]}
     if args.device != "cpu":
         techniques = {"cuda graph": [], "cuda, eager": ["--no-cuda-graph"]}
+    words = f"{args.script}.py --env {name} --device {args.device} --quiet --iterations {args.iterations + 4}"
+    command = [sys.executable, *words.split(), "--eval-every", "0", "--save-every", "0", *args.arguments]
+    command[1] = str(ROOT / command[1])
     for technique, flags in techniques.items():
-        flags += ["--env", name, "--device", args.device, "--iterations", str(args.iterations + 4)]  # never evaluated
-        flags += ["--eval-every", "0", "--save-every", "0", "--stop-after"]
         with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as runs:
-            cold, _ = run_shac(cache, Path(runs) / "cold", [*flags, "1"])
-            warm, memory = run_shac(cache, run := Path(runs) / "warm", [*flags, str(args.iterations + 3)])
-            progress = read_csv(run / "progress.csv")[3:]
-            num_envs = json.loads((run / "args.json").read_text())["num_envs"]
-        total, critic = (1e3 * median(float(row[f"time_{n}"]) for row in progress) for n in ("total", "update_critic"))
+            run = Path(runs)
+            cold, _ = start([*command, *flags, "--stop-after", "1", "--run-dir", f"{run}/cold"], run / "cold", cache)
+            last = ["--stop-after", str(args.iterations + 3), "--run-dir", f"{run}/warm"]
+            warm, memory = start([*command, *flags, *last], run / "warm", cache)
+            progress = read_csv(run / "warm" / "progress.csv")[3:]
+            num_envs = json.loads((run / "warm" / "args.json").read_text())["num_envs"]
+        critic = [1e3 * float(row["time_update_critic"]) for row in progress if "time_update_critic" in row]
         yield {
             "task": name,
             "environments": num_envs,
             "device": technique,
-            "iteration (ms)": total,
-            "critic": critic,
+            "script": " ".join((args.script, *args.arguments)),
+            "iteration (ms)": 1e3 * median(float(row["time_total"]) for row in progress),
+            "critic": median(critic) if critic else "",
             "start to first iteration (s)": warm,
             "peak memory (MiB)": memory,
             "start with nothing compiled (s)": cold,
         }
 
 
-PAGE = "experiments.md"
 PARTS: dict[PartName, Part] = {
-    "physics": Part(
-        "speed_physics", measure_physics, ("task", "environments", "precision", "device", "muscles"), "physics", PAGE
-    ),
-    "scaling": Part(
-        "speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique"), "scaling", PAGE
-    ),
-    "training": Part("speed_training", measure_training, ("task", "environments", "device"), "training", PAGE),
-    "time": Part("time", measure_time, ("task",), "time", PAGE),
-    "contact": Part("speed_contact", measure_contact, ("task",), "contact", "transfer.md"),
-    "policies": Part("speed_policies", measure_policies, ("task", "algorithm", "policy"), "policies", "pfpn.md"),
+    "physics": Part("speed_physics", measure_physics, ("task", "environments", "precision", "device", "muscles")),
+    "scaling": Part("speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique")),
+    "training": Part("speed_training", measure_training, ("task", "environments", "device", "script")),
+    "time": Part("time", measure_time, ("task",), "time", "experiments.md"),
+    "terrain": Part("terrain_cost", measure_terrain, ("task", "ground"), "terrain_cost", "physics.md"),
 }
 
 

@@ -3,12 +3,13 @@
     python benchmarks/stability.py                         every task and integrator, a quarter of an hour
     python benchmarks/stability.py --parts long --steps 100_000
     python benchmarks/stability.py --contact firm          on firm ground, beside the rows of the soft one
+    python benchmarks/stability.py --parts terrain --env hopper ant
 
 Writes stability_*.csv, stability.png and, with --update-results, the tables of docs/stability.md, which explains them.
 All is float32, from states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below
 twice the largest kinetic energy of a reference, 64 times as fine. "sweeps" drives one thing to an extreme: without
 motors the energy must never exceed that of the start, springs included, by 10 %; under actions, the kinetic one not
-twice the reference's.
+twice the reference's. "terrain" throws robots without motors at walls and spikes, likewise.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from itertools import product
+from typing import Any, Literal
 
 import motions
 import mujoco
@@ -27,6 +29,7 @@ import numpy as np
 import torch
 from common import Line, Panel, Part, TaskName, lines, measured, parse, plot
 from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay, simulator
+from speed import random_states
 from tables import Row
 from torch import Tensor
 
@@ -35,7 +38,7 @@ from diffsim import Scene, Simulator
 from diffsim.tasks import Contact
 from diffsim.training import Count
 
-PartName = Literal["step", "sweeps", "horizon", "long"]
+PartName = Literal["step", "sweeps", "horizon", "long", "terrain"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 HORIZONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -52,6 +55,31 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "alternating action": (1,),
 }
 NEEDS_GROUND = list(SWEEPS)[:5]
+CONSTANTS = {"contact stiffness x": ("k_n", None), "contact damping x": ("k_d", None), "friction": ("mu", 1.0)}
+SWEEP_KEY = ("task", "integrator", "sweep", "value")
+TERRAIN_KEY = ("task", "ground", "speed (m/s)", "integrator")
+SPEEDS = (1.0, 10.0)  # m/s at which robots are thrown at a terrain
+
+
+def walls(height: float, width: float) -> Array:
+    """The profile of blocks and gaps between them, each as wide."""
+    x, z = np.repeat(np.arange(-20.0, 20.0, width), 2), np.array([0.0, height, height, 0.0])
+    return np.concatenate([[[-30.0, 0.0]], np.stack([x, np.resize(z, len(x))], 1), [[30.0, np.resize(z, len(x))[-1]]]])
+
+
+def spikes(height: float, width: float) -> Array:
+    x = np.arange(-20.0, 20.0, width / 2)
+    return np.stack([x, np.resize([0.0, height], len(x))], 1)
+
+
+TERRAINS = {
+    "walls of 0.1 m": walls(0.1, 1.0),
+    "walls of 0.3 m": walls(0.3, 1.0),
+    "walls of 1 m": walls(1.0, 1.0),
+    "slots, 0.3 m deep and 4 cm wide": walls(0.3, 0.04),
+    "spikes of 0.3 m, 10 cm apart": spikes(0.3, 0.1),
+    "spikes of 0.3 m, 1 cm apart": spikes(0.3, 0.01),
+}
 
 
 @dataclass
@@ -108,13 +136,8 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
             stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        yield {
-            "task": case.label,
-            "integrator": integrator,
-            "fewest substeps": fewest or f"over {counts[-1]}",
-            "largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "",
-            "default": default,
-        }
+        row: Row = {"task": case.label, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
+        yield {**row, "largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
 
 
 def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple[float, int]:
@@ -155,12 +178,10 @@ def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, 
     actions = motions.idle(scene).expand(60, case.n, scene.nu)
     height = 2 if scene.floating else 1  # in qpos; the planar robots' second slide
     lowest = torch.tensor(motions.heights(model, qpos).min(1)) if scene.ncontact else 0.0
-    if sweep == "contact stiffness x":
-        scene = dataclasses.replace(scene, k_n=value * scene.k_n)
-    elif sweep == "contact damping x":
-        scene = dataclasses.replace(scene, k_d=value * scene.k_d)
-    elif sweep == "friction":
-        scene = dataclasses.replace(scene, mu=value)
+    if sweep in CONSTANTS:
+        name, start = CONSTANTS[sweep]
+        changes: dict[str, Any] = {name: value * (getattr(scene, name) if start is None else start)}
+        scene = dataclasses.replace(scene, **changes)
     elif sweep == "last link's mass x":
         mass, inertia, model = scene.mass.copy(), scene.inertia.copy(), copy.deepcopy(model)
         mass[-1], inertia[-1] = value * mass[-1], value * inertia[-1]
@@ -207,17 +228,9 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
                 start, largest = energies(scene, model, *path)
                 bounded = bool((largest <= 1.1 * start + 1e-3).all())
             norm, lost = gradient_norm(sim, qpos, qvel, actions)
-            yield {
-                "task": case.label,
-                "integrator": integrator,
-                "sweep": sweep,
-                "value": float(value),
-                "finite": bad == 0,
-                "contained": bad,
-                "energy bounded": bounded,
-                "gradient": norm,
-                "gradients not finite": lost,
-            }
+            row: Row = {"task": case.label, "integrator": integrator, "sweep": sweep, "value": float(value)}
+            row = {**row, "finite": bad == 0, "contained": bad, "energy bounded": bounded}
+            yield {**row, "gradient": norm, "gradients not finite": lost}
 
 
 def summary(rows: list[dict[str, str]]) -> list[Row]:
@@ -255,14 +268,9 @@ def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
                 bad += int(sim.nonfinite.sum())
                 total = total + task.reward(task.observe(q, v, action), action).mean() / horizon
             found = [g.flatten() for g in torch.autograd.grad(total, weights, allow_unused=True) if g is not None]
-            yield {
-                "task": case.label,
-                "integrator": integrator,
-                "horizon": horizon,
-                "gradient": torch.cat(found).norm().item(),
-                "gradients not finite": int(sim.nonfinite_gradients.sum()) - before,
-                "contained": bad,
-            }
+            row: Row = {"task": case.label, "integrator": integrator, "horizon": horizon}
+            row = {**row, "gradient": torch.cat(found).norm().item()}
+            yield {**row, "gradients not finite": int(sim.nonfinite_gradients.sum()) - before, "contained": bad}
 
 
 @torch.no_grad()
@@ -276,14 +284,53 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
         bad += info["nonfinite"].sum()
         fastest = torch.maximum(fastest, env.qvel.abs().max())
         returns += info["episode"]["r"][info["_episode"]].tolist()
-    yield {
-        "task": label(args, name),
-        "control steps": 64 * math.ceil(args.steps / 64),
-        "contained": int(bad),
-        "largest velocity": fastest.item(),
-        "episodes": len(returns),
-        "median return": float(np.median(returns)) if returns else math.nan,
-    }
+    row: Row = {"task": label(args, name), "control steps": 64 * math.ceil(args.steps / 64), "contained": int(bad)}
+    row = {**row, "largest velocity": fastest.item(), "episodes": len(returns)}
+    yield {**row, "median return": float(np.median(returns)) if returns else math.nan}
+
+
+def thrown(scene: Scene, qpos: Tensor, room: float) -> Tensor:
+    """qpos of a level ground, spread over 10 m of the scene's, at least `room` above all of it within 0.7 m."""
+    assert scene.terrain is not None
+    profile, height, moved = scene.terrain[0], 2 if scene.floating else 1, qpos.clone()
+    moved[:, 0] = torch.linspace(-5, 5, len(qpos), dtype=qpos.dtype)
+    for row in moved:
+        near = np.linspace(float(row[0]) - 0.7, float(row[0]) + 0.7, 141)
+        row[height] += np.interp(near, *profile.T).max() + room
+    return moved
+
+
+def measure_terrain(args: Args, name: TaskName) -> Iterator[Row]:
+    task, flat, n = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene, 64
+    model, rest = unconstrained(flat), motions.idle(flat).expand(90, n, flat.nu)
+    states = random_states(name, n, 3)[-1]
+    for (ground, profile), speed in product(TERRAINS.items(), SPEEDS):
+        scene = flat.with_terrain(profile)
+        qpos, qvel = thrown(scene, states[0], 0.2), states[1].clone()
+        qvel[:, 0] = speed
+        for integrator in INTEGRATORS[:3]:
+            sim = simulator(scene, integration(integrator, task.substeps), n, horizon=8)
+            q, v, bad = replay(sim, qpos, qvel, rest)
+            start, largest = energies(scene, model, q, v)
+            norms, lost = zip(*(gradient_norm(sim, q[k], v[k], rest) for k in range(10, 90, 10)), strict=True)
+            row: Row = {"task": name, "ground": ground, "speed (m/s)": speed, "integrator": integrator}
+            row = {**row, "contained": bad, "gained energy": int((largest > 1.1 * start).sum())}
+            row = {**row, "largest energy": (largest / start).max()}
+            yield {**row, "gradient": max(norms), "gradients not finite": sum(lost)}
+
+
+def terrain_summary(rows: list[dict[str, str]]) -> list[Row]:
+    """One line for each task and ground: of each integrator how many environments failed, at the worse speed."""
+    lines = list[Row]()
+    for task, ground in dict.fromkeys((row["task"], row["ground"]) for row in rows):
+        own = [row for row in rows if (row["task"], row["ground"]) == (task, ground)]
+        line: dict[str, object] = {"task": task, "ground": ground}
+        for integrator in INTEGRATORS[:3]:
+            here = [row for row in own if row["integrator"] == integrator]
+            counts = {name: max(int(row[name]) for row in here) for name in ("contained", "gained energy")}
+            line[integrator] = ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "-"
+        lines.append(line | {"largest gradient": max(float(row["gradient"]) for row in own)})
+    return lines
 
 
 def draw(args: Args, rows: list[dict[str, str]]) -> None:
@@ -300,11 +347,12 @@ def draw(args: Args, rows: list[dict[str, str]]) -> None:
 PAGE = "stability.md"
 PARTS: dict[PartName, Part] = {
     "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE),
-    "sweeps": Part(
-        "stability_sweeps", measure_sweeps, ("task", "integrator", "sweep", "value"), "sweeps", PAGE, summary
-    ),
+    "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, summary),
     "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon")),
     "long": Part("stability_long", measure_long, ("task",), "long", PAGE),
+    "terrain": Part(
+        "terrain_extremes", measure_terrain, TERRAIN_KEY, "terrain_extremes", "physics.md", terrain_summary
+    ),
 }
 
 

@@ -45,7 +45,7 @@ def origin(device: str = "cpu") -> str:
 
 
 def revision() -> str:
-    """The commit, "-dirty" with changes of tracked files that are no results: benchmarks write those one after another."""
+    """The commit, "-dirty" with changes of tracked files. Results do not count: benchmarks write them one by one."""
 
     def git(*words: str) -> str | None:
         done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
@@ -57,7 +57,7 @@ def revision() -> str:
 
 def unknown(line: str) -> str:
     """Which part of an origin does not say where rows come from; empty if all do."""
-    parts = dict(zip(("machine", "version", "revision"), line.split("; "), strict=False))
+    parts = dict(zip(("machine", "version", "revision"), line[2:].split("; "), strict=False))
     return next((f"{name}: {text}" for name, text in parts.items() if re.search("unknown|-dirty", text)), "")
 
 
