@@ -23,7 +23,7 @@ import numpy as np
 import torch
 import transfer
 import tyro
-from common import parse
+from common import run
 from tables import Row, markdown
 from torch import Tensor
 
@@ -198,4 +198,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

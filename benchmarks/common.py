@@ -20,9 +20,9 @@ import tyro
 from tables import ROOT, Row
 
 import diffsim
-from diffsim import DiffEnv, startup
+from diffsim import DiffEnv
 from diffsim.sim.simulator import check_device
-from diffsim.training import SavedPolicy, fail, load_policy, make_policy_env, parse_command_line
+from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
 from diffsim.training.flags import check_ranges
 
@@ -45,6 +45,7 @@ class CommonFlags:
     figures: Path | None = None  # of the pictures (default: that of the csv files)
     update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
     draw_only: Annotated[bool, tyro.conf.arg(aliases=["--collect-only"])] = False  # measure nothing, read csv files
+    arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
 
     @property
     def directory(self) -> Path:
@@ -158,9 +159,11 @@ def machine(device: str) -> str:
 
 
 def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = None) -> F:
-    """The command line, checked; anything wrong ends the benchmark with one line, before anything is measured."""
-    startup.end_in_one_line(startup.KernelCacheError)
-    args = parse_command_line(kind, argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    """The command line, checked before anything is measured; what follows "--" goes to the scripts that it runs."""
+    words = [*(sys.argv[1:] if argv is None else argv), "--"]
+    end = words.index("--")
+    args = tyro.cli(kind, args=words[:end], description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    args.arguments = tuple(words[end + 1 : -1])
     check_ranges(args)
     if args.output and args.update_results:
         fail("--output and --update-results exclude each other")
@@ -173,6 +176,12 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
         fail(f"--update-results needs a known machine, known versions and a committed revision, not {found}")
     torch.set_num_threads(1)  # as in training: idle threads of torch disturb the simulator's
     return args
+
+
+@command
+def run(main: Callable[[F], None], kind: type[F], description: str | None) -> None:
+    """A benchmark from its command line; what its user got wrong ends it with one line."""
+    main(parse(kind, description))
 
 
 class Part(NamedTuple):

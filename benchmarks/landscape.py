@@ -22,9 +22,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from common import TASKS, Line, Panel, TaskName, Tasks, can_draw, plot
+from common import TASKS, Line, Panel, TaskName, Tasks, can_draw, plot, run
 from motions import Array, shac
-from runner import Case, Runner, ScriptFlags, parse
+from runner import Case, Runner, ScriptFlags
 from tables import ROOT, Row, markdown
 from torch import Tensor
 from torch.func import functional_call, vmap
@@ -275,4 +275,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

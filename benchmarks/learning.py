@@ -26,8 +26,8 @@ from typing import NamedTuple
 
 import common
 import numpy as np
-from common import LEARNT, Line, Panel, Tasks, plot
-from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, parse, passing, seed, summary
+from common import LEARNT, Line, Panel, Tasks, plot, run
+from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, passing, seed, summary
 from tables import ROOT, Row, markdown, read_csv
 
 from diffsim.training import Count, fail
@@ -246,4 +246,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

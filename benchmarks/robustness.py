@@ -29,7 +29,7 @@ import common
 import mujoco
 import numpy as np
 import torch
-from common import ABOUT, Case, Panel, lines, load_case, parse, plot
+from common import ABOUT, Case, Panel, lines, load_case, plot, run
 from tables import Row, markdown
 from torch import Tensor
 
@@ -266,4 +266,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

@@ -32,9 +32,9 @@ from typing import Literal, TypeVar
 import mujoco
 import numpy as np
 import torch
-from common import Panel, Part, TaskName, lines, measured, plot
+from common import Panel, Part, TaskName, lines, measured, plot, run
 from motions import CONTROL_DT, shac, simulator
-from runner import ScriptFlags, parse
+from runner import ScriptFlags
 from tables import ROOT, Row, read_csv
 
 import diffsim
@@ -355,4 +355,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

@@ -27,7 +27,7 @@ import motions
 import mujoco
 import numpy as np
 import torch
-from common import Line, Panel, Part, TaskName, lines, measured, parse, plot
+from common import Line, Panel, Part, TaskName, lines, measured, plot, run
 from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay, simulator
 from speed import random_states
 from tables import Row
@@ -366,4 +366,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import motions
 import numpy as np
 import torch
-from common import TASKS, Line, Panel, Part, TaskName, measured, parse, plot
+from common import TASKS, Line, Panel, Part, TaskName, measured, plot, run
 from motions import INTEGRATORS, Array, Integration, PolicyFlags, integration, replay, simulator
 from speed import DTYPES, Precision, race, timer
 from tables import Row, markdown
@@ -172,4 +172,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

@@ -30,7 +30,7 @@ import common
 import mujoco
 import numpy as np
 import torch
-from common import ABOUT, Case, load_case, parse
+from common import ABOUT, Case, load_case, run
 from numpy.typing import NDArray
 from tables import Row, markdown
 from torch import Tensor
@@ -317,4 +317,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

@@ -29,8 +29,7 @@ def states(name: str, n: int) -> tuple[diffsim.DiffEnv, transfer.Array, transfer
 def test_the_worlds_agree_where_nothing_touches() -> None:
     """In flight and within the joints' ranges both solve the same equations, with the same motors at the same times."""
     env, qpos, qvel = states("hopper", 3)
-    qpos[:, 1] += 5.0
-    qvel[:, 3:] *= 0.1
+    qpos[:, 1], qpos[:, 3:] = 5.0, torch.tensor([-0.5, -0.5, 0.0])
     here = Simulator(env.scene, 3, Integration("semi_implicit", 64), DT, dtype=torch.float64)
     ends = []
     for world in (transfer.Here(here), transfer.MuJoCo(env.scene, 3, DT)):
