@@ -6,7 +6,6 @@
     python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
     python benchmarks/speed.py --parts training --env ant -- --contact firm    what follows "--" goes to the script
     python benchmarks/speed.py --parts training --script pfpn -- --policy gaussian
-    python benchmarks/speed.py --parts terrain --env hopper ant                cost against the size of a terrain
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
 A machine that does something else meanwhile gives wrong numbers.
@@ -30,7 +29,6 @@ from statistics import median
 from typing import Literal, TypeVar
 
 import mujoco
-import numpy as np
 import torch
 from common import Panel, Part, TaskName, lines, measured, plot, run
 from motions import CONTROL_DT, shac, simulator
@@ -47,9 +45,8 @@ from diffsim.training.assess import make_env
 
 Precision = Literal["float32", "float64"]
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
-PartName = Literal["physics", "scaling", "training", "time", "terrain"]
+PartName = Literal["physics", "scaling", "training", "time"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; larger settings of the scaling table are left out
-TERRAINS = ((50, 1.0, "1 m"), (500, 1.0, "1 m"), (500, 0.01, "1 cm"))  # vertices, m between them
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
 
@@ -170,26 +167,6 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
                 "mj_step, one core (us/substep)": mj,
                 "mj_step/forward": mj / forward,
             }
-
-
-def level(count: int, spacing: float) -> np.ndarray:
-    """The plane z = 0 as a terrain of so many vertices."""
-    return np.stack([spacing * (np.arange(count) - count // 2), np.zeros(count)], 1)
-
-
-def measure_terrain(args: Args, name: TaskName) -> Iterator[Row]:
-    """A control step on level terrains of several sizes, on one thread."""
-    setting, num_envs = diffsim.TASKS[name].integration("default"), args.num_envs[0]
-    scenes = {"plane": (flat := diffsim.make(name, num_envs=1).scene), "2 vertices": flat.with_terrain(level(2, 1.0))}
-    for count, spacing, words in TERRAINS:
-        scenes[f"{count} vertices, {words} apart"] = flat.with_terrain(level(count, spacing))
-    sims = {ground: simulator(x, setting, num_envs, device=args.device, threads=1) for ground, x in scenes.items()}
-    competitors = {ground: timer(sim) for ground, sim in sims.items()}
-    times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
-    for ground, t in times.items():
-        per_substep = {f"{kind} (us/substep)": us / num_envs / setting.substeps for kind, us in t.items()}
-        ratio = sum(t.values()) / sum(times["plane"].values())
-        yield {"task": name, "ground": ground, **per_substep, "times the plane": ratio}
 
 
 def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: int) -> list[float]:
@@ -343,7 +320,6 @@ PARTS: dict[PartName, Part] = {
     "scaling": Part("speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique")),
     "training": Part("speed_training", measure_training, ("task", "environments", "device", "script")),
     "time": Part("time", measure_time, ("task",), "time", "experiments.md"),
-    "terrain": Part("terrain_cost", measure_terrain, ("task", "ground"), "terrain_cost", "physics.md"),
 }
 
 

@@ -3,13 +3,12 @@
     python benchmarks/stability.py                         every task and integrator, a quarter of an hour
     python benchmarks/stability.py --parts long --steps 100_000
     python benchmarks/stability.py --contact firm          on firm ground, beside the rows of the soft one
-    python benchmarks/stability.py --parts terrain --env hopper ant
 
 Writes stability_*.csv, stability.png and, with --update-results, the tables of docs/stability.md, which explains them.
 All is float32, from states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below
 twice the largest kinetic energy of a reference, 64 times as fine. "sweeps" drives one thing to an extreme: without
 motors the energy must never exceed that of the start, springs included, by 10 %; under actions, the kinetic one not
-twice the reference's. "terrain" throws robots without motors at walls and spikes, likewise.
+twice the reference's.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import Any, Literal
 
 import motions
@@ -29,7 +27,6 @@ import numpy as np
 import torch
 from common import Line, Panel, Part, TaskName, lines, measured, plot, run
 from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay, simulator
-from speed import random_states
 from tables import Row
 from torch import Tensor
 
@@ -38,7 +35,7 @@ from diffsim import Scene, Simulator
 from diffsim.tasks import Contact
 from diffsim.training import Count
 
-PartName = Literal["step", "sweeps", "horizon", "long", "terrain"]
+PartName = Literal["step", "sweeps", "horizon", "long"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 HORIZONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -57,29 +54,6 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 NEEDS_GROUND = list(SWEEPS)[:5]
 CONSTANTS = {"contact stiffness x": ("k_n", None), "contact damping x": ("k_d", None), "friction": ("mu", 1.0)}
 SWEEP_KEY = ("task", "integrator", "sweep", "value")
-TERRAIN_KEY = ("task", "ground", "speed (m/s)", "integrator")
-SPEEDS = (1.0, 10.0)  # m/s at which robots are thrown at a terrain
-
-
-def walls(height: float, width: float) -> Array:
-    """The profile of blocks and gaps between them, each as wide."""
-    x, z = np.repeat(np.arange(-20.0, 20.0, width), 2), np.array([0.0, height, height, 0.0])
-    return np.concatenate([[[-30.0, 0.0]], np.stack([x, np.resize(z, len(x))], 1), [[30.0, np.resize(z, len(x))[-1]]]])
-
-
-def spikes(height: float, width: float) -> Array:
-    x = np.arange(-20.0, 20.0, width / 2)
-    return np.stack([x, np.resize([0.0, height], len(x))], 1)
-
-
-TERRAINS = {
-    "walls of 0.1 m": walls(0.1, 1.0),
-    "walls of 0.3 m": walls(0.3, 1.0),
-    "walls of 1 m": walls(1.0, 1.0),
-    "slots, 0.3 m deep and 4 cm wide": walls(0.3, 0.04),
-    "spikes of 0.3 m, 10 cm apart": spikes(0.3, 0.1),
-    "spikes of 0.3 m, 1 cm apart": spikes(0.3, 0.01),
-}
 
 
 @dataclass
@@ -95,20 +69,14 @@ def label(args: Args, name: TaskName) -> str:
     return name if args.contact == "soft" else f"{name} {args.contact}"
 
 
-def unconstrained(scene: Scene) -> mujoco.MjModel:
-    """MuJoCo's model without its contact and limits, for energies."""
-    model = mujoco.MjModel.from_xml_path(scene.path)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    return model
-
-
 class Case(motions.Case):
     """With MuJoCo's model for the energies, and a reference so fine that it is stable."""
 
     def __init__(self, args: Args, name: TaskName) -> None:
         super().__init__(args, name, diffsim.TASKS[name].penalty(args.contact))
         self.label = label(args, name)
-        self.model = unconstrained(self.scene)
+        self.model = mujoco.MjModel.from_xml_path(self.scene.path)
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 
     @cached_property
     def reference(self) -> Simulator:
@@ -161,15 +129,12 @@ def stored(scene: Scene, model: mujoco.MjModel, qpos: Tensor) -> Array:
     return 0.5 * (scene.k_limit[links] * beyond**2).sum(1) + 0.5 * scene.k_n * ground
 
 
-def energies(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> tuple[Array, Array]:
-    """(N,) energy at the start, springs included, and the largest one along qpos (T, N, nq), qvel (T, N, nv).
-
-    Potential energy has no zero: its least value along the path is taken off.
-    """
+def bounded(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> bool:
+    """Whether the energy along qpos (T, N, nq), qvel (T, N, nv) stays that of the start, springs included, to 10 %."""
     start = mechanics(model, qpos[0], qvel[0])[1] + stored(scene, model, qpos[0])
     path = np.array([mechanics(model, q, v)[:2] for q, v in zip(qpos, qvel, strict=True)])
-    floor = (path[:, 1] - path[:, 0]).min(0)
-    return start - floor, path[:, 1].max(0) - floor
+    floor = (path[:, 1] - path[:, 0]).min(0)  # potential energy has no zero: its least value is taken off
+    return bool((path[:, 1] - floor <= 1.1 * (start - floor) + 1e-3).all())
 
 
 def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, Tensor, Tensor, Tensor]:
@@ -222,14 +187,13 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
             sim = simulator(scene, integration(integrator, case.task.substeps), case.n, horizon=8)
             if "action" in sweep:
                 energy, bad = case.kinetic(sim, actions)
-                bounded = energy < 2 * limit
+                within = energy < 2 * limit
             else:
                 *path, bad = replay(sim, qpos, qvel, actions)
-                start, largest = energies(scene, model, *path)
-                bounded = bool((largest <= 1.1 * start + 1e-3).all())
+                within = bounded(scene, model, *path)
             norm, lost = gradient_norm(sim, qpos, qvel, actions)
             row: Row = {"task": case.label, "integrator": integrator, "sweep": sweep, "value": float(value)}
-            row = {**row, "finite": bad == 0, "contained": bad, "energy bounded": bounded}
+            row = {**row, "finite": bad == 0, "contained": bad, "energy bounded": within}
             yield {**row, "gradient": norm, "gradients not finite": lost}
 
 
@@ -289,50 +253,6 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
     yield {**row, "median return": float(np.median(returns)) if returns else math.nan}
 
 
-def thrown(scene: Scene, qpos: Tensor, room: float) -> Tensor:
-    """qpos of a level ground, spread over 10 m of the scene's, at least `room` above all of it within 0.7 m."""
-    assert scene.terrain is not None
-    profile, height, moved = scene.terrain[0], 2 if scene.floating else 1, qpos.clone()
-    moved[:, 0] = torch.linspace(-5, 5, len(qpos), dtype=qpos.dtype)
-    for row in moved:
-        near = np.linspace(float(row[0]) - 0.7, float(row[0]) + 0.7, 141)
-        row[height] += np.interp(near, *profile.T).max() + room
-    return moved
-
-
-def measure_terrain(args: Args, name: TaskName) -> Iterator[Row]:
-    task, flat, n = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene, 64
-    model, rest = unconstrained(flat), motions.idle(flat).expand(90, n, flat.nu)
-    states = random_states(name, n, 3)[-1]
-    for (ground, profile), speed in product(TERRAINS.items(), SPEEDS):
-        scene = flat.with_terrain(profile)
-        qpos, qvel = thrown(scene, states[0], 0.2), states[1].clone()
-        qvel[:, 0] = speed
-        for integrator in INTEGRATORS[:3]:
-            sim = simulator(scene, integration(integrator, task.substeps), n, horizon=8)
-            q, v, bad = replay(sim, qpos, qvel, rest)
-            start, largest = energies(scene, model, q, v)
-            norms, lost = zip(*(gradient_norm(sim, q[k], v[k], rest) for k in range(10, 90, 10)), strict=True)
-            row: Row = {"task": name, "ground": ground, "speed (m/s)": speed, "integrator": integrator}
-            row = {**row, "contained": bad, "gained energy": int((largest > 1.1 * start).sum())}
-            row = {**row, "largest energy": (largest / start).max()}
-            yield {**row, "gradient": max(norms), "gradients not finite": sum(lost)}
-
-
-def terrain_summary(rows: list[dict[str, str]]) -> list[Row]:
-    """One line for each task and ground: of each integrator how many environments failed, at the worse speed."""
-    lines = list[Row]()
-    for task, ground in dict.fromkeys((row["task"], row["ground"]) for row in rows):
-        own = [row for row in rows if (row["task"], row["ground"]) == (task, ground)]
-        line: dict[str, object] = {"task": task, "ground": ground}
-        for integrator in INTEGRATORS[:3]:
-            here = [row for row in own if row["integrator"] == integrator]
-            counts = {name: max(int(row[name]) for row in here) for name in ("contained", "gained energy")}
-            line[integrator] = ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "-"
-        lines.append(line | {"largest gradient": max(float(row["gradient"]) for row in own)})
-    return lines
-
-
 def draw(args: Args, rows: list[dict[str, str]]) -> None:
     panels = list[Panel]()
     for name in dict.fromkeys(row["task"] for row in rows):
@@ -350,9 +270,6 @@ PARTS: dict[PartName, Part] = {
     "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, summary),
     "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon")),
     "long": Part("stability_long", measure_long, ("task",), "long", PAGE),
-    "terrain": Part(
-        "terrain_extremes", measure_terrain, TERRAIN_KEY, "terrain_extremes", "physics.md", terrain_summary
-    ),
 }
 
 
