@@ -44,18 +44,18 @@ SKIPPED = 12  # control steps at the start of an episode, which say more of the 
 @dataclass
 class Args(common.CommonFlags):
     checkpoint: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT")] = None
-    # of any script, or its run: the policy that acts in MuJoCo
+    # checkpoint of any script, or its run: the policy that acts in MuJoCo
     recording: Path | None = None  # .npz to fit to instead
     env: common.Tasks = ()  # the task of the recording
     contact: Literal["soft", "firm"] = "firm"  # the constants to begin with
-    fit: tuple[Constant, ...] = CONTACT
-    episodes: Count = 20  # of the policy in MuJoCo
+    fit: tuple[Constant, ...] = CONTACT  # constants to fit
+    episodes: Count = 20  # episodes of the policy in MuJoCo
     steps: Count = 200  # control steps of each
     noise: NonNegative = 0.2  # standard deviation of the noise on its actions
-    segments: Count = 256  # of each iteration, drawn anew
-    iterations: Count = 120
-    lr: Positive = 0.1  # of the constants' logarithms, falling to a tenth
-    substeps: Count = 16  # of the implicit integrator
+    segments: Count = 256  # segments drawn in each iteration
+    iterations: Count = 120  # steps of the optimiser
+    lr: Positive = 0.1  # step size of the constants' logarithms, which falls to a tenth
+    substeps: Count = 16  # substeps of the implicit integrator
 
 
 class Recording(NamedTuple):

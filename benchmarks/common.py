@@ -30,7 +30,7 @@ RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results
 OUTPUT = ROOT / "runs" / "benchmarks"
 TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu", "humanoid_imitation"]
 LEARNT: tuple[TaskName, ...] = get_args(TaskName)
-TASKS = LEARNT[:-1]  # of the SHAC paper
+TASKS = LEARNT[:-1]  # those of the SHAC paper
 Tasks = Annotated[tuple[TaskName, ...], tyro.conf.arg(aliases=["--env-id"])]
 F = TypeVar("F", bound="CommonFlags")
 
@@ -42,7 +42,7 @@ class CommonFlags:
     env: Tasks = TASKS  # tasks
     device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
     output: Path | None = None  # directory of csv files (default: runs/benchmarks/cpu or, by the GPU, e.g. .../h100)
-    figures: Path | None = None  # of the pictures (default: that of the csv files)
+    figures: Path | None = None  # directory of the pictures (default: that of the csv files)
     update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
     draw_only: Annotated[bool, tyro.conf.arg(aliases=["--collect-only"])] = False  # measure nothing, read csv files
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
@@ -66,10 +66,8 @@ class CommonFlags:
 
     def keep(self, name: str, row: Row, key: Sequence[str]) -> None:
         """Print a row, and merge it, as soon as it is measured."""
-        print(
-            "  " + ", ".join(f"{k} {tables.digits(v)}" for k, v in row.items() if k == "task" or k not in ABOUT),
-            flush=True,
-        )
+        shown = (f"{k} {tables.digits(v)}" for k, v in row.items() if k == "task" or k not in ABOUT)
+        print("  " + ", ".join(shown), flush=True)
         self.merge(name, [row], key)
 
     def machines(self, name: str) -> dict[str, Path]:
@@ -98,10 +96,12 @@ class CommonFlags:
 
 @dataclass
 class CheckpointFlags(CommonFlags):
-    """Of benchmarks of saved policies, which say their task."""
+    """What benchmarks of saved policies take. A policy says its task."""
 
     checkpoints: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="CHECKPOINT", help="checkpoint of any script, or its run"),
     ] = ()
     env: tyro.conf.Suppress[Tasks] = TASKS
 
@@ -188,7 +188,7 @@ class Part(NamedTuple):
     """One table of a benchmark: what measures it, and where it goes."""
 
     csv: str
-    measure: Callable[[Any, TaskName], Iterable[Row]]  # of the flags and a task
+    measure: Callable[[Any, TaskName], Iterable[Row]]  # called with the flags and a task
     key: tuple[str, ...]  # columns in which a new row and the one that it replaces agree
     table: str = ""  # its name in a page
     page: str = ""

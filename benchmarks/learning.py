@@ -39,7 +39,7 @@ class Returns(NamedTuple):
 
     target: int  # to which learners are compared
     timed: Sequence[int] = ()  # those whose passing is timed
-    published: Mapping[str, int] = {}  # of SHAC and PPO
+    published: Mapping[str, int] = {}  # by learner: SHAC's and PPO's
     record: int | None = None  # the best published of any learner (AHAC's), timed for SAPO
 
 
@@ -51,7 +51,7 @@ class Experiment(NamedTuple):
     tasks: Sequence[str]
     page: str = "experiments.md"
     table: str = ""  # its name in the page (default: the experiment's)
-    picture: str | None = None  # likewise; "": none
+    picture: str | None = None  # its file (default: the experiment's name; "": no picture)
     columns: Sequence[str] = ()  # the table is these of learning.csv instead of what the curves say
     shown: Sequence[str] = ()  # learners of that table (default: all)
 
@@ -99,7 +99,7 @@ def collect(args: Args, learner: str, env: str) -> None:
 
 
 def curves(args: Args, learner: str, env: str) -> list[Curve]:
-    """Of each seed, from the csv file; where this machine has none, from another one's, without the seconds."""
+    """The curve of each seed from this machine's csv file, else from another machine's, without the seconds."""
     seeds: dict[str, list[dict[str, str]]] = {}
     rows = args.read(name := f"{learner}_{env}")
     if not rows and args.directory.parent == common.RESULTS:
@@ -111,7 +111,7 @@ def curves(args: Args, learner: str, env: str) -> list[Curve]:
 
 
 def timed(runs: Sequence[Curve]) -> list[Curve]:
-    """Those that had the machine to themselves: of the others the csv files have no seconds."""
+    """The runs that had the machine to themselves. The csv files have no seconds of the others."""
     return [run for run in runs if not np.isnan(run["seconds"]).any()]
 
 
@@ -149,7 +149,7 @@ def table(args: Args, learners: Sequence[str], tasks: Sequence[str]) -> list[Row
 
 
 def ratios(args: Args, learners: Sequence[str], tasks: Sequence[str]) -> list[Row]:
-    """Of PFPN and the Gaussian policy, by each algorithm: the best return within control steps that all runs made."""
+    """PFPN's best return over the Gaussian policy's, by algorithm, within the control steps that all runs made."""
     rows = list[Row]()
     for env, (algorithm, names) in product(tasks, PAIRS.items()):
         both = [curves(args, name, env) for name in names if name in learners]

@@ -43,14 +43,20 @@ WALK = (2.0, 4.0)  # s before the push
 PUSH = 0.1  # s
 FORWARD, SIDEWAYS = "forward", "sideways"
 DIRECTIONS = {FORWARD: (1.0, 0.0, 0.0), SIDEWAYS: (0.0, 1.0, 0.0)}
-MULTIPLES = np.linspace(0.25, 2.0, 8)  # of the smallest push, in the curves
-FIRST = 1 / 16  # of the weight, the first push
-MOST = 2**10  # times as much is given up
-TOLERANCE = 0.02  # of the smallest push
+MULTIPLES = np.linspace(0.25, 2.0, 8)  # levels of the curves, in multiples of the smallest push
+FIRST = 1 / 16  # the first push, as a share of the weight
+MOST = 2**10  # the search ends at this multiple of the first push
+TOLERANCE = 0.02  # relative error of the smallest push
 KEY = ABOUT[:-1]
 CURVE_KEY = (*KEY, "test", "level")  # level: of a push in multiples of the smallest, of a cube in kg
-GROUP = ("task", "learner", "contact", "mass")  # of a row of the table
-EACH = ("seed", "forward N", "sideways N", "forward m/s", "sideways m/s")  # in it of each seed
+GROUP = ("task", "learner", "contact", "mass")  # columns in which the seeds of a table's row agree
+EACH = (
+    "seed",
+    "forward N",
+    "sideways N",
+    "forward m/s",
+    "sideways m/s",
+)  # columns of that row with a value for each seed
 
 
 @dataclass
@@ -58,13 +64,13 @@ class Args(common.CheckpointFlags):
     num_envs: Count = 64  # robots that begin to walk
     body: str = ""  # the pushed one, by its name in the MJCF (default: the robot's first)
     after: Positive = 3.0  # s from the beginning of the push in which a robot falls, or has survived
-    masses: tuple[Positive, ...] = (1, 2, 5, 10, 20, 50, 100)  # of the cubes, kg
-    speed: NonNegative = 0.2  # of the cubes, m/s
+    masses: tuple[Positive, ...] = (1, 2, 5, 10, 20, 50, 100)  # masses of the cubes, kg
+    speed: NonNegative = 0.2  # speed of the cubes, m/s
     restitution: NonNegative = 0.0  # 0: the cube stays with the trunk; 1: it bounces off
 
 
 class State(NamedTuple):
-    """What a policy goes on from."""
+    """The state from which a policy goes on."""
 
     qpos: Tensor  # (n, nq)
     qvel: Tensor  # (n, nv)
@@ -76,9 +82,9 @@ class Walkers:
     """Robots under their policy, which forces may push. Nothing is reset: what has fallen lies there.
 
     Args:
-        env: of the policy's task; its simulator's settings are taken over.
+        env: the policy's environment, whose simulator's settings are taken over.
         policy: observations (n, obs_dim) -> actions (n, nu).
-        body: the pushed one.
+        body: MuJoCo's number of the pushed body.
         state: where they begin.
     """
 
@@ -105,7 +111,7 @@ class Walkers:
             yield state, fallen
 
     def endure(self, seconds: float, force: Tensor, pushed: int) -> Tensor:
-        """(n,) control steps until each falls, all of them for those that do not."""
+        """(n,) control steps until each robot falls; all of them if it does not."""
         steps = torch.zeros(len(self.start.qpos), dtype=torch.long, device=self.sim.device)
         for _, fallen in self.walk(seconds, force, pushed):
             steps += ~fallen
@@ -115,7 +121,7 @@ class Walkers:
 
 
 def starts(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> State:
-    """The states of those that still walk after a time of their own within WALK."""
+    """The states of the robots that still walk after a time, drawn for each, within WALK."""
     env.reset(seed=SEED)
     no_action = torch.zeros(env.num_envs, env.scene.nu, dtype=env.dtype, device=env.device)
     walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action, env.first_step))

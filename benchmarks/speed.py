@@ -46,7 +46,7 @@ from diffsim.training.assess import make_env
 Precision = Literal["float32", "float64"]
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
 PartName = Literal["physics", "scaling", "training", "time"]
-MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; larger settings of the scaling table are left out
+MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; the scaling table leaves out larger settings
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
 
@@ -60,8 +60,8 @@ class Args(ScriptFlags):
     dtype: tuple[Precision, ...] = ("float32", "float64")  # precisions of the physics table
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
-    script: str = "shac"  # of the training table, in the repository's root, without .py
-    iterations: Count = 27  # of the training table, after three that are not counted
+    script: str = "shac"  # script of the training table, in the repository's root, without .py
+    iterations: Count = 27  # iterations of the training table, after three that are not counted
 
 
 State = tuple[torch.Tensor, torch.Tensor, torch.Tensor]

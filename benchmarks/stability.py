@@ -70,7 +70,7 @@ def label(args: Args, name: TaskName) -> str:
 
 
 class Case(motions.Case):
-    """With MuJoCo's model for the energies, and a reference so fine that it is stable."""
+    """A motion with MuJoCo's model for its energies, and a reference so fine that it is stable."""
 
     def __init__(self, args: Args, name: TaskName) -> None:
         super().__init__(args, name, diffsim.TASKS[name].penalty(args.contact))
@@ -121,7 +121,7 @@ def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -
 
 
 def stored(scene: Scene, model: mujoco.MjModel, qpos: Tensor) -> Array:
-    """At least the energy (N,) in the springs of ground and limits."""
+    """A lower bound (N,) of the energy in the springs of ground and limits."""
     links = np.flatnonzero(np.isfinite(scene.upper))
     joints = qpos[:, scene.qpos_adr[links]].numpy()
     beyond = np.maximum(scene.lower[links] - joints, 0) + np.maximum(joints - scene.upper[links], 0)

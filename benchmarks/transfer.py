@@ -24,7 +24,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
-from typing import Protocol
 
 import common
 import mujoco
@@ -56,7 +55,7 @@ mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable, wh
 class Args(common.CheckpointFlags):
     episodes: Count = 64  # start states, the same in every world
     steps: Count = 1000  # control steps at most
-    friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # of MuJoCo, in multiples of the file's mu
+    friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # friction in MuJoCo, in multiples of the file's mu
     finer: Count = FINER  # steps of "finer" in multiples of the task's substeps
     video: Path | None = None  # write the episode of median return, here and in MuJoCo side by side: .mp4 or .gif
 
@@ -64,24 +63,18 @@ class Args(common.CheckpointFlags):
 # Worlds ---------------------------------------------------------------------------------------------------------------
 
 
-class World(Protocol):
-    """N robots that take control steps."""
-
-    def step(self, qpos: Array, qvel: Array, action: Array, alive: Flags) -> tuple[Array, Array, Flags]:
-        """qpos (N, nq) and qvel (N, nv) after a control step, and which robots (N,) left the finite numbers.
-
-        Those, and all that are not alive, stay as they were.
-        """
-
-
 class Here:
-    """This simulator."""
+    """N robots in this simulator."""
 
     def __init__(self, sim: Simulator) -> None:
         self.sim = sim
 
     @torch.no_grad()
     def step(self, qpos: Array, qvel: Array, action: Array, alive: Flags) -> tuple[Array, Array, Flags]:
+        """qpos (N, nq) and qvel (N, nv) after a control step, and which robots (N,) left the finite numbers.
+
+        Those, and all that are not alive, stay as they were.
+        """
         tensors = (torch.as_tensor(x, dtype=self.sim.dtype, device=self.sim.device) for x in (qpos, qvel, action))
         new = [x.double().numpy(force=True) for x in self.sim.step(*tensors)]
         q, v = (np.where(alive[:, None], after, before) for after, before in zip(new, (qpos, qvel), strict=True))
@@ -89,13 +82,13 @@ class Here:
 
 
 class MuJoCo:
-    """MuJoCo with its own contact and limits on a scene's file.
+    """N robots in MuJoCo with its own contact and limits on a scene's file.
 
     Args:
         scene: its file is read again, whose mu is the friction of all geoms, whatever the scene's own is.
         num_envs: number of robots N.
         control_dt: s of a control step, which takes the fewest steps that are no longer than the file's.
-        friction: times that mu.
+        friction: factor on that mu.
     """
 
     def __init__(self, scene: Scene, num_envs: int, control_dt: float, friction: float = 1.0) -> None:
@@ -110,6 +103,7 @@ class MuJoCo:
         self._pool = ThreadPoolExecutor(available_cores())
 
     def step(self, qpos: Array, qvel: Array, action: Array, alive: Flags) -> tuple[Array, Array, Flags]:
+        """As in Here."""
         ctrl, qpos, qvel, lost = self._middle + self._reach * action, qpos.copy(), qvel.copy(), np.zeros_like(alive)
 
         def run(rows: Sequence[int]) -> None:
@@ -125,6 +119,9 @@ class MuJoCo:
         rows, count = np.flatnonzero(alive).tolist(), available_cores()
         list(self._pool.map(run, (rows[k::count] for k in range(count))))
         return qpos, qvel, lost
+
+
+World = Here | MuJoCo
 
 
 # Motions --------------------------------------------------------------------------------------------------------------
@@ -167,7 +164,7 @@ def act(
     """Episodes of at most so many steps in a world, from qpos (n, nq) and qvel (n, nv).
 
     Args:
-        task: of float64, on the CPU; says what is observed and rewarded, and who has fallen.
+        task: in float64, on the CPU; says what is observed and rewarded, and who has fallen.
         policy: observations (n, obs_dim) in float32 -> actions (n, nu).
     """
     n = len(qpos)
@@ -210,7 +207,7 @@ def measure(motion: Motion, scene: Scene, control_dt: float) -> dict[str, object
     }
     deepest = np.zeros(0)
     if "contact" in scene.features:
-        frames = np.arange(1, len(motion.qpos))[:, None] <= motion.lengths  # of the states after each step
+        frames = np.arange(1, len(motion.qpos))[:, None] <= motion.lengths  # the states after each step
         depth = gait.trace(scene, motion.qpos[1:][frames]).depth
         deepest = np.concatenate([depth[:, foot].max(1) for foot in feet(scene)])
     middle, most = np.percentile(1e3 * deepest[deepest > 0], (50, 95)) if (deepest > 0).any() else ("", "")
@@ -301,7 +298,7 @@ def film(path: Path, env: DiffEnv, here: Motion, there: Motion) -> None:
 def main(args: Args) -> None:
     paths = args.measured
     if args.video:
-        if len(args.checkpoints) != 1 or 1.0 not in args.friction:
+        if len(paths) != 1 or 1.0 not in args.friction:
             fail("--video shows one checkpoint, and MuJoCo at the file's friction (--friction 1)")
         try:
             render.check_video(args.video, (2 * render.VIDEO_SIZE[0], render.VIDEO_SIZE[1]))
