@@ -57,8 +57,8 @@ def revision() -> str:
 
 def unknown(line: str) -> str:
     """Which part of an origin does not say where rows come from; empty if all do."""
-    parts = dict(zip(("machine", "version", "revision"), line[2:].split("; "), strict=False))
-    return next((f"{name}: {text}" for name, text in parts.items() if re.search("unknown|-dirty", text)), "")
+    machine_versions_revision = line.removeprefix("# ").split("; ")[:3]
+    return next((part for part in machine_versions_revision if re.search("unknown|-dirty", part)), "")
 
 
 def origins(path: Path) -> list[str]:

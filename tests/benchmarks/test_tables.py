@@ -83,9 +83,9 @@ def test_results_of_unknown_origin_are_refused(
     known = "# 2 cores of a CPU; python 3.11, torch 2.13; revision 1dd159e; python speed.py --runs unknown-dirty\n"
     assert tables.unknown(known) == ""
     for old, new, found in (
-        ("a CPU", "unknown", "machine: 2 cores of unknown"),
-        ("torch 2.13", "torch unknown", "version: python 3.11, torch unknown"),
-        ("1dd159e", "1dd159e-dirty", "revision: revision 1dd159e-dirty"),
+        ("a CPU", "unknown", "2 cores of unknown"),
+        ("torch 2.13", "torch unknown", "python 3.11, torch unknown"),
+        ("1dd159e", "1dd159e-dirty", "revision 1dd159e-dirty"),
     ):
         line = known.replace(old, new)
         monkeypatch.setattr(tables, "origin", lambda _, line=line: line)
