@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import sys
 import threading
 from collections.abc import Callable
@@ -41,7 +42,7 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
     """Make a script's main end the process with one line on stderr where its user is at fault.
 
     The exit code is 2 for an expected error and 130 for Ctrl-C. Other errors keep their traceback. Only the first rank
-    prints.
+    prints. A reader of stdout that has read enough, as `head` does, ends the script silently.
     """
 
     @functools.wraps(main)
@@ -49,6 +50,8 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
         report, threading.excepthook = threading.excepthook, _report_in_thread
         try:
             main(*args, **kwargs)
+        except BrokenPipeError:
+            pass
         except KeyboardInterrupt:
             _end("interrupted", 130)
         except EXPECTED as error:
@@ -59,6 +62,10 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
             _end(error, 2)
         finally:
             threading.excepthook = report
+            try:
+                sys.stdout.flush()
+            except BrokenPipeError:  # and no complaint when Python flushes once more at its end
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     return run
 
