@@ -32,9 +32,7 @@ from diffsim.planning.restarts import best_of_random_starts, receding_horizon, s
 from diffsim.planning.system import System
 from diffsim.tasks import TASKS
 from diffsim.terrain import named_terrains, random_terrain
-from diffsim.training import distributed
-from diffsim.training.assess import evaluate_checkpoint
-from diffsim.training.errors import command, fail
+from diffsim.training import command, distributed, evaluate_checkpoint, fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
 from diffsim.training.flags import Flags, parse

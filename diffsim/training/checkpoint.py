@@ -153,6 +153,7 @@ def _check_structure(state: Mapping[str, Any]) -> None:
         return (
             is_named(x)
             and is_named(x.get("weights"), Tensor)
+            and all(weight.layout == torch.strided and weight.device.type == "cpu" for weight in x["weights"].values())
             and isinstance(x.get("layers"), list)
             and all(isinstance(layer, list) and layer and layer[0] in LAYERS for layer in x["layers"])
         )
@@ -189,7 +190,11 @@ def load_policy(path: Path) -> SavedPolicy:
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
             network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
-        network.load_state_dict(state["policy"]["weights"], assign=True)
+            kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
+        weights = state["policy"]["weights"]
+        if any(weights[name].dtype != kind for name, kind in kinds.items()):
+            raise TypeError
+        network.load_state_dict(weights, assign=True)
     except (KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"])
@@ -201,8 +206,8 @@ def export_policy(path: Path, output: Path) -> None:
     _write(output, {name: state[name] for name in ("format", "script", "args", "iteration", "policy")})
 
 
-def restore(learner: Learner, state: Mapping[str, Any]) -> None:
-    """Load the weights and statistics of a checkpoint into a learner.
+def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:
+    """Load the weights and statistics of a checkpoint into a learner, and what it holds of an environment into that.
 
     Raises:
         ValueError: they are of other sizes.
@@ -210,6 +215,8 @@ def restore(learner: Learner, state: Mapping[str, Any]) -> None:
     try:
         for name, part in parts(learner).items():
             part.load_state_dict(state["modules"][name])
+        if env is not None:
+            env[0].load_state_dict(env[1])
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         why = f"{type(error).__name__} {' '.join(str(error).split())}"
         fail(f"the checkpoint does not fit the script as it is now: {why}")

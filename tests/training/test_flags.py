@@ -24,7 +24,7 @@ import sapo
 import shac
 from diffsim.tasks import Task
 from diffsim.training import checkpoint, flags, parse, ranges
-from diffsim.training.assess import make_env
+from diffsim.training.evaluation import make_env
 
 
 @pytest.fixture(autouse=True)
