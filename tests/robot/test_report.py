@@ -12,8 +12,8 @@ import pytest
 from scenes import parse, pendulum, robot, task_scene, tendon
 
 from diffsim.__main__ import main
-from diffsim.robot.report import report
 from diffsim.robot.mjcf import load_scene
+from diffsim.robot.report import report
 from diffsim.tasks import TASKS
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
