@@ -11,9 +11,6 @@ policy search (Algorithm 1). Its dynamic programming takes exact Jacobians from 
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers, nearest_feedback
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration
@@ -36,8 +34,7 @@ from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import TASKS
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
-from diffsim.training.checkpoint import Stateful
-from diffsim.training.errors import fail
+from diffsim.training.errors import command, fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
 from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, parse
@@ -67,8 +64,6 @@ PER_TASK = {
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
-
-    FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples", "terrain")
 
     variant: Variant = "feedback"
     """the algorithm (full), after imitation of the guides' feedback (ours), or one of Figure 2's others (per task)"""
@@ -195,7 +190,6 @@ class Search:
         self.S = SampleSet(self.system, self.network, self.measure(x, u, finite.bool()))
         self.lessons: tuple[Tensor, ...] = ()  # what feedback and dagger fit
         self.student = self.network.theta  # the last of feedback's fits
-        self.modules: dict[str, Stateful] = {"policy": self.network, "samples": self.S, "search": self}
 
     def over(self, *names: str) -> System:
         """The robot over terrains: trajectory i over number i % n."""
@@ -686,11 +680,13 @@ def train(args: Args) -> None:
         run.log(search.prepare(run.message), search.control_steps)
         save_demonstration(search.system, search.guides[:: args.guides], run.directory / "plan.npz", search.grounds)
     for iteration in run:  # lines 5 to 18
-        run.log(search.iterate(iteration), search.control_steps)
+        before = search.control_steps
+        run.log(search.iterate(iteration), search.control_steps - before)
         if run.evaluation_due:
             run.log_evaluation(evaluate(search))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     evaluate_checkpoint(args, Search, evaluate) if args.evaluate else train(args)

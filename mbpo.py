@@ -12,9 +12,6 @@ around each real one.
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import copy
 import math
 from collections.abc import Sequence
@@ -26,6 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from diffsim import DiffEnv
 from diffsim.planning import Dynamics
 from diffsim.tasks import TASKS
 from diffsim.training import (
@@ -39,11 +37,11 @@ from diffsim.training import (
     Positive,
     ReplayBuffer,
     Run,
-    Stateful,
+    SomeWidths,
     Transition,
     Widths,
+    command,
     distributed,
-    episode_metrics,
     evaluate,
     evaluate_checkpoint,
     fail,
@@ -75,7 +73,7 @@ HELD_OUT_BATCH = 1024
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*ParallelFlags.FIXED, "hidden", "model_hidden", "models", "elites", *SIZES)
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "steps", "updates", "batch_size", "real_ratio", "gamma", "tau")
 
     iterations: Count = 2_000
     """learning iterations (per task)"""
@@ -115,7 +113,7 @@ class Args(ParallelFlags):
     """samples of such an update"""
     real_ratio: Fraction = 0.05
     """share of them that are real"""
-    hidden: Widths = (256, 128, 64)
+    hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
     actor_lr: Positive = 5e-4
     """learning rate of actor and critics (per task)"""
@@ -293,20 +291,6 @@ class MBPO:
         if args.sample_enhance:
             integration, threads = env.sim.integration, args.threads or None
             self.dynamics = Dynamics(env.scene, integration, env.control_dt, env.device, threads)
-        self.modules: dict[str, Stateful] = {
-            "actor": self.actor,
-            "critics": self.critics,
-            "targets": self.targets,
-            "temperature": self.temperature,
-            "models": self.models,
-            "actor_optimizer": self.actor_optimizer,
-            "critic_optimizer": self.critic_optimizer,
-            "temperature_optimizer": self.temperature_optimizer,
-            "model_optimizer": self.model_optimizer,
-            "real": self.real,
-            "unseen": self.unseen,
-            "imagined": self.imagined,
-        }
 
     # Real transitions ------------------------------------------------------------------------------------------------
 
@@ -321,7 +305,7 @@ class MBPO:
     @torch.no_grad()
     def act(self, random: bool) -> dict[str, Tensor]:
         """Control steps of all environments into the buffers."""
-        env, steps = self.env, []
+        env = self.env
         obs = env.detach()
         for _ in range(self.args.steps):
             if random:
@@ -329,7 +313,7 @@ class MBPO:
             else:
                 action, _ = self.actor(self.actor.normalizer(obs))
             state = torch.cat((env.qpos, env.qvel), 1) if self.args.sample_enhance else None
-            next_obs, reward, terminated, truncated, info = env.step(action)
+            next_obs, reward, terminated, _, info = env.step(action)
             made = Transition(obs, action, reward, info["final_obs"], terminated.to(reward.dtype))
             self.unseen.add(Transition(*(x[: self.held_out] for x in made)))
             seen = Transition(*(x[self.held_out :] for x in made))
@@ -338,13 +322,9 @@ class MBPO:
                 self.real.add(self.around(state[self.held_out :], seen))
             self.actor.normalizer.update(obs)
             self.models.target.update(self.changes(seen))
-            episode = info["episode"]
-            steps.append((terminated | truncated, info["nonfinite"], episode["r"], episode["l"]))
             obs = next_obs
-        done, nonfinite, returns, lengths = (torch.stack(tensors) for tensors in zip(*steps, strict=True))
-        found = episode_metrics(env, done, {"r": returns, "l": lengths}, nonfinite)
-        optimizers = (self.actor_optimizer, self.critic_optimizer, self.model_optimizer)
-        return found | {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
+        optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer, self.model_optimizer
+        return {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
 
     def around(self, state: Tensor, made: Transition) -> Transition:
         """SE-MBPO: transitions near real ones, observed and rewarded as the task does."""
@@ -493,6 +473,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, mbpo.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

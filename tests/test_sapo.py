@@ -235,5 +235,6 @@ def test_start_from_another_policy(tmp_path: Path, capsys: pytest.CaptureFixture
     flags = (
         f"--env ant --start-from {saved} --start-windows 2 --num-envs 4 --iterations 1 --eval-episodes 2 --device cpu"
     )
-    run(sapo, tmp_path, *flags.split())
+    saved = run(sapo, tmp_path, *flags.split())
     assert "imitated" in capsys.readouterr().out
+    assert saved["control_steps"] == (2 + 1) * 32 * 4  # windows of imitation count too
