@@ -16,10 +16,10 @@ from test_gradient import check_gradients, gradients
 import diffsim
 from diffsim.planning.system import System
 from diffsim.planning.terrains import named_terrains
-from diffsim.robot.scene import Scene
+from diffsim.robot.scene import Scene, TerrainError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.terrain import Elevation, TerrainError, incline, rough, step
+from diffsim.terrain import Elevation, incline, rough, step
 from diffsim.view import render, web
 from diffsim.view.slabs import slabs
 

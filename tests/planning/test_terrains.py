@@ -8,7 +8,8 @@ import torch
 from scenes import task_scene
 
 from diffsim.planning.terrains import named_terrains, random_terrain
-from diffsim.terrain import Elevation, TerrainError, incline, rough, step
+from diffsim.robot.scene import TerrainError
+from diffsim.terrain import Elevation, incline, rough, step
 
 
 def test_terrains_by_their_names():
