@@ -185,6 +185,8 @@ def _actuators(scene: Scene) -> list[str]:
 
 def _stability(scene: Scene) -> list[str]:
     """Springs and dampers of the joints, in the reference pose; MuJoCo takes dampers implicitly."""
+    if not scene.features & {"damping", "drag"} and scene.features & {"hinge", "ball"}:
+        return ["Nothing damps the joints: semi_implicit drifts in energy; the extrapolated integrator hardly does."]
     first = 6 if scene.floating else 0
     inverse = np.linalg.inv(mass_matrix(scene.mj_model))[first:, first:]
     laws = (scene.stiffness[1:], scene.damping[1:])
