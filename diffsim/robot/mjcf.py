@@ -181,7 +181,7 @@ class _Reader:
             "d_limit": column(np.where(limited, d_limit[dof], 0.0)),
         }
 
-    def _inertias(self) -> dict[str, Array]:
+    def _inertias(self) -> dict[str, Any]:
         """mass, com and inertia (nlink, ...) of the bodies that are welded together."""
         m = self.m
         mass, moment, inertia = np.zeros(self.nlink), np.zeros((self.nlink, 3)), np.zeros((self.nlink, 3, 3))

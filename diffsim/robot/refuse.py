@@ -63,7 +63,7 @@ def obstacles(m: mujoco.MjModel) -> list[str]:
             name = names[: error.end].rpartition(b"\0")[2] + names[error.end :].partition(b"\0")[0]
             return [f"names must be in UTF-8, and {name.decode('latin-1')!r} is not; save the file in that encoding"]
     lines: dict[tuple[str, str], dict[str, None]] = {}
-    for check in CHECKS:
+    for check in (*NUMBERS, *ELEMENTS):
         for kind, name, why in check(m):
             lines.setdefault((kind, why), {})[name] = None
     return [f"{kind} {', '.join(names)}: {why}" for (kind, why), names in lines.items()]
@@ -163,7 +163,7 @@ def _masses(m: mujoco.MjModel) -> Iterator[Obstacle]:
     matrix = mass_matrix(m)
     scale = np.sqrt(np.maximum(np.diag(matrix), 0))
     shared = np.zeros(m.nv, bool)
-    if scale.all():
+    if np.isfinite(matrix).all() and scale.all():
         values, shapes = np.linalg.eigh(matrix / np.outer(scale, scale))
         shared = (abs(shapes[:, 0]) > 0.1) & (values[0] < 1e-7)
     for body in range(m.nbody):  # MuJoCo's matrix takes the slides of a body for independent
@@ -337,10 +337,8 @@ def _contacts(m: mujoco.MjModel) -> Iterator[Obstacle]:
     plane, only_drawn = m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, "; set contype and conaffinity to 0 if only drawn"
     other = ~plane | (touching.sum() > 1)
     tilted = ~np.isclose(data.geom_xmat[:, 2::3], [0.0, 0.0, 1.0]).all(1)
-    rules = {
-        f"contact is simulated with one ground plane only{only_drawn}": touching & other,
-        "the ground plane must be horizontal": touching & ~other & tilted,
-    }
+    one_plane = f"contact is simulated with one ground plane only{only_drawn}"
+    rules = {one_plane: touching & other, "the ground plane must be horizontal": touching & ~other & tilted}
     yield from _where(m, Kind.mjOBJ_GEOM, rules)
     points = sum(POINTS.get(m.geom_type[geom], 0) for _, geom in pairs)
     if points > MOST_POINTS:
@@ -372,16 +370,5 @@ def _wrong(solref: ArrayLike) -> str:
     return "" if _finite(asked((first, second))).all() else "is beyond single precision; MuJoCo's default is 0.02 1"
 
 
-CHECKS = (
-    _not_finite,
-    _negative,
-    _masses,
-    _names,
-    _options,
-    _whole_elements,
-    _bodies,
-    _joints,
-    _tendons,
-    _actuators,
-    _contacts,
-)
+NUMBERS = _not_finite, _negative, _masses, _names
+ELEMENTS = _options, _whole_elements, _bodies, _joints, _tendons, _actuators, _contacts

@@ -264,20 +264,14 @@ class Scene:
             ValueError: a feature that cannot be left out.
         """
         n = self.nlink
+        points = "contact_link", "contact_position", "contact_radius"
+        segments = "segment_link", "segment_position", "segment_muscle"
         gone: dict[str, dict[str, Any]] = {
-            "contact": {
-                "contact_link": np.zeros(0, np.int32),
-                "contact_position": np.zeros((0, 3)),
-                "contact_radius": np.zeros(0),
-            },
+            "contact": {name: getattr(self, name)[:0] for name in points},
             "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
             "stiffness": {"stiffness": np.zeros(n)},
             "damping": {"damping": np.zeros(n)},
-            "muscle": {
-                "segment_link": np.zeros((0, 2), np.int32),
-                "segment_position": np.zeros((0, 2, 3)),
-                "segment_muscle": np.zeros(0, np.int32),
-            },
+            "muscle": {name: getattr(self, name)[:0] for name in segments},
             "drag": {"density": 0.0, "viscosity": 0.0},
         }
         changes: dict[str, Any] = {}
