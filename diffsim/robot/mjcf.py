@@ -93,6 +93,14 @@ class Sphere(NamedTuple):
     geom: int
 
 
+class Segment(NamedTuple):
+    """A straight piece of a muscle's path between two links, the lower one first; ends in their frames."""
+
+    links: tuple[int, int]
+    ends: Array
+    actuator: int
+
+
 class _Reader:
     """Walks a compiled MjModel once, body by body. The links after the base are its degrees of freedom, in order."""
 
@@ -200,67 +208,62 @@ class _Reader:
 
     def _actuators(self) -> dict[str, Any]:
         m = self.m
-        rows = [
-            self._muscle(a) if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON else self._motor(a)
-            for a in range(m.nu)
-        ]
-        segments = sorted((s for row in rows for s in row["segments"]), key=lambda s: (s[0], s[2]))
+        tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
+        low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
+        high = np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
+        link, scale, hill = np.zeros(m.nu, np.int32), np.zeros(m.nu), np.full((m.nu, 9), np.nan)
+        segments: list[Segment] = []
+        for a in range(m.nu):
+            if tendon[a]:
+                constant, pieces = self._path(m.actuator_trnid[a, 0], a)
+                segments += pieces
+                scale[a], hill[a] = self._muscle(a, constant)
+            else:
+                link[a], scale[a] = self._motor(a)
+        segments.sort(key=lambda segment: (segment.links, segment.actuator))
         return {
-            "motor_link": np.array([row["link"] for row in rows], np.int32),
-            "gear": np.array([row["scale"] * (row["high"] - row["low"]) / 2 for row in rows]),
-            "motor_bias": np.array([row["scale"] * (row["high"] + row["low"]) / 2 for row in rows]),
-            "segment_link": np.array([links for links, _, _ in segments], np.int32).reshape(-1, 2),
-            "segment_position": np.array([ends for _, ends, _ in segments]).reshape(-1, 2, 3),
-            "segment_muscle": np.array([muscle for _, _, muscle in segments], np.int32),
-            "hill": np.array([row["hill"] for row in rows]).reshape(-1, 9),
+            "motor_link": link,
+            "gear": scale * (high - low) / 2,
+            "motor_bias": scale * (high + low) / 2,
+            "segment_link": np.array([s.links for s in segments], np.int32).reshape(-1, 2),
+            "segment_position": np.array([s.ends for s in segments]).reshape(-1, 2, 3),
+            "segment_muscle": np.array([s.actuator for s in segments], np.int32),
+            "hill": hill,
             "muscle_model": text(m, "muscle_model", "linear"),
         }
 
-    def _motor(self, a: int) -> dict[str, Any]:
+    def _motor(self, a: int) -> tuple[int, float]:
+        """Link, and force per control."""
         m = self.m
         joint, axis = m.actuator_trnid[a, 0], 0
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
             axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
-        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
-        scale = m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
-        return {
-            "link": self._link(joint) + axis,
-            "scale": scale,
-            "low": low,
-            "high": high,
-            "segments": [],
-            "hill": [np.nan] * 9,
-        }
+        return self._link(joint) + axis, m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
 
-    def _muscle(self, a: int) -> dict[str, Any]:
-        m = self.m
-        strength = self._numeric("muscle_strength", 1.0)
-        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (0.0, 1.0)
-        gain = m.actuator_gainprm[a, :9]
-        scale = -strength * m.actuator_gear[a, 0] * gain[0]
-        constant, segments = self._path(m.actuator_trnid[a, 0], a)
-        hill = [np.nan] * 9
-        if not is_motor(m, a):
-            start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
-            scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
-            near, far = m.actuator_lengthrange[a]
-            fibre = (far - near) / (end - start)  # m, where the muscle is strongest
-            hill = [constant, 1 / fibre, start - near / fibre, 1 / (fibre * vmax), lmin, lmax, fpmax, fvmax, scale]
-        return {"link": 0, "scale": scale, "low": low, "high": high, "segments": segments, "hill": hill}
+    def _muscle(self, a: int, constant: float) -> tuple[float, list[float]]:
+        """Force per activation, and the numbers of the Hill-type model; constant: length of the path within links."""
+        m, strength, gain = self.m, self._numeric("muscle_strength", 1.0), self.m.actuator_gainprm[a, :9]
+        if is_motor(m, a):
+            return -strength * m.actuator_gear[a, 0] * gain[0], [np.nan] * 9
+        start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
+        scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
+        near, far = m.actuator_lengthrange[a]
+        fibre = (far - near) / (end - start)  # m, where the muscle is strongest
+        return scale, [constant, 1 / fibre, start - near / fibre, 1 / (fibre * vmax), lmin, lmax, fpmax, fvmax, scale]
 
-    def _path(self, tendon: int, actuator: int) -> tuple[float, list[tuple[tuple[int, int], Array, int]]]:
-        """Of a tendon the length within links, and the segments between two: (links, end points, actuator)."""
-        m = self.m
-        points: list[tuple[int, Array]] = []
+    def _path(self, tendon: int, actuator: int) -> tuple[float, list[Segment]]:
+        """The length of a tendon within links, and its segments between two."""
+        m, points = self.m, list[tuple[int, Array]]()
         for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
             link, rotation, position = self.body[m.site_bodyid[site]]
             points.append((link, position + rotation @ m.site_pos[site]))
-        constant, segments = 0.0, []
+        constant, segments = 0.0, list[Segment]()
         for (i, a), (j, b) in zip(points, points[1:], strict=False):
             if i == j:
                 constant += float(np.linalg.norm(b - a))
             else:
-                segments.append(((i, j) if i < j else (j, i), np.array([a, b] if i < j else [b, a]), actuator))
+                ends = [a, b] if i < j else [b, a]
+                segments.append(Segment((min(i, j), max(i, j)), np.array(ends), actuator))
         return constant, segments
 
     def _contacts(self, mass: float, slide: NDArray[np.bool_]) -> dict[str, Any]:
@@ -298,11 +301,9 @@ class _Reader:
         }
 
     def _spheres(self, geom: int) -> list[Sphere]:
-        m, kind = self.m, mujoco.mjtGeom
+        m, kind, size = self.m, mujoco.mjtGeom, self.m.geom_size[geom]
         link, rotation, position = self.body[m.geom_bodyid[geom]]
-        axes = rotation @ _matrix(m.geom_quat[geom])
-        centre = position + rotation @ m.geom_pos[geom]
-        size = m.geom_size[geom]
+        axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
         if m.geom_type[geom] == kind.mjGEOM_SPHERE:
             return [Sphere(link, centre, size[0], geom)]
         if m.geom_type[geom] == kind.mjGEOM_CAPSULE:
