@@ -110,14 +110,11 @@ def troubles(scene: Scene) -> list[str]:
 
 
 def _self_contact(scene: Scene) -> list[str]:
-    m = scene.mj_model
-    pairs = list(self_pairs(m))
+    m, pairs = scene.mj_model, list(self_pairs(scene.mj_model))
     if not pairs:
         return []
-    names, number = (
-        " and ".join(label(m, Kind.mjOBJ_GEOM, geom) for geom in (pairs[0][0], pairs[0][1][0])),
-        sum(len(b) for _, b in pairs),
-    )
+    names = " and ".join(label(m, Kind.mjOBJ_GEOM, int(geom)) for geom in (pairs[0][0], pairs[0][1][0]))
+    number = sum(len(others) for _, others in pairs)
     count = f"{number} pairs of geoms, such as" if number > 1 else "the geoms"
     return [f"The robot's parts pass through each other: {count} {names}, would collide in MuJoCo."]
 
@@ -185,15 +182,16 @@ def _actuators(scene: Scene) -> list[str]:
 
 def _stability(scene: Scene) -> list[str]:
     """Springs and dampers of the joints, in the reference pose; MuJoCo takes dampers implicitly."""
+    sentences = []
     if not scene.features & {"damping", "drag"} and scene.features & {"hinge", "ball"}:
-        return ["Nothing damps the joints: semi_implicit drifts in energy; the extrapolated integrator hardly does."]
+        sentences.append("Nothing damps the joints: semi_implicit drifts in energy; the extrapolated one hardly does.")
     first = 6 if scene.floating else 0
     inverse = np.linalg.inv(mass_matrix(scene.mj_model))[first:, first:]
     laws = (scene.stiffness[1:], scene.damping[1:])
     k, b = (abs(np.linalg.eigvals(inverse * law)).max(initial=0) for law in laws)
     if k * STEP**2 + 2 * b * STEP < 4:  # semi-implicit Euler of v' = -b v - k x
-        return []
+        return sentences
     joint = scene.mj_model.dof_jntid[first + int((np.diag(inverse) * (laws[0] * STEP + laws[1])).argmax())]
     name = label(scene.mj_model, Kind.mjOBJ_JOINT, int(joint))
     steps = int(np.ceil((b + np.sqrt(b**2 + 4 * k)) / 4 / 60))
-    return [f"Spring or damper of joint {name}: semi_implicit needs {steps} substeps of 1/60 s or more."]
+    return [*sentences, f"Spring or damper of joint {name}: semi_implicit needs {steps} substeps of 1/60 s or more."]

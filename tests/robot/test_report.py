@@ -91,9 +91,7 @@ def test_a_robot_that_meets_nothing_is_not_approximated():
 
 def test_an_undamped_robot_gets_an_integrator():
     (sentence,) = parse(pendulum(world="")).approximations
-    assert sentence == (
-        "Nothing damps the joints: semi_implicit drifts in energy; the extrapolated integrator hardly does."
-    )
+    assert "Nothing damps the joints: semi_implicit drifts in energy; the extrapolated one hardly does." == sentence
 
 
 @pytest.mark.parametrize(
