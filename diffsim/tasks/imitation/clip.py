@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
+import zlib
 from importlib.resources import files
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from diffsim.tasks.imitation.kinematics import difference
 CONTROL_DT = 1 / 60  # s
 SHORTEST, LONGEST = 6, 216_000  # frames: 0.1 s and an hour
 MOST_BYTES = 100e6  # of a file, unpacked
-FARTHEST, FASTEST = 1e4, 1e3  # m from the origin; m/s or rad/s
+UNREADABLE = OSError, ValueError, TypeError, EOFError, MemoryError, OverflowError, RuntimeError
+FARTHEST, FASTEST = 1e4, 1e3  # m from the origin; m/s or rad/s, and no joint turns by more rad
 BEYOND = math.radians(30)  # joint limits are springs, so that recorded motions pass them a little
 SEAM = 3.0  # the ends of a loop may be this many times as far apart as any two successive frames
 
@@ -129,24 +131,21 @@ def read_clip(source: str | Path) -> Clip:
         raise ValueError(f"clip {path}: a frame takes {dt:g} s; the rate must be positive and finite")
     if qpos.ndim != 2 or qpos.shape[1] < 8:
         raise ValueError(f"clip {path}: qpos is {tuple(qpos.shape)}, must be (frames, nq)")
-    far = ~(torch.cat((qpos[:, :3] / FARTHEST, qpos[:, 3:] / FASTEST), 1).abs() <= 1)
+    far = ~((qpos[:, :3].abs() <= FARTHEST).all(1) & (qpos[:, 3:].abs() <= FASTEST).all(1))
     if bool(far.any()):
-        most = f"at most {FARTHEST:g} m from the origin"
-        raise ValueError(
-            f"clip {path}: qpos is not finite or too large in frame {int(far.any(1).nonzero()[0])}; {most}"
+        why = (
+            f"qpos is not finite or too large in frame {int(far.nonzero()[0])}; at most {FARTHEST:g} m from the origin"
         )
+        raise ValueError(f"clip {path}: {why}")
     norm = qpos[:, 3:7].norm(dim=1, keepdim=True)
     if bool((norm < 0.5).any()):
         raise ValueError(f"clip {path}: columns 3 to 6 of qpos must be the root's quaternion wxyz, and one is near 0")
-    frames = (len(qpos) - 1) * dt / CONTROL_DT + 1
-    if not SHORTEST - 0.5 <= frames <= LONGEST:
-        lengths = f"must be {SHORTEST} to {LONGEST}"
-        raise ValueError(
-            f"clip {path} is too {'long' if frames > LONGEST else 'short'}: {frames:.0f} frames at 60 Hz, {lengths}"
-        )
-    clip = Clip(
-        path.stem, _resample(torch.cat((qpos[:, :3], qpos[:, 3:7] / norm, qpos[:, 7:]), 1), round(frames)), bool(loop)
-    )
+    frames = (len(qpos) - 1) * dt / CONTROL_DT
+    if not SHORTEST - 1.5 <= frames <= LONGEST:
+        why = f"too {'long' if frames > LONGEST else 'short'}: {frames + 1:.0f} frames at 60 Hz, must be"
+        raise ValueError(f"clip {path} is {why} {SHORTEST} to {LONGEST}")
+    qpos[:, 3:7] /= norm
+    clip = Clip(path.stem, _resample(qpos, round(frames) + 1), bool(loop))
     if (speed := float(clip.velocity().abs().max())) > FASTEST:
         raise ValueError(f"clip {path} moves at up to {speed:.2g} m/s or rad/s, must be at most {FASTEST:g}")
     gap, step = (tangent(a, b)[..., 2:].abs().max() for a, b in (clip.qpos[[0, -1]], (clip.qpos[:-1], clip.qpos[1:])))
@@ -166,7 +165,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
                 raise MemoryError
         with np.load(path, allow_pickle=False) as arrays:
             return {key: arrays[key] for key in ("qpos", "fps", "dt", "loop") if key in arrays}
-    except (OSError, ValueError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+    except (*UNREADABLE, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"clip {path} is no .npz file of numbers, or one beyond {MOST_BYTES / 1e6:g} MB") from error
 
 
