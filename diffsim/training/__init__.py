@@ -12,8 +12,7 @@ from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, command, fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
-from diffsim.training.likeliest import Likeliest
-from diffsim.training.normalizer import ObsNormalizer, moments
+from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import (
     Count,
