@@ -30,8 +30,8 @@ from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.lbfgs import maximise
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
+from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import TASKS
-from diffsim.terrain import named_terrains, random_terrain
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.errors import command, fail
