@@ -51,7 +51,8 @@ def simulator(
     division: Division | None = None,
     control_dt: float = CONTROL_DT,
 ) -> Simulator:
-    return Simulator(scene, num_envs, setting, control_dt, horizon, device, dtype, threads, division)
+    how = dict(device=device, dtype=dtype, threads=threads, division=division)
+    return Simulator(scene, num_envs, setting, control_dt, horizon, **how)
 
 
 @dataclass
