@@ -213,7 +213,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args = _continue(kind, argv, args, path)
     else:
         args.device = distributed.choose_device(args.device)
-        defaults = dataclasses.replace(kind(), **_presets(args), **args.task_defaults())
+        defaults = dataclasses.replace(kind(), **(_presets(args) | args.task_defaults()))
         if issubclass(task := TASKS[args.env], HumanoidImitation):
             defaults.clip = read_clip(task.default_clip)
         args = _cli(kind, argv, defaults)

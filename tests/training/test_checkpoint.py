@@ -82,7 +82,7 @@ NAN, NO_POLICY = float("nan"), {"layers": [["Linear", 2, 1]], "weights": {}}
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("script", [None, 3, "../shac", "shac\x1b[31m"]),
+        ("script", [None, 3, "shac\x1b[31m"]),
         ("args", [None, [], {"gamma": 1.0}, {1: 2, "env": "ant"}]),
         ("iteration", [None, -1, 1.5, NAN, True, 2**70]),
         ("control_steps", [None, -1, "5"]),

@@ -172,7 +172,8 @@ def test_defaults_are_the_tables(script: ModuleType) -> None:
         expected = dict(zip(script.COLUMNS, script.PER_TASK[env], strict=True)) if env in script.PER_TASK else {}
         if hasattr(script, "CPU"):
             expected |= {name: min(expected.get(name, most), most) for name, most in script.CPU.items()}
-        preset = diffsim.TASKS[env].integration("default")
+            expected |= getattr(script, "ON_CPU", {}).get(env, {})
+        preset = getattr(script, "INTEGRATION", {}).get(env) or diffsim.TASKS[env].integration("default")
         expected |= dict(integrator=preset.integrator, substeps=preset.substeps, theta=preset.theta)
         assert {name: getattr(args, name) for name in expected} == expected
         assert re.fullmatch(rf"runs/{env}__{script.__name__}__1__\d+", str(args.run_dir))
