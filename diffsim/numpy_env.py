@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -12,7 +13,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.env import DiffEnv, check_seed
+from diffsim.env import DiffEnv
 from diffsim.view.screen import Frames
 
 Array = NDArray[np.floating[Any]]
@@ -39,7 +40,7 @@ class NumpyEnv(gymnasium.Env[Array, Array]):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
         """Start an episode; returns obs (obs_dim,) and an empty info."""
-        super().reset(seed=None if seed is None else check_seed(seed))
+        super().reset(seed=None if seed is None else _check_seed(seed))
         return _begin(self.env, np.zeros(1, np.int64), [self.np_random])[0], {}
 
     @torch.no_grad()
@@ -109,11 +110,13 @@ class NumpyVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         """
         rows = self.env.masked(options).numpy(force=True)
         if seed is not None:
-            single = np.ndim(seed) == 0
-            seeds = [check_seed(seed) + i for i in range(self.num_envs)] if single else list(seed)
+            if isinstance(seed, Sequence | np.ndarray):
+                seeds = list(seed)
+            else:
+                seeds = [_check_seed(seed) + i for i in range(self.num_envs)]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments; give one each, or one integer")
-            self._seed(rows, [None if each is None else check_seed(each) for each in seeds])
+            self._seed(rows, [None if each is None else _check_seed(each) for each in seeds])
         self._ended[rows] = False
         return self._begin(rows), {}
 
@@ -165,6 +168,13 @@ class NumpyVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
 
     def _begin(self, rows: NDArray[np.int64]) -> Array:
         return _begin(self.env, rows, [self._generators[i] for i in rows])
+
+
+def _check_seed(seed: object) -> int:
+    """The seed as an int, be it NumPy's; gymnasium takes True and 1.0, too."""
+    if not isinstance(seed, Integral) or isinstance(seed, bool):
+        raise ValueError(f"seed is {seed!r}, must be an integer")
+    return int(seed)
 
 
 def _begin(env: DiffEnv, rows: NDArray[np.int64], generators: Sequence[np.random.Generator]) -> Array:

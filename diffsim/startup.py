@@ -30,7 +30,10 @@ class KernelCacheError(ValueError):
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo even where MUJOCO_GL names an OpenGL that is not there: only drawing needs it, and says so."""
+    """Import MuJoCo even where MUJOCO_GL names an OpenGL that is not there: only drawing needs it, and says so.
+
+    Its warnings go to stderr, unless the host already has another place for them.
+    """
     try:
         importlib.import_module("mujoco")
     except Exception:  # AttributeError among them
@@ -42,6 +45,9 @@ def import_mujoco() -> None:
             importlib.import_module("mujoco")
         finally:
             os.environ["MUJOCO_GL"] = wanted
+    mujoco = sys.modules["mujoco"]
+    if mujoco.get_mju_user_warning() is None:  # MuJoCo would write MUJOCO_LOG.TXT into the user's folder
+        mujoco.set_mju_user_warning(lambda text: print(f"MuJoCo: {text}", file=sys.stderr))
 
 
 def start_warp() -> None:

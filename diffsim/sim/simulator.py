@@ -63,7 +63,8 @@ class Simulator:
             raise ValueError(f"terrain has {len(scene.terrain)} profiles, must have 1 or one for each of {num_envs}")
         self.options = Options(integration, **options).check()
         self.scene, self.num_envs, self.control_dt, self.horizon = scene, num_envs, control_dt, horizon
-        self.integration, self.device, self.dtype = self.options.integration, self.options.device, self.options.dtype
+        self.integration, self.dtype = self.options.integration, self.options.dtype
+        self.device = torch.device(self.options.device)
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
         width, bodies = len(FACTORS) if self.options.factors else 0, scene.nbody if self.options.forces else 0
         numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width + 6 * bodies)
