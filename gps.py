@@ -37,8 +37,9 @@ from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.errors import command, fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels
-from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, parse
-from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.flags import Flags, parse
+from diffsim.training.layers import ObsNormalizer
+from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive
 from diffsim.training.run import Run
 
 Variant = Literal[

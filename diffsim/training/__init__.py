@@ -11,29 +11,23 @@ from diffsim.training.checkpoint import Learner, SavedPolicy, export_policy, loa
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, command, fail
 from diffsim.training.evaluation import Evaluation, evaluate
-from diffsim.training.flags import (
+from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
+from diffsim.training.layers import Likeliest, ObsNormalizer, moments
+from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.ranges import (
     Count,
     Decay,
     Finite,
-    Flags,
     Fraction,
     Natural,
     NonNegative,
-    ParallelFlags,
     Positive,
     Repeats,
     SomeWidths,
-    Width,
     Widths,
-    parse,
-    parse_penalty,
 )
-from diffsim.training.likeliest import Likeliest
-from diffsim.training.normalizer import ObsNormalizer, moments
-from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run
-from diffsim.view.gait import Gait, describe
 
 __all__ = [
     "ClippedAdam",
@@ -45,7 +39,6 @@ __all__ = [
     "Finite",
     "Flags",
     "Fraction",
-    "Gait",
     "Learner",
     "Likeliest",
     "Natural",
@@ -60,10 +53,8 @@ __all__ = [
     "SomeWidths",
     "Transition",
     "UsageError",
-    "Width",
     "Widths",
     "command",
-    "describe",
     "distributed",
     "evaluate",
     "evaluate_checkpoint",
