@@ -30,8 +30,8 @@ from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.lbfgs import maximise
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
+from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import TASKS
-from diffsim.terrain import named_terrains, random_terrain
 from diffsim.training import command, distributed, evaluate_checkpoint, fail
 from diffsim.training.evaluation import SEED as EVALUATION_SEED
 from diffsim.training.evaluation import Evaluation, travels

@@ -21,7 +21,7 @@ import diffsim
 import gps
 from diffsim.planning import LinearGaussian, save_demonstration
 from diffsim.planning.lbfgs import maximise
-from diffsim.terrain import named_terrains
+from diffsim.planning.terrains import named_terrains
 from diffsim.training import evaluate, load_policy
 from diffsim.training.checkpoint import load, restore
 from diffsim.view import render

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
-from diffsim.sim.simulator import Simulator, check_device
+from diffsim.sim.options import check_device
+from diffsim.sim.simulator import Simulator
 
 REAL = torch.float64  # a dynamic program multiplies hundreds of Jacobians
 BATCH = 8192  # environments of one backward pass: bounds the memory of its checkpoints

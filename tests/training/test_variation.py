@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from learners import ROOT, assert_same, refusal, run
+from learners import assert_same, refusal, run
 from scenes import ROBOTS
 
 import diffsim
@@ -149,13 +149,3 @@ def test_learners_without_gradient_vary_too(tmp_path: Path, monkeypatch: pytest.
     assert len(seen) == 2 and not torch.equal(*seen)
     mass = FACTORS.index("mass")
     assert all((factors[:, mass] != 1).all() and (factors[:, :mass] == 1).all() for factors in seen)
-
-
-def test_the_page_has_the_constants_of_the_tasks() -> None:
-    text = (ROOT / "docs" / "transfer.md").read_text()
-    for name in FIRM:
-        *constants, integration = TASKS[name].firm
-        (row,) = (line for line in text.splitlines() if line.strip().startswith(f"| {name} |") and "substeps" in line)
-        cells = [cell.strip() for cell in row.strip(" |").split("|")]
-        assert list(map(float, cells[1:6])) == constants
-        assert cells[6] == f"{integration.integrator}, {integration.substeps} substeps"
