@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 import sys
 import threading
 from collections.abc import Callable
@@ -55,10 +56,12 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
             _end("interrupted", 130)
         except EXPECTED as error:
             _end(error, 2)
-        except RuntimeError as error:
-            if "can't allocate memory" not in str(error):  # torch's words on a CPU
+        except (RuntimeError, MemoryError) as error:
+            wanted = re.search(r"can't allocate memory.* (\d+) bytes", str(error))  # torch's words on a CPU
+            if wanted is None and not isinstance(error, MemoryError):
                 raise
-            _end(error, 2)
+            size = f"for {float(wanted[1]) / 1e9:,.1f} GB more" if wanted else ""
+            _end(f"not enough memory {size}: choose smaller sizes", 2)
         finally:
             threading.excepthook = report
             try:

@@ -64,13 +64,13 @@ def fits(hint: Any, value: Any) -> bool:
     if origin is Annotated:
         return fits(kinds[0], value)
     if origin is Literal:
-        return type(value) is str and value in kinds
+        return any(type(value) is type(kind) and value == kind for kind in kinds)
     if origin in (Union, UnionType):
         return any(fits(kind, value) for kind in kinds)
     if origin is tuple:
         kinds = kinds[:1] * len(value) if isinstance(value, tuple) and kinds[-1] is Ellipsis else kinds
         return isinstance(value, tuple) and len(value) == len(kinds) and all(map(fits, kinds, value))
-    return type(value) in (int, float) if hint is float else type(value) is hint
+    return type(value) is hint
 
 
 def _ranges(hint: Any, value: Any) -> list[tuple[Any, Range]]:
