@@ -60,8 +60,8 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
             wanted = re.search(r"can't allocate memory.* (\d+) bytes", str(error))  # torch's words on a CPU
             if wanted is None and not isinstance(error, MemoryError):
                 raise
-            size = f"for {float(wanted[1]) / 1e9:,.1f} GB more" if wanted else ""
-            _end(f"not enough memory {size}: choose smaller sizes", 2)
+            size = f" for {float(wanted[1]) / 1e9:,.1f} GB more" if wanted else ""
+            _end(f"not enough memory{size}: choose smaller sizes", 2)
         finally:
             threading.excepthook = report
             try:

@@ -119,10 +119,10 @@ def test_contact_decides_constants_and_integration() -> None:
 
 
 def test_firm_runs_resume_bitwise_and_are_evaluated_on_firm_ground(tmp_path: Path) -> None:
-    flags = "--env hopper --contact firm --num-envs 4 --horizon 8 --iterations 6 --redraw 2 --eval-episodes 2 --quiet"
+    flags = "--env hopper --contact firm --num-envs 4 --horizon 8 --iterations 4 --redraw 1 --eval-episodes 2 --quiet"
     flags += " --device cpu --critic-iterations 2 --threads 1"
     whole = run(shac, tmp_path / "whole", *flags.split())
-    run(shac, tmp_path / "part", *flags.split(), "--stop-after", 3)
+    run(shac, tmp_path / "part", *flags.split(), "--stop-after", 2)
     part = run(shac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
     assert_same(part["modules"], whole["modules"])
     assert whole["args"]["randomise"] == RANDOMISED and whole["args"]["integrator"] == "implicit"
