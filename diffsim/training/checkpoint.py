@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from diffsim.env import DiffEnv
 from diffsim.training.errors import fail
 from diffsim.training.layers import Likeliest, ObsNormalizer
+from diffsim.training.ranges import fits
 
 FORMAT = 2
 
@@ -135,49 +136,53 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
 
 def _check_structure(state: Mapping[str, Any]) -> None:
     """Raise a ValueError unless all that a checkpoint of this format holds is there, and of the right type."""
-
-    def check(name: str, holds: Callable[[Any], bool], words: str) -> None:
-        if name not in state or not holds(state[name]):
-            raise ValueError(f"{name} is missing" if name not in state else f"{name} is not {words}")
-
-    def is_count(x: Any) -> bool:
-        return type(x) is int and 0 <= x < 2**62
-
-    def is_number(x: Any) -> bool:
-        return type(x) in (int, float) and math.isfinite(x)
-
-    def is_named(x: Any, kind: type = object) -> bool:
-        return isinstance(x, dict) and all(isinstance(k, str) and isinstance(v, kind) for k, v in x.items())
-
-    def is_policy(x: Any) -> bool:
-        return (
-            is_named(x)
-            and is_named(x.get("weights"), Tensor)
-            and all(weight.layout == torch.strided and weight.device.type == "cpu" for weight in x["weights"].values())
-            and isinstance(x.get("layers"), list)
-            and all(isinstance(layer, list) and layer and layer[0] in LAYERS for layer in x["layers"])
-        )
-
-    def is_rank(x: Any) -> bool:
-        rng = x.get("rng") if is_named(x) else None
-        return isinstance(rng, Tensor) and rng.dtype == torch.uint8 and (x.get("env") is None or is_named(x["env"]))
-
-    check("script", lambda x: isinstance(x, str) and x.isprintable(), "the name of a script")
-    check("args", lambda x: is_named(x) and isinstance(x.get("env"), str), "the arguments of a run")
-    check("iteration", is_count, "a count")
-    check("policy", is_policy, "a policy")
-    if "modules" not in state:  # an exported policy
-        return
-    check("modules", is_named, "the state of a learner")
-    check("control_steps", is_count, "a count")
-    check("seconds", lambda x: is_number(x) and x >= 0, "a time")
-    check("totals", lambda x: is_named(x, int), "counts by name")
-    check("episodes", lambda x: _is_list(x, lambda row: len(row) == 3 and all(map(is_number, row))), "sums of windows")
-    check("ranks", lambda x: bool(x) and _is_list(x, is_rank), "the states of the ranks")
+    for name, kind in (HELD if "modules" in state else POLICY).items():
+        if name not in state:
+            raise ValueError(f"{name} is missing")
+        if not fits(kind, state[name]) or not HOLDS[name](state[name]):
+            raise ValueError(f"{name} is not what a checkpoint holds")
 
 
-def _is_list(values: Any, holds: Callable[[Any], bool]) -> bool:
-    return isinstance(values, list) and all(holds(value) for value in values)
+def _is_count(number: int) -> bool:
+    return 0 <= number < 2**62
+
+
+def _is_policy(policy: dict[str, Any]) -> bool:
+    layers, weights = policy.get("layers"), policy.get("weights")
+    return (
+        fits(dict[str, Tensor], weights)
+        and fits(list[list[Any]], layers)
+        and all(layer and layer[0] in LAYERS for layer in layers)
+        and all(weight.layout == torch.strided and weight.device.type == "cpu" for weight in weights.values())
+    )
+
+
+def _is_rank(rank: dict[str, Any]) -> bool:
+    return fits(Tensor, rank.get("rng")) and rank["rng"].dtype == torch.uint8 and "env" in rank
+
+
+# What a checkpoint holds, of which type, and what more must be true of it. An exported policy holds less.
+POLICY: dict[str, Any] = {"script": str, "args": dict[str, Any], "iteration": int, "policy": dict[str, Any]}
+HELD: dict[str, Any] = POLICY | {
+    "modules": dict[str, Any],
+    "control_steps": int,
+    "seconds": float,
+    "totals": dict[str, int],
+    "episodes": list[tuple[float, float, float]],
+    "ranks": list[dict[str, Any]],
+}
+HOLDS: dict[str, Callable[[Any], bool]] = {
+    "script": str.isprintable,
+    "args": lambda args: isinstance(args.get("env"), str),
+    "iteration": _is_count,
+    "policy": _is_policy,
+    "modules": lambda _: True,
+    "control_steps": _is_count,
+    "seconds": lambda seconds: 0 <= seconds < math.inf,
+    "totals": lambda _: True,
+    "episodes": lambda rows: all(math.isfinite(number) for row in rows for number in row),
+    "ranks": lambda ranks: bool(ranks) and all(map(_is_rank, ranks)),
+}
 
 
 def load_policy(path: Path) -> SavedPolicy:

@@ -70,7 +70,11 @@ def fits(hint: Any, value: Any) -> bool:
     if origin is tuple:
         kinds = kinds[:1] * len(value) if isinstance(value, tuple) and kinds[-1] is Ellipsis else kinds
         return isinstance(value, tuple) and len(value) == len(kinds) and all(map(fits, kinds, value))
-    return type(value) is hint
+    if origin is list:
+        return isinstance(value, list) and all(fits(kinds[0], x) for x in value)
+    if origin is dict:
+        return isinstance(value, dict) and all(fits(kinds[0], k) and fits(kinds[1], x) for k, x in value.items())
+    return hint is Any or type(value) is hint
 
 
 def _ranges(hint: Any, value: Any) -> list[tuple[Any, Range]]:
