@@ -10,9 +10,6 @@ what comes after the window. Windows as long as an episode (--horizon 1000) make
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,
@@ -31,9 +29,8 @@ from diffsim.training import (
     ParallelFlags,
     Positive,
     Run,
-    Stateful,
     Widths,
-    episode_metrics,
+    command,
     evaluate,
     evaluate_checkpoint,
     parse,
@@ -58,7 +55,7 @@ PER_TASK = {
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*ParallelFlags.FIXED, "hidden", "deterministic_policy", "normalize_obs")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "final_lr")
 
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""
@@ -137,9 +134,6 @@ class Rollout(NamedTuple):
     obs: Tensor  # s_t, on which the policy acted
     reward: Tensor
     done: Tensor  # terminated or truncated
-    nonfinite: Tensor
-    episode_return: Tensor  # of the episode so far, as is the length
-    episode_length: Tensor
 
 
 class BPTT:
@@ -155,7 +149,6 @@ class BPTT:
         self.policy = self.actor.deterministic()
         # However large a gradient is, it is clipped and followed: chaos is what the comparison is about.
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas, skip_norm=math.inf)
-        self.modules: dict[str, Stateful] = {"actor": self.actor, "optimizer": self.optimizer}
 
     def set_learning_rate(self, iteration: int) -> None:
         args = self.args
@@ -169,9 +162,7 @@ class BPTT:
         norm = self.optimizer.step(loss)
         if args.normalize_obs:
             self.actor.normalizer.update(rollout.obs.detach())
-        episode = {"r": rollout.episode_return, "l": rollout.episode_length}
-        metrics = episode_metrics(self.env, rollout.done, episode, rollout.nonfinite)
-        return {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped} | metrics
+        return {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped}
 
 
 def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
@@ -179,9 +170,8 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
     steps = []
     obs = env.detach()
     for step_noise in noise.unbind():
-        next_obs, reward, terminated, truncated, info = env.step(actor(obs, step_noise))
-        episode = info["episode"]["r"], info["episode"]["l"]
-        steps.append((obs, reward, terminated | truncated, info["nonfinite"], *episode))
+        next_obs, reward, terminated, truncated, _ = env.step(actor(obs, step_noise))
+        steps.append((obs, reward, terminated | truncated))
         obs = next_obs
     return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
 
@@ -210,6 +200,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, bptt.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -35,16 +35,13 @@ from diffsim.tasks import TASKS
 from diffsim.terrain import named_terrains, random_terrain
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
-from diffsim.training.checkpoint import Stateful
-from diffsim.training.errors import fail
+from diffsim.training.errors import command, fail
 from diffsim.training.evaluation import SEED, Evaluation, travels
-from diffsim.training.flags import Finite, Flags, Natural, NonNegative, Positive, Range, parse
+from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, Repeats, parse
 from diffsim.training.normalizer import ObsNormalizer
 from diffsim.training.run import Run
 
 LESSONS, REACH, BLEND = 20_000, 0.5, 0.1  # feedback: states of a fit; how far a guide teaches; over which guides mix
-Size = Annotated[int, Range("between 1 and 10,000", lambda value: 1 <= value <= 10_000)]  # of tensors
-Passes = Annotated[int, Range("between 1 and 1,000,000", lambda value: 1 <= value <= 1_000_000)]  # of a loop
 # fmt: off
 COLUMNS = ("variant", "horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight",
            "attitude_weight", "window", "tracking", "spread", "hidden", "noise", "perturb")
@@ -64,13 +61,13 @@ PER_TASK = {
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*Flags.FIXED, "variant", "horizon", "hidden", "guides", "reward", "samples", "terrain")
+    MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "imitation", "lbfgs_iterations", "perturb", "practice")
 
     variant: Literal["full", "feedback"] = "feedback"
     """full: the paper's algorithm; feedback: its first iterations imitate the guides' feedback (ours; per task)"""
-    iterations: Passes = 80
+    iterations: Count = 80
     """iterations K of the policy search"""
-    horizon: Size = 500
+    horizon: Repeats = 500
     """control steps T of a trajectory (per task)"""
     reward: Literal["native", "target"] = "native"
     """the task's own reward, or the paper's: squared errors of velocity and height (per task)"""
@@ -86,21 +83,21 @@ class Args(Flags):
     """weight of the trunk's squared rotation, beside the paper's three terms (per task)"""
     demonstration: Path | None = None
     """start from this trajectory instead of --restarts: an .npz with qpos (T+1, nq), qvel (T+1, nv), action (T, nu)"""
-    restarts: Size = 16
+    restarts: Repeats = 16
     """random action sequences from which trajectory optimisation starts; the best are kept"""
     window: Natural = 0
     """plan by windows of so many control steps, each a fifth of it later than the last (0: at once; per task)"""
-    guides: Size = 1
+    guides: Repeats = 1
     """guiding distributions n, from as many of the best trajectories"""
-    screening: Passes = 40
+    screening: Repeats = 40
     """iLQR iterations of all restarts"""
-    ilqr_iterations: Passes = 300
+    ilqr_iterations: Repeats = 300
     """further iLQR iterations of the best"""
     tracking: NonNegative = 5e-4
     """weight of the squared deviation from the example in the initial guiding distributions (Section 6; per task)"""
     spread: Positive = 3.0
     """standard deviation of the guiding actions relative to the policy's: the temperature of exp(reward) (per task)"""
-    guiding_samples: Size = 40
+    guiding_samples: Repeats = 40
     """trajectories drawn from the guiding distributions"""
     terrain: tuple[str, ...] = ("level",)
     """train on each, with its own guides: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
@@ -108,23 +105,23 @@ class Args(Flags):
     """the policy's trajectories each go over a random terrain of these kinds, up to that size, not over --terrain"""
     adaptive: Natural = 0
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
-    adaptive_iterations: Passes = 50
+    adaptive_iterations: Repeats = 50
     """iLQR iterations of an adaptation"""
     perturb: NonNegative = 0.1
     """the policy's samples start away from the guides', by a normal part of the plan's deviations (per task)"""
-    hidden: Size = 50
+    hidden: Repeats = 50
     """units of the policy's hidden layer (per task)"""
     noise: Positive = 0.1
     """the policy's standard deviation, relative to that of the planned actions over time (per task)"""
-    pretraining: Passes = 1500
+    pretraining: Repeats = 1500
     """L-BFGS iterations of the fit to the guiding samples; a tenth of them for feedback's later fits"""
-    samples: Size = 10
+    samples: Repeats = 10
     """trajectories of the policy per iteration"""
-    active: Size = 100
+    active: Repeats = 100
     """trajectories in the active set S_k"""
-    stored: Size = 300
+    stored: Repeats = 300
     """trajectories kept to choose from"""
-    lbfgs_iterations: Passes = 60
+    lbfgs_iterations: Repeats = 60
     """L-BFGS iterations of each of an iteration's two optimisations"""
     regularizer_bounds: tuple[NonNegative, NonNegative] = (1e-4, 1.0)
     """w_r starts at their geometric mean and is changed by factors of ten between them; 0 0: no regularizer"""
@@ -192,7 +189,6 @@ class Search:
         self.S = SampleSet(self.system, self.network, self.measure(x, u, finite.bool()))
         self.lessons: tuple[Tensor, ...] = ()  # what feedback fits
         self.student = self.network.theta  # the last of feedback's fits
-        self.modules: dict[str, Stateful] = {"policy": self.network, "samples": self.S, "search": self}
 
     def prepare(self, say: Callable[[str], None], file: Path) -> dict[str, float]:
         """Lines 1 to 4. Tells its progress, writes the plans to a file as soon as they exist, returns metrics."""
@@ -547,11 +543,13 @@ def train(args: Args, learner: type[Search] = Search) -> None:
     if run.iteration == 0:
         run.log(search.prepare(run.message, run.directory / "plan.npz"), search.control_steps)
     for iteration in run:  # lines 5 to 18
-        run.log(search.iterate(iteration), search.control_steps)
+        before = search.control_steps
+        run.log(search.iterate(iteration), search.control_steps - before)
         if run.evaluation_due:
             run.log_evaluation(evaluate(search))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     evaluate_checkpoint(args, Search, evaluate) if args.evaluate else train(args)

@@ -12,9 +12,6 @@ around each real one.
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import copy
 import math
 from collections.abc import Sequence
@@ -26,6 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from diffsim import DiffEnv
 from diffsim.planning import Dynamics
 from diffsim.tasks import TASKS
 from diffsim.training import (
@@ -39,11 +37,10 @@ from diffsim.training import (
     Positive,
     ReplayBuffer,
     Run,
-    Stateful,
     Transition,
     Widths,
+    command,
     distributed,
-    episode_metrics,
     evaluate,
     evaluate_checkpoint,
     fail,
@@ -75,7 +72,7 @@ HELD_OUT_BATCH = 1024
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*ParallelFlags.FIXED, "hidden", "model_hidden", "models", "elites", *SIZES)
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "actor_lr", "temperature_lr", "model_lr")
 
     iterations: Count = 2_000
     """learning iterations (per task)"""
@@ -293,20 +290,6 @@ class MBPO:
         if args.sample_enhance:
             integration, threads = env.sim.integration, args.threads or None
             self.dynamics = Dynamics(env.scene, integration, env.control_dt, env.device, threads)
-        self.modules: dict[str, Stateful] = {
-            "actor": self.actor,
-            "critics": self.critics,
-            "targets": self.targets,
-            "temperature": self.temperature,
-            "models": self.models,
-            "actor_optimizer": self.actor_optimizer,
-            "critic_optimizer": self.critic_optimizer,
-            "temperature_optimizer": self.temperature_optimizer,
-            "model_optimizer": self.model_optimizer,
-            "real": self.real,
-            "unseen": self.unseen,
-            "imagined": self.imagined,
-        }
 
     # Real transitions ------------------------------------------------------------------------------------------------
 
@@ -321,7 +304,7 @@ class MBPO:
     @torch.no_grad()
     def act(self, random: bool) -> dict[str, Tensor]:
         """Control steps of all environments into the buffers."""
-        env, steps = self.env, []
+        env = self.env
         obs = env.detach()
         for _ in range(self.args.steps):
             if random:
@@ -329,7 +312,7 @@ class MBPO:
             else:
                 action, _ = self.actor(self.actor.normalizer(obs))
             state = torch.cat((env.qpos, env.qvel), 1) if self.args.sample_enhance else None
-            next_obs, reward, terminated, truncated, info = env.step(action)
+            next_obs, reward, terminated, _, info = env.step(action)
             made = Transition(obs, action, reward, info["final_obs"], terminated.to(reward.dtype))
             self.unseen.add(Transition(*(x[: self.held_out] for x in made)))
             seen = Transition(*(x[self.held_out :] for x in made))
@@ -338,13 +321,9 @@ class MBPO:
                 self.real.add(self.around(state[self.held_out :], seen))
             self.actor.normalizer.update(obs)
             self.models.target.update(self.changes(seen))
-            episode = info["episode"]
-            steps.append((terminated | truncated, info["nonfinite"], episode["r"], episode["l"]))
             obs = next_obs
-        done, nonfinite, returns, lengths = (torch.stack(tensors) for tensors in zip(*steps, strict=True))
-        found = episode_metrics(env, done, {"r": returns, "l": lengths}, nonfinite)
-        optimizers = (self.actor_optimizer, self.critic_optimizer, self.model_optimizer)
-        return found | {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
+        optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer, self.model_optimizer
+        return {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
 
     def around(self, state: Tensor, made: Transition) -> Transition:
         """SE-MBPO: transitions near real ones, observed and rewarded as the task does."""
@@ -493,6 +472,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, mbpo.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

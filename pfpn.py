@@ -12,9 +12,6 @@ weight are moved to those that have it. PPO, SHAC and SAC train it, and the poli
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import copy
 import math
 from collections.abc import Callable, Sequence
@@ -25,6 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,
@@ -38,11 +36,10 @@ from diffsim.training import (
     Positive,
     ReplayBuffer,
     Run,
-    Stateful,
     Transition,
     Widths,
+    command,
     distributed,
-    episode_metrics,
     evaluate,
     evaluate_checkpoint,
     fail,
@@ -89,7 +86,7 @@ Estimator = Literal["implicit", "straight-through", "mixed"]
 class Args(ParallelFlags):
     """The policy and the algorithms. Defaults: of PPO on the humanoid."""
 
-    FIXED = (*ParallelFlags.FIXED, "algorithm", "policy", "particles", "hidden", "critic_hidden", "buffer_size")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "critic_lr", "temperature_lr", "entropy_coef")
 
     algorithm: Literal["ppo", "shac", "sac"] = "ppo"
     """what trains the policy: rewards alone, the simulator's gradient, or a replay buffer"""
@@ -482,12 +479,6 @@ class Window(NamedTuple):
     reward: Tensor
     terminated: Tensor
     done: Tensor  # terminated or truncated
-    nonfinite: Tensor
-    episode_return: Tensor  # of the episode so far, as is the length
-    episode_length: Tensor
-
-    def metrics(self, env: DiffEnv) -> dict[str, Tensor]:
-        return episode_metrics(env, self.done, {"r": self.episode_return, "l": self.episode_length}, self.nonfinite)
 
 
 def collect(env: DiffEnv, horizon: int, act: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Window, list[Tensor]]:
@@ -496,9 +487,7 @@ def collect(env: DiffEnv, horizon: int, act: Callable[[Tensor], tuple[Tensor, ..
     for _ in range(horizon):
         action, *beside = act(obs)
         next_obs, reward, terminated, truncated, info = env.step(action)
-        ends = terminated, terminated | truncated, info["nonfinite"]
-        episode = info["episode"]["r"], info["episode"]["l"]
-        steps.append((obs, info["final_obs"], reward, *ends, *episode, *beside))
+        steps.append((obs, info["final_obs"], reward, terminated, terminated | truncated, *beside))
         obs = next_obs
     columns = [torch.stack(tensors) for tensors in zip(*steps, strict=True)]
     known = len(Window._fields)
@@ -517,11 +506,6 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
         following = torch.where(done[t], next_value[t], torch.lerp(next_value[t], following, lam))
         following = returns[t] = reward[t] + gamma * following
     return returns
-
-
-def named(learner: object, names: str) -> dict[str, Stateful]:
-    """Those attributes of a learner: all that the next iteration depends on."""
-    return {name: getattr(learner, name) for name in names.split()}
 
 
 def follow(slow: nn.Module, fast: nn.Module, rate: float) -> None:
@@ -549,7 +533,6 @@ class PPO:
         sizes = (obs_dim,), (action_dim,), (), (), ()  # normalized s_t; u; its log probability; advantage; target
         self.samples = [torch.zeros(samples, *size, device=env.device) for size in sizes]
         self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
-        self.modules = named(self, "actor resampling return_normalizer optimizer")
 
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
         mixture, value = self.actor.both(self.actor.normalizer(obs))
@@ -573,7 +556,7 @@ class PPO:
         for buffer, tensor in zip(self.samples, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(window.obs)
-        return window.metrics(self.env)
+        return {}
 
     def learn(self) -> dict[str, Tensor]:
         """Descend the clipped loss in epochs of minibatches."""
@@ -637,7 +620,6 @@ class SHAC:
         self.obs = torch.zeros(samples, obs_dim, device=env.device)  # the critic's samples
         self.value = torch.zeros(samples, device=env.device)
         self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
-        self.modules = named(self, "actor resampling critic target optimizer critic_optimizer")
 
     def schedule(self, iteration: int) -> None:
         """Linear decay of the learning rates."""
@@ -662,8 +644,7 @@ class SHAC:
         self.value.copy_(value.flatten())
         self.obs.copy_(normalizer(window.obs).flatten(0, 1))
         normalizer.update(window.obs)
-        metrics = {"losses/actor": loss.detach(), "charts/entropy": entropy.detach().mean(), "grad/norm": norm}
-        return metrics | window.metrics(self.env)
+        return {"losses/actor": loss.detach(), "charts/entropy": entropy.detach().mean(), "grad/norm": norm}
 
     def loss(self, window: Window, chosen: Tensor, entropy: Tensor) -> Tensor:
         """Eq. 5: each environment's window is cut at its dones; of (H, N) choices' log probabilities and entropies."""
@@ -730,8 +711,6 @@ class SAC:
         self.critic_optimizer = ClippedAdam(self.critics, self.max_grad_norm, lr=args.critic_lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, self.max_grad_norm, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
-        optimizers = "optimizer critic_optimizer temperature_optimizer"
-        self.modules = named(self, f"actor resampling critics targets temperature {optimizers} buffer")
 
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
         mixture = self.actor(self.actor.normalizer(obs))
@@ -747,7 +726,7 @@ class SAC:
         made = window.obs, action, window.reward, window.next_obs, terminated
         self.buffer.add(Transition(*(tensor.flatten(0, 1) for tensor in made)))
         self.actor.normalizer.update(window.obs)
-        return window.metrics(self.env)
+        return {}
 
     def learn(self) -> dict[str, Tensor]:
         """As many updates as there were control steps."""
@@ -758,7 +737,8 @@ class SAC:
             rows.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
         found = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
         found |= self.resampling.end_iteration(self.actor.head, self.optimizer)
-        skipped = self.optimizer.skipped + self.critic_optimizer.skipped
+        optimizers = self.optimizer, self.critic_optimizer, self.temperature_optimizer
+        skipped = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
         return found | {"charts/temperature": self.temperature["log"].detach().exp(), "grad/skipped": skipped}
 
     def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
@@ -812,6 +792,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, learner.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

@@ -12,17 +12,15 @@ imitates the result. First order steps along the gradient of the return, second 
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.planning import REAL, AfterStep, Cost, Dynamics, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Task
@@ -34,10 +32,9 @@ from diffsim.training import (
     ObsNormalizer,
     Positive,
     Run,
-    Stateful,
     Widths,
+    command,
     distributed,
-    episode_metrics,
     evaluate,
     evaluate_checkpoint,
     fail,
@@ -63,7 +60,7 @@ PER_ORDER = {
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*Flags.FIXED, "num_envs", "horizon", "hidden", "order", "normalize_obs")
+    MAY_CHANGE = (*Flags.MAY_CHANGE, "lr", "epochs")
 
     iterations: Count = 120
     """learning iterations (per order)"""
@@ -238,8 +235,7 @@ class PODS:
         self.actor = Actor(args, env.task.obs_dim, env.scene.nu).to(env.device)
         self.policy = self.actor.deterministic()
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.lr)
-        self.control_steps = 0
-        self.modules: dict[str, Stateful] = {"actor": self.actor, "optimizer": self.optimizer, "pods": self}
+        self.control_steps = 0  # of the iteration
         threads = args.threads or None
         if args.order == 1:
             self.sizes = args.max_step * 0.5 ** torch.arange(args.candidates, device=env.device)
@@ -254,8 +250,8 @@ class PODS:
         """Act for T steps, improve the actions, and keep them as lessons."""
         args, env, count = self.args, self.env, self.args.horizon * self.env.num_envs
         start = Start(env.qpos, env.qvel, env.detach())
-        u, visited, whole, metrics = self.act()
-        self.control_steps += count
+        u, visited, whole = self.act()
+        self.control_steps = count
         first, new = None, Sequences(u, visited, u[0, :, 0])
         if args.order == 1:
             for _ in range(args.improvements):
@@ -273,7 +269,7 @@ class PODS:
         def mean(x: Tensor) -> Tensor:
             return torch.where(whole, x, 0.0).sum() / whole.sum()
 
-        return metrics | {
+        return {
             "pods/return": mean(first),
             "pods/improved_return": mean(new.returns),
             "pods/step": mean((new.u - u).square().mean((0, 2)).sqrt()),
@@ -282,19 +278,17 @@ class PODS:
         }
 
     @torch.no_grad()
-    def act(self) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
+    def act(self) -> tuple[Tensor, Tensor, Tensor]:
         """T steps of the policy: u (T, N, nu), obs (T, N, obs_dim), and which sequences (N,) no episode's end cuts."""
         steps, env = [], self.env
         obs = env.detach()
         for _ in range(self.args.horizon):
             u = self.actor(obs)
             next_obs, _, terminated, truncated, info = env.step(torch.tanh(u))
-            episode = info["episode"]["r"], info["episode"]["l"]
-            steps.append((u, obs, terminated | truncated, info["nonfinite"], *episode))
+            steps.append((u, obs, terminated | truncated))
             obs = next_obs
-        u, visited, done, nonfinite, returns, lengths = (torch.stack(column) for column in zip(*steps, strict=True))
-        metrics = episode_metrics(env, done, {"r": returns, "l": lengths}, nonfinite)
-        return u, visited, ~(done[:-1].any(0) | nonfinite[-1]), metrics
+        u, visited, done = (torch.stack(column) for column in zip(*steps, strict=True))
+        return u, visited, ~(done[:-1].any(0) | info["nonfinite"])
 
     def plan(self, start: Start, u: Tensor) -> tuple[Tensor, Sequences]:
         """Second order: the returns (N,) of the sequences u (T, N, nu), and what they become."""
@@ -325,12 +319,6 @@ class PODS:
         found = {"losses/imitation": per_epoch[-1], "losses/first_epoch": per_epoch[0]}
         return found | {"grad/norm": norm, "grad/skipped": self.optimizer.skipped}
 
-    def state_dict(self) -> dict[str, Any]:
-        return {"control_steps": self.control_steps}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.control_steps = state["control_steps"]
-
 
 # The run --------------------------------------------------------------------------------------------------------------
 
@@ -346,6 +334,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, pods.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

@@ -10,9 +10,6 @@ minibatches, and a learning rate that follows the policy's KL divergence, as the
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.tasks import TASKS, Task
 from diffsim.training import (
     ClippedAdam,
@@ -32,11 +30,11 @@ from diffsim.training import (
     ObsNormalizer,
     ParallelFlags,
     Positive,
+    Repeats,
     Run,
-    Stateful,
     Widths,
+    command,
     distributed,
-    episode_metrics,
     evaluate,
     evaluate_checkpoint,
     fail,
@@ -65,7 +63,7 @@ CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost m
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*ParallelFlags.FIXED, "hidden")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "entropy_coef")
 
     iterations: Count = 5000
     """learning iterations, a rollout and its updates each (per task)"""
@@ -87,7 +85,7 @@ class Args(ParallelFlags):
     """discount factor"""
     gae_lambda: Fraction = 0.95
     """lambda of the advantage estimation"""
-    epochs: Count = 5
+    epochs: Repeats = 5
     """passes over a rollout's samples (per task)"""
     minibatch_size: Count = 8192
     """samples of a minibatch (per task; on a CPU at most 2048)"""
@@ -164,9 +162,6 @@ class Rollout(NamedTuple):
     reward: Tensor
     terminated: Tensor
     done: Tensor  # terminated or truncated
-    nonfinite: Tensor
-    episode_return: Tensor  # of the episode so far, as is the length
-    episode_length: Tensor
 
 
 class Batch(NamedTuple):
@@ -199,11 +194,6 @@ class PPO:
         sizes = (obs_dim,), (mirrored,), (action_dim,), (action_dim,), (), ()
         self.batch = Batch(*(torch.zeros(samples, *size, device=env.device) for size in sizes))
         self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
-        self.modules: dict[str, Stateful] = {
-            "actor_critic": self.actor_critic,
-            "return_normalizer": self.return_normalizer,
-            "optimizer": self.optimizer,
-        }
 
     @torch.no_grad()
     def roll_out(self) -> dict[str, Tensor]:
@@ -224,8 +214,7 @@ class PPO:
         for buffer, tensor in zip(self.batch, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(rollout.obs)
-        episode = {"r": rollout.episode_return, "l": rollout.episode_length}
-        return episode_metrics(self.env, rollout.done, episode, rollout.nonfinite)
+        return {"charts/std": policy.log_std.exp().mean()}
 
     def update(self) -> dict[str, Tensor]:
         """Descend the clipped loss (Eq. 7) in epochs of minibatches."""
@@ -251,7 +240,6 @@ class PPO:
         return dict(zip(names, torch.stack(metrics).mean(0), strict=True)) | {
             "grad/skipped": self.optimizer.skipped,
             "charts/learning_rate": self.optimizer.lr,
-            "charts/std": policy.log_std.detach().exp().mean(),
         }
 
 
@@ -264,9 +252,8 @@ def collect(env: DiffEnv, policy: ActorCritic, noise: Tensor) -> Rollout:
         mean, value = policy(policy.normalizer(obs))
         action = mean + std * step_noise
         next_obs, reward, terminated, truncated, info = env.step(action)
-        ends = terminated, terminated | truncated, info["nonfinite"]
-        episode = info["episode"]["r"], info["episode"]["l"]
-        steps.append((obs, info["final_obs"], mean, action, value, reward, *ends, *episode))
+        ends = terminated, terminated | truncated
+        steps.append((obs, info["final_obs"], mean, action, value, reward, *ends))
         obs = next_obs
     return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
 
@@ -327,6 +314,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, ppo.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

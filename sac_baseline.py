@@ -11,9 +11,6 @@ device. REDQ (Chen et al. 2021, https://arxiv.org/abs/2101.05982) is the same sc
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import copy
 import math
 from collections.abc import Sequence
@@ -24,22 +21,24 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,
     Ensemble,
+    Finite,
     Fraction,
     Natural,
     ObsNormalizer,
     ParallelFlags,
     Positive,
+    Repeats,
     ReplayBuffer,
     Run,
-    Stateful,
     Transition,
     Widths,
+    command,
     distributed,
-    episode_metrics,
     evaluate,
     evaluate_checkpoint,
     fail,
@@ -76,7 +75,7 @@ LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    FIXED = (*ParallelFlags.FIXED, "hidden", "critics", "layer_norm", "buffer_size")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "steps", "actor_lr", "critic_lr", "temperature_lr", "target_entropy")
 
     iterations: Count = 20_000
     """learning iterations, `steps` control steps of all environments with their updates each (per task)"""
@@ -86,9 +85,9 @@ class Args(ParallelFlags):
     """parallel environments N (per task)"""
     steps: Count = 32
     """control steps of an iteration (1/60 s each)"""
-    updates_per_step: Count = 1
+    updates_per_step: Repeats = 1
     """gradient updates of the critics after each control step of all environments"""
-    actor_updates: Count = 1
+    actor_updates: Repeats = 1
     """of which so many, the last ones, also update the actor and the temperature"""
     batch_size: Count = 2048
     """samples of an update (per task)"""
@@ -98,9 +97,9 @@ class Args(ParallelFlags):
     """control steps of each environment with random actions before the first update (per task)"""
     hidden: Widths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
-    critics: Count = 2
+    critics: Repeats = 2
     """value functions"""
-    critic_subset: Count = 2
+    critic_subset: Repeats = 2
     """the target is the least of so many, drawn anew for each update"""
     layer_norm: bool = False
     """normalize the critics' hidden layers, which steadies many updates on large batches"""
@@ -112,7 +111,7 @@ class Args(ParallelFlags):
     """learning rate of the temperature's logarithm (per task)"""
     initial_temperature: Positive = 1.0
     """initial weight of the entropy"""
-    target_entropy: float = -1.0
+    target_entropy: Finite = -1.0
     """of the policy per action, in nats, to which the temperature is steered"""
     gamma: Fraction = 0.99
     """discount factor"""
@@ -207,16 +206,6 @@ class SAC:
         self.critic_optimizer = ClippedAdam(self.critics, args.max_grad_norm, lr=args.critic_lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, args.max_grad_norm, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
-        self.modules: dict[str, Stateful] = {
-            "actor": self.actor,
-            "critics": self.critics,
-            "targets": self.targets,
-            "temperature": self.temperature,
-            "actor_optimizer": self.actor_optimizer,
-            "critic_optimizer": self.critic_optimizer,
-            "temperature_optimizer": self.temperature_optimizer,
-            "buffer": self.buffer,
-        }
 
     def explore(self) -> dict[str, Tensor]:
         """An iteration of uniformly random actions, from which only the buffer and the normalizer learn."""
@@ -227,33 +216,29 @@ class SAC:
         return self.iterate(learning=True)
 
     def iterate(self, learning: bool) -> dict[str, Tensor]:
-        steps, metrics = [], []
+        metrics = []
         obs = self.env.detach()
         for _ in range(self.args.steps):
-            obs, step = self.act(obs, random=not learning)
-            steps.append(step)
+            obs = self.act(obs, random=not learning)
             if learning:
                 metrics.append(self.update())
-        done, nonfinite, returns, lengths = (torch.stack(tensors) for tensors in zip(*steps, strict=True))
-        found = episode_metrics(self.env, done, {"r": returns, "l": lengths}, nonfinite)
-        if learning:
-            found |= {name: torch.stack([row[name] for row in metrics]).mean() for name in metrics[0]}
-        skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped
-        return found | {"charts/temperature": self.temperature.log.detach().exp(), "grad/skipped": skipped}
+        found = {name: torch.stack([row[name] for row in metrics]).mean() for name in (metrics[0] if learning else ())}
+        optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
+        found["grad/skipped"] = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
+        return found | {"charts/temperature": self.temperature.log.detach().exp()}
 
     @torch.no_grad()
-    def act(self, obs: Tensor, random: bool) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """One control step of all environments into the buffer."""
+    def act(self, obs: Tensor, random: bool) -> Tensor:
+        """One control step of all environments into the buffer; returns the observations after it."""
         env = self.env
         if random:
             action = 2 * torch.rand(env.num_envs, env.scene.nu, device=env.device) - 1
         else:
             action, _ = self.actor(self.actor.normalizer(obs))
-        next_obs, reward, terminated, truncated, info = env.step(action)
+        next_obs, reward, terminated, _, info = env.step(action)
         self.buffer.add(Transition(obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
         self.actor.normalizer.update(obs)
-        episode = info["episode"]
-        return next_obs, (terminated | truncated, info["nonfinite"], episode["r"], episode["l"])
+        return next_obs
 
     def update(self) -> dict[str, Tensor]:
         """The updates of one control step."""
@@ -320,6 +305,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, sac.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

@@ -10,9 +10,6 @@ policy's entropy as a part of the reward; two critics are fitted to the soft TD(
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import copy
 import math
 from collections.abc import Callable, Sequence
@@ -24,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.tasks import TASKS, Task
 from diffsim.training import (
     Count,
@@ -35,11 +33,11 @@ from diffsim.training import (
     ObsNormalizer,
     ParallelFlags,
     Positive,
+    Repeats,
     Run,
-    Stateful,
     Widths,
+    command,
     distributed,
-    episode_metrics,
     evaluate,
     evaluate_checkpoint,
     fail,
@@ -72,20 +70,17 @@ SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
 class Args(ParallelFlags):
     """The algorithm. With --no-entropy --no-state-std --critics 1 --activation elu it is SHAC."""
 
-    FIXED = (
-        *ParallelFlags.FIXED,
-        *("actor_hidden", "critic_hidden", "state_std", "critics", "activation", "population"),
-    )
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "actor_lr", "critic_lr", "final_lr", "temperature_lr")
 
     entropy: bool = True
     """the policy's entropy is part of the reward"""
     state_std: bool = True
     """the standard deviation of the policy's noise depends on the state"""
-    critics: Count = 2
+    critics: Repeats = 2
     """value functions: the least of them makes the targets, their mean the actor's loss"""
     activation: Literal["elu", "silu"] = "silu"
     """nonlinearity of actor and critics (per task)"""
-    population: Count = 1
+    population: Repeats = 1
     """members that learn side by side, each in its share of the environments, until one goes on (per task)"""
     selection: Fraction = 0.5
     """share of the iterations after which the best member goes on in all environments"""
@@ -127,9 +122,9 @@ class Args(ParallelFlags):
     """lambda of the value estimation"""
     target_alpha: Fraction = 0.2
     """target critics <- alpha target critics + (1 - alpha) critics, each iteration (per task)"""
-    critic_iterations: Count = 16
+    critic_iterations: Repeats = 16
     """passes over a window's samples to fit the critics (per task)"""
-    critic_minibatches: Count = 4
+    critic_minibatches: Repeats = 4
     """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh (per task)"""
@@ -233,9 +228,6 @@ class Rollout(NamedTuple):
     entropy: Tensor  # minus the action's log density, per action
     terminated: Tensor
     done: Tensor  # terminated or truncated
-    nonfinite: Tensor
-    episode_return: Tensor  # of the episode so far, as is the length
-    episode_length: Tensor
 
 
 class SAPO:
@@ -263,15 +255,6 @@ class SAPO:
         self.target_entropy = torch.zeros((), device=env.device)
         self.obs = torch.zeros(args.population, samples, obs_dim, device=env.device)  # the critics' samples
         self.value = torch.zeros(args.population, samples, device=env.device)
-        self.modules: dict[str, Stateful] = {
-            "actor": self.actor,
-            "critics": self.critics,
-            "targets": self.targets,
-            "population": self.population,
-            "actor_optimizer": self.actor_optimizer,
-            "critic_optimizer": self.critic_optimizer,
-            "temperature_optimizer": self.temperature_optimizer,
-        }
 
     @property
     def policy(self) -> nn.Sequential:
@@ -318,10 +301,8 @@ class SAPO:
         gap = (entropy - self.target_entropy).detach()
         self.temperature_optimizer.step((self.population.log_temperature.exp().flatten() * gap).sum())
         self.population.score.lerp_(distributed.average(self.by_member(rollout.reward).mean((1, 2))), SCORE_RATE)
-        episode = {"r": rollout.episode_return, "l": rollout.episode_length}
-        metrics = episode_metrics(self.env, rollout.done, episode, rollout.nonfinite)
         temperature = self.population.log_temperature.detach().exp().mean()
-        metrics |= {"charts/entropy": entropy.mean(), "charts/temperature": temperature}
+        metrics = {"charts/entropy": entropy.mean().detach(), "charts/temperature": temperature}
         return {"losses/actor": loss.detach(), "grad/norm": norm} | metrics
 
     def act(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -387,7 +368,8 @@ class SAPO:
                 losses.append(errors.detach().mean())
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
-        skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped
+        optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
+        skipped = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
         return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
 
     def next_values(self, rollout: Rollout) -> Tensor:
@@ -405,9 +387,7 @@ def collect(env: DiffEnv, act: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
     for noise in torch.randn(horizon, env.num_envs, env.scene.nu, device=env.device).unbind():
         action, entropy = act(obs, noise)
         next_obs, reward, terminated, truncated, info = env.step(action)
-        ends = terminated, terminated | truncated, info["nonfinite"]
-        episode = info["episode"]["r"], info["episode"]["l"]
-        steps.append((obs, info["final_obs"], reward, entropy, *ends, *episode))
+        steps.append((obs, info["final_obs"], reward, entropy, terminated, terminated | truncated))
         obs = next_obs
     return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
 
@@ -442,15 +422,18 @@ def train(args: Args) -> None:
     update_actor, update_critic = run.capture(sapo.update_actor, env), run.capture(sapo.update_critic)
     for iteration in run:
         sapo.prepare(iteration)
-        if iteration == 1 and args.start_from:
+        windows = 0
+        if args.start_from and iteration == 1:
+            windows = args.start_windows
             policy = load_policy(args.start_from).network.to(env.device)
-            errors = [sapo.imitate(policy, k < args.start_windows / 2) for k in range(args.start_windows)]
+            errors = [sapo.imitate(policy, k < windows / 2) for k in range(windows)]
             run.message(f"imitated {args.start_from}: squared error of the actions {errors[-1].item():.3g}")
-        run.log(update_actor() | update_critic())
+        run.log(update_actor() | update_critic(), (1 + windows) * args.horizon * args.num_envs)
         if run.evaluation_due:
             run.log_evaluation(evaluate(eval_env, sapo.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

@@ -10,9 +10,6 @@ at the window's end (Eq. 5); the value function is fitted to the TD(lambda) retu
 
 from __future__ import annotations
 
-from diffsim import DiffEnv  # first: from here on Ctrl-C ends in one line
-
-# isort: split
 import copy
 import math
 from collections.abc import Sequence
@@ -23,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from diffsim import DiffEnv
 from diffsim.training import (
     ClippedAdam,
     Count,
@@ -32,10 +30,10 @@ from diffsim.training import (
     ObsNormalizer,
     ParallelFlags,
     Positive,
+    Repeats,
     Run,
-    Stateful,
     Widths,
-    episode_metrics,
+    command,
     evaluate,
     evaluate_checkpoint,
     parse,
@@ -60,7 +58,7 @@ PER_TASK = {
 class Args(ParallelFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
-    FIXED = (*ParallelFlags.FIXED, "actor_hidden", "critic_hidden", "deterministic_policy", "critic")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "actor_lr", "critic_lr", "final_lr")
 
     horizon: Count = 32
     """control steps h of a window (1/60 s each)"""
@@ -90,9 +88,9 @@ class Args(ParallelFlags):
     """lambda of the value estimation (Eq. 7)"""
     target_alpha: Fraction = 0.995
     """target critic <- alpha target critic + (1 - alpha) critic, each iteration (per task)"""
-    critic_iterations: Count = 16
+    critic_iterations: Repeats = 16
     """passes over a window's samples to fit the critic"""
-    critic_minibatches: Count = 4
+    critic_minibatches: Repeats = 4
     """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh"""
@@ -156,9 +154,6 @@ class Rollout(NamedTuple):
     reward: Tensor
     terminated: Tensor
     done: Tensor  # terminated or truncated
-    nonfinite: Tensor
-    episode_return: Tensor  # of the episode so far, as is the length
-    episode_length: Tensor
 
 
 class SHAC:
@@ -178,13 +173,6 @@ class SHAC:
         self.critic_optimizer = ClippedAdam(self.critic, args.max_grad_norm, args.betas)
         self.obs = torch.zeros(args.horizon * env.num_envs, obs_dim, device=env.device)  # the critic's samples
         self.value = torch.zeros(args.horizon * env.num_envs, device=env.device)
-        self.modules: dict[str, Stateful] = {
-            "actor": self.actor,
-            "critic": self.critic,
-            "target": self.target,
-            "actor_optimizer": self.actor_optimizer,
-            "critic_optimizer": self.critic_optimizer,
-        }
 
     def set_learning_rates(self, iteration: int) -> None:
         args, done = self.args, (iteration - 1) / self.args.iterations
@@ -203,9 +191,7 @@ class SHAC:
         self.value.copy_(value.flatten())
         self.obs.copy_(normalizer(rollout.obs).flatten(0, 1))
         normalizer.update(rollout.obs)
-        episode = {"r": rollout.episode_return, "l": rollout.episode_length}
-        metrics = episode_metrics(self.env, rollout.done, episode, rollout.nonfinite)
-        return {"losses/actor": loss.detach(), "grad/norm": norm} | metrics
+        return {"losses/actor": loss.detach(), "grad/norm": norm}
 
     def update_critic(self) -> dict[str, Tensor]:
         """Fit the critic to the window's TD(lambda) returns (Eq. 6), and let the target critic follow."""
@@ -237,9 +223,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
     obs = env.detach()
     for step_noise in noise.unbind():
         next_obs, reward, terminated, truncated, info = env.step(actor(obs, step_noise))
-        episode = info["episode"]["r"], info["episode"]["l"]
-        done = terminated | truncated
-        steps.append((obs, info["final_obs"], reward, terminated, done, info["nonfinite"], *episode))
+        steps.append((obs, info["final_obs"], reward, terminated, terminated | truncated))
         obs = next_obs
     return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
 
@@ -279,6 +263,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(eval_env, shac.policy))
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(Args, argv)
     if args.evaluate:

@@ -13,10 +13,6 @@ by 1 m/s; minus and equals change the speed; space pauses; enter starts a new ep
 
 from __future__ import annotations
 
-from diffsim import DiffEnv, startup  # first: from here on Ctrl-C ends in one line
-from diffsim.view import render, web
-
-# isort: split
 import copy
 import csv
 import math
@@ -34,8 +30,10 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from diffsim.training import SavedPolicy, describe, evaluate, fail, load_policy, make_policy_env, parse_command_line
+from diffsim import DiffEnv
+from diffsim.training import SavedPolicy, command, describe, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED
+from diffsim.view import render, web
 
 ROBOT = 1  # MuJoCo's first body after the world
 SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
@@ -95,10 +93,10 @@ class Args:
                 fail(f"--viewer: {error}; --web and --video need none")
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
-    startup.end_in_one_line()
     config = (tyro.conf.FlagCreatePairsOff,)
-    args = parse_command_line(Args, argv, description=__doc__, config=config)
+    args = tyro.cli(Args, args=argv, description=__doc__, config=config)
     args.check()
     try:
         if args.plot:

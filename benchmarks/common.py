@@ -20,9 +20,9 @@ import tyro
 from tables import ROOT, Row
 
 import diffsim
-from diffsim import DiffEnv, startup
+from diffsim import DiffEnv
 from diffsim.sim.simulator import check_device
-from diffsim.training import SavedPolicy, fail, load_policy, make_policy_env, parse_command_line
+from diffsim.training import SavedPolicy, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
 from diffsim.training.flags import check_ranges
 
@@ -152,8 +152,7 @@ def machine(device: str) -> str:
 
 def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = None) -> F:
     """The command line, checked; anything wrong ends the benchmark with one line."""
-    startup.end_in_one_line(startup.KernelCacheError)
-    args = parse_command_line(kind, argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    args = tyro.cli(kind, args=argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
     check_ranges(args)
     if args.output and args.update_results:
         fail("--output and --update-results exclude each other")

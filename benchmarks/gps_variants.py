@@ -17,7 +17,7 @@ from tables import ROOT
 from torch import Tensor
 
 from diffsim.planning.samples import Samples
-from diffsim.training import evaluate_checkpoint, parse
+from diffsim.training import command, evaluate_checkpoint, parse
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
@@ -93,8 +93,6 @@ CASES |= {"single-example": SingleExample, "policy-gradient": PolicyGradient, "d
 class VariantArgs(gps.Args):
     """Which variant."""
 
-    FIXED = (*gps.Args.FIXED, "case")
-
     case: Name = "nonguided"
     """the variant of Figure 2"""
 
@@ -103,6 +101,7 @@ class VariantArgs(gps.Args):
         return super().task_defaults() | {"variant": "full", "perturb": 0.0} | bounds
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(VariantArgs, argv)
     search = CASES[args.case]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from diffsim import startup  # first: it starts Warp and MuJoCo, and Ctrl-C may come during the other imports
-
-# isort: split
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -15,6 +12,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
+from diffsim import startup
 from diffsim.env import DiffEnv
 from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
@@ -137,5 +135,3 @@ for _name, _task in TASKS.items():
             max_episode_steps=_task.episode_length,
             kwargs={"name": _name},
         )
-
-startup.imported()

@@ -24,6 +24,7 @@ import warp as wp
 from diffsim import TASKS, load_scene, startup
 from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
+from diffsim.training.errors import command
 from diffsim.view import render
 
 POLICIES = files("diffsim") / "policies"
@@ -31,9 +32,9 @@ DEMO_EPISODES = 8  # of which the one of median return is filmed
 DEMO_SECONDS = 4.0  # of it
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
-    startup.end_in_one_line()
     parser = argparse.ArgumentParser(
         prog="python -m diffsim", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -21,6 +21,8 @@ from diffsim.tasks import Task
 from diffsim.terrain import Elevation
 from diffsim.view.screen import RENDER_MODES, Frames, RenderMode, Screen
 
+STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_statistics
+
 
 def check_seed(seed: int) -> int:
     """The seed as an int, be it NumPy's; raises ValueError unless it is an integer of 64 bits. True is none."""
@@ -123,6 +125,7 @@ class DiffEnv(VectorEnv):
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.first_step = torch.zeros_like(self.episode_step)
         self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
+        self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
         self._restart()
         self.render_mode = render_mode
 
@@ -208,6 +211,9 @@ class DiffEnv(VectorEnv):
             done = terminated | truncated
             length = self.episode_step.clone()
             episode = {"r": self._episode_return.clone(), "l": length, "t": length * self.control_dt}
+            sums = done, done * self._episode_return, done * length, nonfinite
+            for total, value in zip(self._statistics.values(), sums, strict=True):
+                total += value
         self._show()
         info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
         return obs, reward, terminated, truncated, info
@@ -284,6 +290,19 @@ class DiffEnv(VectorEnv):
             for to, value in zip(start, (self.qpos, self.qvel, self._obs), strict=True):
                 to.copy_(value)
         self.qpos, self.qvel, self._obs = start
+
+    def take_statistics(self) -> dict[str, Tensor]:
+        """What happened since the last call, as () tensors; the device is not waited for.
+
+        Returns:
+            "episodes": how many ended; "return" and "length": sums over them; "nonfinite": environments that blew up;
+            "nonfinite_gradients": adjoints of control steps that were not finite.
+        """
+        parts = self._statistics | {"nonfinite_gradients": self.sim.nonfinite_gradients}
+        sums = {name: part.sum() for name, part in parts.items()}
+        for part in parts.values():
+            part.zero_()
+        return sums
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Put all environments into given states, keeping their episode clocks; returns the observation (N, obs_dim).

@@ -1,4 +1,4 @@
-"""MuJoCo and Warp, started without noise, and an end in one line. The package imports this before everything else."""
+"""MuJoCo and Warp, started without noise. The package imports this before everything else; its host stays as it was."""
 
 from __future__ import annotations
 
@@ -7,68 +7,14 @@ import errno
 import importlib
 import os
 import shutil
-import signal
 import sys
-import threading
-import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType, TracebackType
 from typing import Any
 from weakref import WeakSet
 
-_one_line: tuple[type[BaseException], ...] = ()
-_interrupted = False  # while the package was imported
-
-
-def end_in_one_line(*kinds: type[BaseException]) -> None:
-    """From now on such errors, and Ctrl-C, end the program in one line on stderr instead of a traceback."""
-    global _one_line
-    _one_line = (KeyboardInterrupt, *kinds)
-
-
-def imported() -> None:
-    """The package is imported. Raises KeyboardInterrupt if Ctrl-C came and a module that was imported kept it back."""
-    if signal.getsignal(signal.SIGINT) is _note:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if _interrupted:
-        raise KeyboardInterrupt
-
-
-def _note(number: int, frame: FrameType | None) -> None:
-    global _interrupted
-    _interrupted = True
-    signal.default_int_handler(number, frame)
-
-
-def _report(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    global _interrupted
-    # An import that is interrupted fails somewhere in another package, with whatever error that makes of it.
-    imports = sum(frame.f_code.co_name == "<module>" for frame, _ in traceback.walk_tb(trace)) > 1
-    interrupted = _interrupted or (imports and issubclass(kind, KeyboardInterrupt))
-    no_memory = kind is RuntimeError and "can't allocate memory" in str(error)  # torch's on a CPU
-    if interrupted or issubclass(kind, _one_line) or (_one_line and no_memory):
-        text = "" if interrupted else str(error).partition("\n")[0]
-        print(f"{Path(sys.argv[0]).name}: {text or 'interrupted'}", file=sys.stderr)
-    else:
-        _others(kind, error, trace)
-    _interrupted = False
-
-
-def _report_in_thread(args: threading.ExceptHookArgs) -> None:
-    if type(args.thread).__name__ != "_AsyncWriterThread":  # tensorboard's raises its error in the main thread again
-        _others_in_threads(args)
-
-
-_others, sys.excepthook = sys.excepthook, _report
-_others_in_threads, threading.excepthook = threading.excepthook, _report_in_thread
-if signal.getsignal(signal.SIGINT) is signal.default_int_handler and (
-    threading.current_thread() is threading.main_thread()
-):
-    signal.signal(signal.SIGINT, _note)
-
-import warp as wp  # noqa: E402  Ctrl-C may come during this import and all that follow
+import warp as wp
 
 ROOM = 16 * 2**20  # bytes that a kernel takes in Warp's cache at most; LLVM aborts the process when there are fewer
 # What Warp prints when it starts and nobody needs: pip installs a Warp that supports the Python at hand.

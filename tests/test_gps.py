@@ -418,8 +418,8 @@ def test_an_evaluation_ends_where_the_robot_falls() -> None:
 def test_feedback(tmp_path: Path) -> None:
     """It learns the guides' lessons, and S has its guide."""
     modules = run(gps, tmp_path, *TINY, "--variant", "feedback")["modules"]
-    assert len(modules["search"]["lessons"]) == 3 and modules["samples"]["initial"] == 1
-    assert not torch.equal(modules["search"]["student"], modules["policy"]["theta"])
+    assert len(modules["learner"]["lessons"]) == 3 and modules["S"]["initial"] == 1
+    assert not torch.equal(modules["learner"]["student"], modules["network"]["theta"])
 
 
 def test_an_interrupted_run_keeps_its_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -449,23 +449,23 @@ def test_a_gpu_plans_and_learns_as_the_cpu_does(variant: str, tmp_path: Path) ->
     one, other = (run(gps, tmp_path / device, *flags, device)["modules"] for device in ("cpu", "cuda"))
     for part in ("x", "u", "K", "L"):
         place = LinearGaussian._fields.index(part)
-        torch.testing.assert_close(other["search"]["guides"][0][place].cpu(), one["search"]["guides"][0][place])
-    assert other["search"]["control_steps"] == one["search"]["control_steps"]
-    torch.testing.assert_close(other["policy"]["theta"].cpu(), one["policy"]["theta"], rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(other["learner"]["guides"][0][place].cpu(), one["learner"]["guides"][0][place])
+    assert other["learner"]["control_steps"] == one["learner"]["control_steps"]
+    torch.testing.assert_close(other["network"]["theta"].cpu(), one["network"]["theta"], rtol=1e-3, atol=1e-3)
 
 
 def test_seeds_and_adaptive_guides(tmp_path: Path) -> None:
     arguments = [*TINY, *"--guides 2 --adaptive 1 --adaptive-iterations 2 --stored 60 --seed".split()]
     one, other = (run(gps, tmp_path / str(seed), *arguments, seed)["modules"] for seed in (1, 2))
-    assert not torch.equal(one["policy"]["theta"], other["policy"]["theta"])
-    assert len(one["search"]["guides"]) == len(one["search"]["adapted"]) == one["samples"]["initial"] == 2
-    assert sum(len(generator) > 1 for generator in one["samples"]["generators"]) == 4
+    assert not torch.equal(one["network"]["theta"], other["network"]["theta"])
+    assert len(one["learner"]["guides"]) == len(one["learner"]["adapted"]) == one["S"]["initial"] == 2
+    assert sum(len(generator) > 1 for generator in one["S"]["generators"]) == 4
 
 
 def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
     path, qpos = tmp_path / "demo.npz", np.linspace((0.3, 3.0), (0.5, 2.8), 9)
     np.savez(path, qpos=qpos, qvel=np.zeros((9, 2)), action=np.full((8, 1), 0.1))
-    search = run(gps, tmp_path / "run", *TINY, "--demonstration", path)["modules"]["search"]
+    search = run(gps, tmp_path / "run", *TINY, "--demonstration", path)["modules"]["learner"]
     assert search["guides"][0][0][0].tolist() == [0.3, 3.0, 0.0, 0.0]
 
 
@@ -527,7 +527,7 @@ def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyP
     arguments = [*HOPPING, "level", "--practice", *kinds, "--perturb", "0"]
     whole = run(gps, tmp_path / "whole", *arguments)
     assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
-    start, S = whole["modules"]["search"]["guides"][0][0][0], whole["modules"]["samples"]
+    start, S = whole["modules"]["learner"]["guides"][0][0][0], whole["modules"]["S"]
     own = S["samples"][0][S["samples"][5] > 0]
     assert len(own) >= 6 and len(own[:, 1].unique(dim=0)) == len(own) and (own[:, 0] == start).all()
     search = gps.Search(gps.Args(**whole["args"]), environment("hopper", 1))
@@ -564,11 +564,11 @@ def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None
         ("--env hopper --terrain", "--terrain needs at least one name: level, incline:DEGREES"),
         ("--env hopper --practice incline:100", "terrain 'incline:100': degrees is 100.0"),
         ("--env hopper --practice rough:10 step:nan", "terrain 'step:nan': height is nan"),
-        ("--env cartpole --horizon 4611686018427387904", "--horizon must be between 1 and 10,000, not 46"),
-        ("--env cartpole --hidden 10001", "--hidden must be between 1 and 10,000, not 10001"),
-        ("--env cartpole --restarts 4611686018427387904", "--restarts must be between 1 and 10,000"),
-        ("--env cartpole --stored 4611686018427387904", "--stored must be between 1 and 10,000"),
-        ("--env cartpole --pretraining 2147483648", "--pretraining must be between 1 and 1,000,000"),
+        ("--env cartpole --horizon 4611686018427387904", "--horizon must be from 1 to 10,000, not 46"),
+        ("--env cartpole --hidden 10001", "--hidden must be from 1 to 10,000, not 10001"),
+        ("--env cartpole --restarts 4611686018427387904", "--restarts must be from 1 to 10,000"),
+        ("--env cartpole --stored 4611686018427387904", "--stored must be from 1 to 10,000"),
+        ("--env cartpole --pretraining 2147483648", "--pretraining must be from 1 to 10,000"),
         ("--env hopper --practice incline:10:1", "kind of terrain 'incline:10:1' must be incline:DEGREES"),
         ("--env hopper --terrain level step:1 step:2 --samples 2", "--samples must be at least 3, not 2"),
         ("--env hopper --terrain level step:1 --adaptive 1", "--adaptive takes one --terrain"),

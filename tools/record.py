@@ -16,7 +16,7 @@ import tyro
 from torch import Tensor
 
 from diffsim.tasks.imitation.clip import Clip, tangent
-from diffsim.training import evaluate, fail, load_policy, make_policy_env, parse_command_line
+from diffsim.training import evaluate, fail, load_policy, make_policy_env
 
 SETTLING = 3.0  # s at the start of the episode that are left out
 SHORTEST = 0.3  # s
@@ -58,7 +58,7 @@ def close(qpos: Tensor) -> Tensor:
 
 
 def main() -> None:
-    args = parse_command_line(Args, None, description=__doc__)
+    args = tyro.cli(Args, description=__doc__)
     torch.set_num_threads(1)
     saved = load_policy(args.policy)
     env = make_policy_env(saved, args.episodes)

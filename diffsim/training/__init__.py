@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint, make_policy_env
-from diffsim.training.checkpoint import Learner, SavedPolicy, Stateful, export_policy, load_policy
+from diffsim.training.checkpoint import Learner, SavedPolicy, export_policy, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
-from diffsim.training.errors import fail, parse_command_line
+from diffsim.training.errors import UsageError, command, fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import (
     Count,
@@ -21,6 +21,8 @@ from diffsim.training.flags import (
     NonNegative,
     ParallelFlags,
     Positive,
+    Repeats,
+    Width,
     Widths,
     parse,
     parse_penalty,
@@ -29,7 +31,7 @@ from diffsim.training.likeliest import Likeliest
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.replay import ReplayBuffer, Transition
-from diffsim.training.run import Run, episode_metrics
+from diffsim.training.run import Run
 from diffsim.view.gait import Gait, describe
 
 __all__ = [
@@ -50,15 +52,17 @@ __all__ = [
     "ObsNormalizer",
     "ParallelFlags",
     "Positive",
+    "Repeats",
     "ReplayBuffer",
     "Run",
     "SavedPolicy",
-    "Stateful",
     "Transition",
+    "UsageError",
+    "Width",
     "Widths",
+    "command",
     "describe",
     "distributed",
-    "episode_metrics",
     "evaluate",
     "evaluate_checkpoint",
     "export_policy",
@@ -67,6 +71,5 @@ __all__ = [
     "make_policy_env",
     "moments",
     "parse",
-    "parse_command_line",
     "parse_penalty",
 ]

@@ -94,7 +94,7 @@ def evaluate_checkpoint(
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
     """Print the gait, and leave evaluation.json and, if asked for, the video in the run's directory."""
     assert args.run_dir
-    names = ("env", "integrator", "substeps", "theta", "penalty", "device", "eval_episodes")
+    names = "env integrator substeps theta contact penalty early_termination clip device eval_episodes".split()
     settings = {name: getattr(args, name) for name in names} | dict(script=args.script(), iteration=iteration)
     if gait := describe(evaluation):
         print(f"gait: {gait}")

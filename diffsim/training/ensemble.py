@@ -27,7 +27,7 @@ class Linears(nn.Module):
         return torch.baddbmm(self.bias + norms.bias @ self.weight, x, norms.weight.mT * self.weight)
 
     def __getitem__(self, e: int) -> nn.Linear:
-        layer = nn.Linear(*self.weight.shape[1:]).to(self.weight)
+        layer = nn.utils.skip_init(nn.Linear, *self.weight.shape[1:]).to(self.weight)  # draws no random numbers
         layer.load_state_dict({"weight": self.weight[e].T, "bias": self.bias[e, 0]})
         return layer
 

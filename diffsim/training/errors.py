@@ -1,40 +1,74 @@
-"""Errors of a script's user: one line, exit code 2; on its command line as well."""
+"""Errors of a script's user, and the end of a script in one line."""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import re
+import functools
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import NoReturn, ParamSpec
 
-import tyro
+import torch
 
+from diffsim.env import ActionError
+from diffsim.robot.scene import SceneError
+from diffsim.sim.launcher import TooLargeError
+from diffsim.startup import KernelCacheError
+from diffsim.terrain import TerrainError
 from diffsim.training import distributed
 
-T = TypeVar("T")
+P = ParamSpec("P")
+
+
+class UsageError(ValueError):
+    """What a user asked for cannot be done. The message is one line: what is wrong, and what is allowed."""
+
+
+# Errors whose message says all that a user needs.
+EXPECTED = (
+    *(UsageError, SceneError, TerrainError, TooLargeError, KernelCacheError, ActionError),
+    *(FloatingPointError, torch.OutOfMemoryError),
+)
 
 
 def fail(message: object) -> NoReturn:
-    """End the script with one line on stderr and exit code 2; of several ranks only the first prints it."""
+    """Raise a UsageError; a script that is a `command` ends with it."""
+    raise UsageError(str(message))
+
+
+def command(main: Callable[P, None]) -> Callable[P, None]:
+    """Make a script's main end the process with one line on stderr where its user is at fault.
+
+    The exit code is 2 for an expected error and 130 for Ctrl-C. Other errors keep their traceback. Only the first rank
+    prints.
+    """
+
+    @functools.wraps(main)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        report, threading.excepthook = threading.excepthook, _report_in_thread
+        try:
+            main(*args, **kwargs)
+        except KeyboardInterrupt:
+            _end("interrupted", 130)
+        except EXPECTED as error:
+            _end(error, 2)
+        except RuntimeError as error:
+            if "can't allocate memory" not in str(error):  # torch's words on a CPU
+                raise
+            _end(error, 2)
+        finally:
+            threading.excepthook = report
+
+    return run
+
+
+def _end(message: object, code: int) -> NoReturn:
     if distributed.rank() == 0:
-        print(f"{Path(sys.argv[0]).name}: {message}", file=sys.stderr)
-    sys.exit(2)
+        print(f"{Path(sys.argv[0]).name}: {str(message).partition(chr(10))[0]}", file=sys.stderr)
+    raise SystemExit(code) from None
 
 
-def parse_command_line(kind: type[T], argv: Sequence[str] | None, **options: Any) -> T:
-    """tyro.cli; where it would end with a box around what is wrong, the script ends with one line."""
-    box = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(box):
-            return tyro.cli(kind, args=argv, **options)
-    except SystemExit as end:
-        if not end.code:  # --help
-            raise
-        text = re.sub(r"\x1b\[[\d;]*m|[│|╭╮╰╯]", " ", box.getvalue())
-        # Horizontal rules separate the title, what is wrong, and flags with similar names.
-        _, wrong, *more = [" ".join(part.split()) for part in re.split(r"\s[-─]{5,}[^\n]*\n", text)]
-        similar = re.findall(r"^[^-]*(--[\w-]+)", more[0]) if "Perhaps you meant" in text else []
-        fail(wrong + "".join(f"; perhaps you meant {flag}" for flag in similar))
+def _report_in_thread(args: threading.ExceptHookArgs) -> None:
+    if type(args.thread).__name__ != "_AsyncWriterThread":  # tensorboard's raises its error in the main thread again
+        threading.__excepthook__(args)

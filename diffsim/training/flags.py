@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
-import inspect
-import itertools
 import math
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import torch
 import tyro
 
-from diffsim.env import ActionError
-from diffsim.sim.launcher import TooLargeError
-from diffsim.startup import KernelCacheError, end_in_one_line
 from diffsim.tasks import TASKS, HumanoidImitation
 from diffsim.tasks.imitation.clip import Clip, read_clip
-from diffsim.terrain import TerrainError
 from diffsim.training import checkpoint, distributed
-from diffsim.training.errors import fail, parse_command_line
+from diffsim.training.errors import fail
 from diffsim.training.variation import parse_ranges
 from diffsim.view import render
 
@@ -36,29 +27,31 @@ RANDOMISED = ("stiffness=0.45:2.2", "friction=0.85:1.17")  # with --contact firm
 
 @dataclass(frozen=True)
 class Range:
-    """What a finite number on the command line may be."""
+    """What a value on the command line may be."""
 
     words: str
-    holds: Callable[[float], bool]
+    holds: Callable[[Any], bool]
 
-    def complaint(self, value: float) -> str | None:
-        if not abs(value) <= LARGEST:
-            return (
-                f"must be finite in single precision, not {value}"
-                if math.isfinite(value)
-                else f"must be finite, not {value}"
-            )
+    def complaint(self, value: Any) -> str | None:
+        if isinstance(value, float) and not abs(value) <= LARGEST:
+            return f"must be finite{' in single precision' if math.isfinite(value) else ''}, not {value}"
         return None if self.holds(value) else f"must be {self.words}, not {value}"
 
 
-Count = Annotated[int, Range("at least 1", lambda value: value >= 1)]
-Natural = Annotated[int, Range("at least 0", lambda value: value >= 0)]
+def _whole(least: int, most: int) -> Range:
+    return Range(f"from {least} to {most:,}", lambda value: least <= value <= most)
+
+
+Count = Annotated[int, _whole(1, 10**9)]
+Natural = Annotated[int, _whole(0, 10**9)]
+Repeats = Annotated[int, _whole(1, 10_000)]  # passes, networks: what takes time or memory one after the other
+Width = Annotated[int, _whole(1, 65_536)]
 Finite = Annotated[float, Range("finite", math.isfinite)]
 Positive = Annotated[float, Range("positive", lambda value: value > 0)]
 NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
 Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]
 Decay = Annotated[float, Range("in [0, 1)", lambda value: 0 <= value < 1)]
-Widths = tuple[Count, ...]
+Widths = Annotated[tuple[Width, ...], Range("at least one number", lambda value: len(value) > 0)]
 ClipFile = Annotated[
     Clip | None,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -136,14 +129,18 @@ class RunFlags:
 class Flags(SimulatorFlags, RunFlags):
     """What every script takes. Each extends it by its hyperparameters."""
 
-    FIXED: ClassVar[tuple[str, ...]] = ("env", "clip")  # what a checkpoint decides
+    # What may change when a run goes on or is evaluated; the checkpoint decides everything else.
+    MAY_CHANGE: ClassVar[tuple[str, ...]] = (
+        *("accuracy", "integrator", "substeps", "theta", "contact", "penalty", "early_termination", "threads"),
+        *(field.name for field in dataclasses.fields(RunFlags) if field.name != "seed"),
+    )
 
     def task_defaults(self) -> dict[str, Any]:
         """Defaults that depend on other flags, such as the task, the device or the preset."""
         return {}
 
     def check(self) -> None:
-        """Ends the script where arguments do not fit together."""
+        """Raises a ValueError where arguments do not fit together."""
         if self.clip and not issubclass(TASKS[self.env], HumanoidImitation):
             fail(f"--clip is of {HumanoidImitation.name}: {self.env} tracks no motion")
 
@@ -157,7 +154,7 @@ class Flags(SimulatorFlags, RunFlags):
 class ParallelFlags(Flags):
     """Many environments at once."""
 
-    FIXED: ClassVar[tuple[str, ...]] = (*Flags.FIXED, "num_envs")
+    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*Flags.MAY_CHANGE, "cuda_graph", "anneal", "randomise", "redraw")
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""
@@ -191,7 +188,7 @@ def flag(name: str) -> str:
 
 
 def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
-    """The command line as complete, checked arguments; anything wrong ends the script with one line.
+    """The command line as complete, checked arguments.
 
     Defaults that depend on the task, its preset and the device fill what is not given. With --resume and --evaluate
     the arguments of the checkpoint take their place.
@@ -199,9 +196,11 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     Args:
         kind: the script's dataclass of arguments.
         argv: in place of the process's.
+
+    Raises:
+        ValueError: an argument out of range, or one that does not fit to the others or to the checkpoint.
+        SystemExit: --help, or what tyro cannot parse.
     """
-    kinds = KernelCacheError, TooLargeError, ActionError, TerrainError, FloatingPointError, torch.OutOfMemoryError
-    end_in_one_line(*kinds)
     argv = list(sys.argv[1:] if argv is None else argv)
     # The first pass finds what the defaults of the second depend on, so that its --help shows the task's own.
     args = _cli(kind, [word for word in argv if word not in ("-h", "--help")], kind())
@@ -219,10 +218,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args = _cli(kind, argv, defaults)
         args.device = distributed.choose_device(args.device)
     check_ranges(args)
-    try:
-        args.check()
-    except TerrainError as error:
-        fail(error)
+    args.check()
     if args.capture_video and distributed.rank() == 0:
         try:
             render.check_opengl()
@@ -249,11 +245,9 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     saved = checkpoint.load(path, kind.script())
     if given.resume and "modules" not in saved:
         fail(f"{path} holds a policy alone, which can be evaluated but not resumed")
-    try:
-        defaults = kind(**saved["args"])
-    except TypeError:
-        unknown = ", ".join(flag(name) for name in saved["args"] if not hasattr(kind, name))
-        fail(f"{path} was written by a {kind.script()}.py with other flags: {unknown}")
+    if unknown := [flag(name) for name in saved["args"] if not hasattr(kind, name)]:
+        fail(f"{path} was written by a {kind.script()}.py with other flags: {', '.join(unknown)}")
+    defaults = kind(**saved["args"])
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained
     words = {word.partition("=")[0] for word in argv}
@@ -265,9 +259,11 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         defaults = dataclasses.replace(defaults, **presets)
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
-    for name in kind.FIXED:
-        if getattr(args, name) != getattr(defaults, name):
-            fail(f"{path} has {flag(name)} {getattr(defaults, name)}, not {getattr(args, name)}")
+    for field in dataclasses.fields(kind):
+        own, wanted = getattr(defaults, field.name), getattr(args, field.name)
+        if own != wanted and field.name not in kind.MAY_CHANGE:
+            free = ", ".join(map(flag, kind.MAY_CHANGE))
+            fail(f"{path} has {flag(field.name)} {own}, not {wanted}; what may change is {free}")
     if args.resume:
         last = min(args.iterations, args.stop_after or args.iterations)
         if saved["iteration"] >= last:
@@ -280,52 +276,26 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
-    """One pass of tyro, which shows what each class of the hierarchy declares as a group of its own."""
-    fields, groups, seen = list[tuple[str, Any]](), list[Any](), set[str]()
-    for owner in (base for base in kind.__mro__ if dataclasses.is_dataclass(base)):
-        hints, texts = get_type_hints(owner, include_extras=True), _help_texts(owner)
-        own = [name for name in texts if name not in seen]
-        seen.update(own)
-        if own:
-            flags = [(name, Annotated[hints[name], tyro.conf.arg(help=texts[name])]) for name in own]
-            group = dataclasses.make_dataclass(owner.__name__, flags, namespace={"__doc__": owner.__doc__})
-            title = kind.script() if owner is kind else owner.__name__.removesuffix("Flags").lower()
-            fields.append((f"group{len(groups)}", Annotated[group, tyro.conf.arg(name=title)]))
-            groups.append(group(**{name: getattr(defaults, name) for name in own}))
-    every = dataclasses.make_dataclass(kind.__name__, fields)
-    description = sys.modules[kind.__module__].__doc__
-    config = (tyro.conf.OmitArgPrefixes,)
-    parsed: Any = parse_command_line(every, argv, description=description, default=every(*groups), config=config)
-    return kind(**{name: value for group in vars(parsed).values() for name, value in vars(group).items()})
-
-
-@cache
-def _help_texts(owner: type) -> dict[str, str]:
-    """The string below each field that a class itself declares."""
-    (node,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
-    texts = {}
-    for field, text in itertools.pairwise(node.body if isinstance(node, ast.ClassDef) else []):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
-            texts[field.target.id] = ast.literal_eval(text.value)
-    return texts
+    return tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
 
 
 def check_ranges(args: object) -> None:
-    """End the script where a number of a dataclass of flags is not in the range that its type asks for."""
+    """Raise a ValueError where a value of a dataclass of flags is not what its type asks for."""
     for name, hint in get_type_hints(type(args), include_extras=True).items():
-        value = getattr(args, name)
-        for number, allowed in _ranges(hint, value):
-            if complaint := allowed.complaint(number):
+        for value, allowed in _ranges(hint, getattr(args, name, None)):
+            if complaint := allowed.complaint(value):
                 fail(f"{flag(name)} {complaint}")
 
 
-def _ranges(hint: Any, value: Any) -> list[tuple[float, Range]]:
-    """The numbers of a value with what each may be; of a tuple those of its elements."""
+def _ranges(hint: Any, value: Any) -> list[tuple[Any, Range]]:
+    """A value, and those inside a tuple, each with what it may be."""
+    found = [(value, marker) for marker in getattr(hint, "__metadata__", ()) if isinstance(marker, Range)]
+    hint = hint.__origin__ if hasattr(hint, "__metadata__") else hint
     if get_origin(hint) is tuple:
         kinds = get_args(hint)
         kinds = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
-        return [found for kind, number in zip(kinds, value, strict=True) for found in _ranges(kind, number)]
-    return [(value, marker) for marker in getattr(hint, "__metadata__", ()) if isinstance(marker, Range)]
+        found += [part for kind, number in zip(kinds, value, strict=True) for part in _ranges(kind, number)]
+    return found
 
 
 def parse_penalty(items: Sequence[str]) -> dict[str, float]:

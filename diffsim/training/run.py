@@ -7,7 +7,6 @@ import json
 import signal
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -33,23 +32,8 @@ from diffsim.training.variation import Variation, parse_ranges, soft_factors
 L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
 
-EPISODES = ("episodes/count", "episodes/return", "episodes/length")  # sums of an iteration, see episode_metrics
-TOTALS = ("sim/nonfinite", "sim/nonfinite_gradients")  # counts of an iteration, logged as running totals
+TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
 RANK_SEED = 1_000_003  # between the seeds of two ranks
-
-
-def episode_metrics(env: DiffEnv, done: Tensor, episode: Mapping[str, Tensor], nonfinite: Tensor) -> Metrics:
-    """What `Run` makes episode statistics of: sums over a window of (H, N) steps.
-
-    Args:
-        done: which steps ended an episode.
-        episode: "r" and "l", return and length of the episode so far, as in the info of DiffEnv.step.
-        nonfinite: which steps left the finite numbers.
-    """
-    sums = (done.sum(), (done * episode["r"]).sum(), (done * episode["l"]).sum())
-    gradients = env.sim.nonfinite_gradients.sum()
-    env.sim.nonfinite_gradients.zero_()
-    return dict(zip(EPISODES, sums, strict=True)) | dict(zip(TOTALS, (nonfinite.sum(), gradients), strict=True))
 
 
 class Mark:
@@ -77,9 +61,9 @@ class Entry:
     """An iteration that is not written yet: the device may still work on it."""
 
     iteration: int
-    control_steps: int
+    control_steps: int  # in all
     names: list[str]
-    numbers: Tensor  # of the names, then how many signals have arrived
+    numbers: Tensor  # of the names, then the statistics of its episodes, then how many signals have arrived
     scalars: dict[str, float]  # that are known already
     begin: Mark
     end: Mark
@@ -118,6 +102,7 @@ class Run:
         torch.set_num_threads(1)  # operations this small gain little from more; idle threads disturb the simulator's
         torch.manual_seed(args.seed)
         self.iteration, self.seconds, self.control_steps = 0, 0.0, 0
+        self._written_steps = 0
         self._saved = self._state["iteration"] if self._state else 0
         self.last = min(args.iterations, args.stop_after or args.iterations)
         self._totals, self._episodes = dict.fromkeys(TOTALS, 0), EpisodeStatistics()
@@ -126,12 +111,11 @@ class Run:
         self._samples = 0  # control steps of an iteration, of all ranks
         self._learner: Learner | None = None
         self._log: ProgressLog | None = None
-        self._pending: deque[Entry] = deque()
+        self._pending: Entry | None = None
         self._timings: list[tuple[str, Mark, Mark]] = []
         self._evaluation: tuple[int, Evaluation] | None = None
         self._scalars: dict[str, float] = {}
         self._mark = Mark(self.device)
-        self._simulated: dict[str, float] = {}
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
         self._stopping = False
@@ -172,6 +156,7 @@ class Run:
             self.iteration, self.seconds, self.control_steps = (
                 state[name] for name in ("iteration", "seconds", "control_steps")
             )
+            self._written_steps = self.control_steps
             self._totals |= state["totals"]
             self._episodes.windows.extend(state["episodes"])
         return learner
@@ -223,29 +208,31 @@ class Run:
             sys.exit(128 + self._signals[0])
 
     def log(self, metrics: Mapping[str, Tensor | float], control_steps: int | None = None) -> None:
-        """Take an iteration's metrics: () tensors, averaged over the ranks, and numbers.
+        """Take an iteration's metrics; those of its episodes come from the environment of `make_env`.
 
         Args:
-            metrics: by their names in tensorboard; those of `episode_metrics` become episode statistics and totals.
-            control_steps: of experience so far; by default every iteration has a window of all environments.
+            metrics: by their names in tensorboard: () tensors, averaged over the ranks, and numbers.
+            control_steps: how many this iteration took, of all ranks; by default a window of all environments.
         """
         self._open()
-        names = [name for name, value in metrics.items() if isinstance(value, Tensor)]
-        tensors = [value.detach() for value in metrics.values() if isinstance(value, Tensor)]
-        numbers = torch.stack([*tensors, torch.full((), float(len(self._signals)), device=self.device)])
-        numbers = distributed.average(numbers).to("cpu", non_blocking=True)
+        tensors = {name: value.detach() for name, value in metrics.items() if isinstance(value, Tensor)}
+        if self._env is not None:
+            tensors |= self._env.take_statistics()
+        signals = torch.full((), float(len(self._signals)), device=self.device)
+        numbers = distributed.average(torch.stack([*tensors.values(), signals])).to("cpu", non_blocking=True)
         scalars = {name: float(value) for name, value in metrics.items() if not isinstance(value, Tensor)}
-        if self._env is not None and self.device.type == "cpu":
-            for kernel, seconds in self._env.sim.seconds.items():
-                scalars[f"time/sim_{kernel}"] = seconds - self._simulated[kernel]
-        steps = self.iteration * self._samples if control_steps is None else control_steps
-        begin, end = self._mark, Mark(self.device)
-        self._pending.append(Entry(self.iteration, steps, names, numbers, scalars, begin, end, self._timings))
+        previous, begin, end = self._pending, self._mark, Mark(self.device)
+        self.control_steps += self._samples if control_steps is None else control_steps
+        entry = self.iteration, self.control_steps, list(tensors), numbers, scalars, begin, end, self._timings
+        self._pending = Entry(*entry)
         self._start_clock(end)
+        if previous is not None:  # the device works on this iteration while the one before is written
+            self._write(previous)
 
     def log_evaluation(self, evaluation: Evaluation) -> None:
         """Take the evaluation of the iteration that was logged last."""
-        entry = self._pending[-1]
+        entry = self._pending
+        assert entry is not None, "log the iteration first"
         entry.evaluation = evaluation
         entry.scalars |= evaluation.scalars()
         self._evaluation = self.iteration, evaluation
@@ -259,33 +246,35 @@ class Run:
 
     def _start_clock(self, mark: Mark | None = None) -> None:
         self._mark, self._timings = mark or Mark(self.device), []
-        if self._env is not None:
-            self._simulated = dict(self._env.sim.seconds)
 
     def _end_iteration(self) -> None:
         every = self.args.save_every
         saving = self.iteration == self.last or (every > 0 and self.iteration % every == 0)
-        behind = int(self.device.type == "cuda")  # the GPU works on this iteration while the one before is written
-        while self._pending and (len(self._pending) > behind or self._evaluates() or saving or self._stopping):
-            self._write(self._pending.popleft())
+        if self.device.type == "cpu" or self._evaluates() or saving or self._stopping:
+            self._flush()
         if saving or self._stopping:
             self._save()
         if saving or self._evaluates():
             self._start_clock()
+
+    def _flush(self) -> None:
+        entry, self._pending = self._pending, None
+        if entry is not None:
+            self._write(entry)
 
     def _write(self, entry: Entry) -> None:
         """Write an iteration that the device has finished."""
         entry.end.wait()
         ranks, (*numbers, signals) = distributed.size(), entry.numbers.tolist()
         self._stopping = self._stopping or signals > 0
-        seconds, steps = entry.end.since(entry.begin), entry.control_steps - self.control_steps
-        self.seconds, self.control_steps = self.seconds + seconds, entry.control_steps
+        seconds, steps = entry.end.since(entry.begin), entry.control_steps - self._written_steps
+        self.seconds, self._written_steps = self.seconds + seconds, entry.control_steps
         scalars = dict(zip(entry.names, numbers, strict=True)) | entry.scalars
-        if EPISODES[0] in scalars:
-            self._episodes.add(*(ranks * scalars.pop(name) for name in EPISODES))
+        if "episodes" in scalars:
+            self._episodes.add(*(ranks * scalars.pop(name) for name in ("episodes", "return", "length")))
             for name in TOTALS:
-                self._totals[name] += round(ranks * scalars[name])
-                scalars[name] = self._totals[name]
+                self._totals[name] += round(ranks * scalars.pop(name))
+                scalars[f"sim/{name}"] = self._totals[name]
             if self._episodes.windows:
                 scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
         scalars |= {"charts/SPS": steps / seconds, "time/total": seconds}

@@ -105,7 +105,7 @@ def test_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     sim = diffsim.make("cartpole", 250, substeps=2).sim
     for value, expected in zip(sim.step(qpos[:-1], qvel[:-1], action), (qpos[1:], qvel[1:]), strict=True):
         torch.testing.assert_close(value, expected)
-    search = run(gps, tmp_path / "gps", *SMALL, "--demonstration", path)["modules"]["search"]
+    search = run(gps, tmp_path / "gps", *SMALL, "--demonstration", path)["modules"]["learner"]
     assert search["guides"][0][0][0].tolist() == [*data["qpos"][0], *data["qvel"][0]]
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["gps_experiments.py"])
