@@ -1,12 +1,11 @@
 """Planning from many starts at once: how long an iteration of iLQR takes, and whether more starts find better plans.
 
-    python benchmarks/starts.py                       cartpole, hopper and walker from 1, 4, 16 and 64 starts
-    python benchmarks/starts.py --device cuda         on a GPU
-    python benchmarks/starts.py --robots walker --starts 256 --draw-only
+    python benchmarks/starts.py --iterations 20                     cartpole, hopper, walker from 1, 4, 16 and 64 starts
+    python benchmarks/starts.py --iterations 20 --device cuda       on a GPU
 
 A start is a random action sequence from the task's start state; a smaller number takes the first ones of a larger. All
-are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes starts.csv and, with --update-results,
-the table of docs/gps_terrain.md, which puts the machines side by side.
+are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes starts.csv and, with --update-results, the
+table of docs/gps_terrain.md, which puts the machines side by side.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from tables import ROOT, Row, digits, markdown, read_csv
 
 import diffsim
 from diffsim.planning import ilqr, starting_actions
-from diffsim.training import Count
+from diffsim.training import Count, command
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
@@ -69,21 +68,18 @@ def measure(args: Args, robot: Robot, starts: int) -> Row:
 
 
 def table(machines: dict[str, list[dict[str, str]]]) -> list[Row]:
-    """One row for each task and number of starts: the machines side by side, the costs of the first."""
+    """A row for each task and number of starts: milliseconds of an iteration by machine, the costs of the first."""
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for name, measured in machines.items():
         for row in measured:
-            own = rows.setdefault(tuple(row[key] for key in ("task", "T", "starts")), {})
-            own.setdefault("best", row["best"])
-            own.setdefault("median", row["median"])
-            own[f"{name}, ms per iteration"] = digits(1e3 * float(row["seconds"]))
-            own[f"{name}, ms per start"] = row["ms_per_start"]
-    columns = [f"{name}, {what}" for what in ("ms per iteration", "ms per start") for name in machines]
-    columns += ["best", "median"]
-    order = sorted(rows, key=lambda key: (get_args(Robot).index(key[0]), int(key[2])))
+            own = rows.setdefault(
+                (row["task"], row["T"], row["starts"]), {"best": row["best"], "median": row["median"]}
+            )
+            own[f"{name}, ms"] = digits(1e3 * float(row["seconds"]))
+    columns = [*(f"{name}, ms" for name in machines), "best", "median"]
     return [
         dict(zip(("task", "T", "starts"), key, strict=True)) | {c: rows[key].get(c, "") for c in columns}
-        for key in order
+        for key in sorted(rows, key=lambda key: (key[0], int(key[2])))
     ]
 
 
@@ -98,4 +94,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    command(lambda: main(parse(Args, __doc__)))()
