@@ -47,8 +47,7 @@ CASES |= {"full-80": "--variant full --perturb 0"}  # on a GPU
 CASES |= {"feedback": "--variant feedback --perturb 0", "feedback-start": "--variant feedback"}
 CASES |= {"feedback-short": "--variant feedback --perturb 0 --horizon 160"}
 CASES |= {"feedback-few": "--variant feedback --perturb 0 --samples 4 --guiding-samples 10 --active 40"}
-CASES |= {"feedback-stiff": "--variant feedback --perturb 0 --tracking 0.05"}
-CASES |= dict.fromkeys(("feedback-long", "feedback-long-cpu"), "--variant feedback --samples 20 --active 120")
+CASES |= {"feedback-long": "--variant feedback --samples 20 --active 120"}  # on a GPU
 # On which ground the walker trains: one slope, as in Figure 3; rough ground, as in Figure 4; many terrains, with a
 # guide each, and random ones of their kinds; without the random ones; without guides but that of level ground
 SLOPES = "level incline:10 incline:-10 incline:5 incline:-5 step:5 step:-5"
@@ -80,11 +79,9 @@ SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
     ],
     "hopper": [
         ("feedback", FIVE, f"{HOPPER} {BRIEF} --imitation 14 --iterations 19"),
-        ("feedback-stiff", TWO, f"{HOPPER} {BRIEF} --imitation 16 --iterations 16"),
         ("feedback-few", TWO, f"{HOPPER} {BRIEF} --imitation 16 --iterations 22"),
         (f"full {OTHERS}", THREE, f"{HOPPER} {LONGER} --iterations 25"),
         ("policy-gradient", THREE, f"{HOPPER} {LONGER} --iterations 40"),
-        ("adaptive", ONE, f"{HOPPER} {LONGER} --adaptive 5 --iterations 15"),
         ("full-80", ONE, f"{HOPPER} {BRIEF} --iterations 80 --device cuda"),
         ("feedback-start", TWO, f"{HOPPER} {BRIEF} --imitation 14 --iterations 19"),
     ],
@@ -93,7 +90,6 @@ SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
         ("feedback-short", FIVE, f"{WALKER} {BRIEF} --imitation 24 --iterations 34"),
         (f"full {OTHERS} policy-gradient adaptive", THREE, f"{WALKER} {BRIEF} --horizon 160 --iterations 24"),
         ("feedback-long", FIVE, f"{WALKER} {BRIEF} --imitation 60 --iterations 90 --device cuda"),
-        ("feedback-long-cpu", (2, 4), f"{WALKER} {BRIEF} --imitation 60 --iterations 150"),
         ("feedback-start", TWO, f"{WALKER} {BRIEF} --horizon 160 --imitation 24 --iterations 34"),
         ("feedback-terrain", FIVE, TERRAIN),
         ("feedback-slope feedback-rough feedback-guides feedback-practice", TWO, TERRAIN),

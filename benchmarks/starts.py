@@ -4,8 +4,7 @@
     python benchmarks/starts.py --iterations 20 --device cuda       on a GPU
 
 A start is a random action sequence from the task's start state; a smaller number takes the first ones of a larger. All
-are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes starts.csv and, with --update-results, the
-table of docs/gps_terrain.md, which puts the machines side by side.
+are optimised side by side, by gps.py's cost, on a CPU by one thread. Writes starts.csv.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Literal, get_args
 import torch
 import tyro
 from common import CommonFlags, Tasks, parse
-from tables import ROOT, Row, digits, markdown, read_csv
+from tables import ROOT, Row, digits
 
 import diffsim
 from diffsim.planning import ilqr, starting_actions
@@ -67,30 +66,12 @@ def measure(args: Args, robot: Robot, starts: int) -> Row:
     return case | dict(finite=len(x), done=done) | speed | dict(best=min(costs), median=median(costs))
 
 
-def table(machines: dict[str, list[dict[str, str]]]) -> list[Row]:
-    """A row for each task and number of starts: milliseconds of an iteration by machine, the costs of the first."""
-    rows: dict[tuple[str, ...], dict[str, str]] = {}
-    for name, measured in machines.items():
-        for row in measured:
-            own = rows.setdefault(
-                (row["task"], row["T"], row["starts"]), {"best": row["best"], "median": row["median"]}
-            )
-            own[f"{name}, ms"] = digits(1e3 * float(row["seconds"]))
-    columns = [*(f"{name}, ms" for name in machines), "best", "median"]
-    return [
-        dict(zip(("task", "T", "starts"), key, strict=True)) | {c: rows[key].get(c, "") for c in columns}
-        for key in sorted(rows, key=lambda key: (key[0], int(key[2])))
-    ]
-
-
 def main(args: Args) -> None:
     for robot in () if args.draw_only else args.robots:
         for starts in args.starts:
             row = measure(args, robot, starts)
             print("  " + ", ".join(f"{column} {digits(value)}" for column, value in row.items()), flush=True)
             args.merge("starts", [row], KEY)
-    machines = {name: read_csv(path) for name, path in args.machines("starts").items()}
-    args.publish("planning starts", markdown(table(machines)), "gps_terrain.md", everywhere=True)
 
 
 if __name__ == "__main__":
