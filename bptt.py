@@ -55,7 +55,7 @@ PER_TASK = {
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "final_lr")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "final_lr", "betas", "max_grad_norm", "gamma")
 
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""

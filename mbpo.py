@@ -37,6 +37,7 @@ from diffsim.training import (
     Positive,
     ReplayBuffer,
     Run,
+    SomeWidths,
     Transition,
     Widths,
     command,
@@ -72,7 +73,7 @@ HELD_OUT_BATCH = 1024
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "actor_lr", "temperature_lr", "model_lr")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "steps", "updates", "batch_size", "real_ratio", "gamma", "tau")
 
     iterations: Count = 2_000
     """learning iterations (per task)"""
@@ -112,7 +113,7 @@ class Args(ParallelFlags):
     """samples of such an update"""
     real_ratio: Fraction = 0.05
     """share of them that are real"""
-    hidden: Widths = (256, 128, 64)
+    hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
     actor_lr: Positive = 5e-4
     """learning rate of actor and critics (per task)"""

@@ -36,6 +36,7 @@ from diffsim.training import (
     Positive,
     ReplayBuffer,
     Run,
+    SomeWidths,
     Transition,
     Widths,
     command,
@@ -115,9 +116,9 @@ class Args(ParallelFlags):
     """parallel environments N, over all processes of torchrun (per task; PPO on a CPU: at most 256)"""
     horizon: Count = 32
     """control steps of a window (1/60 s each) (per task)"""
-    hidden: Widths = (256, 128, 64)
+    hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of the policy, which PPO's value shares (per task)"""
-    critic_hidden: Widths = (128, 128)
+    critic_hidden: SomeWidths = (128, 128)
     """units of the hidden layers of SHAC's and SAC's critics (per task)"""
     lr: Positive = 3e-4
     """learning rate of the policy; of PPO the initial one, of SHAC too (per task)"""

@@ -60,7 +60,7 @@ PER_ORDER = {
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    MAY_CHANGE = (*Flags.MAY_CHANGE, "lr", "epochs")
+    MAY_CHANGE = (*Flags.MAY_CHANGE, "improvements", "candidates", "max_step", "imitate", "epochs", "batch_size")
 
     iterations: Count = 120
     """learning iterations (per order)"""

@@ -35,8 +35,8 @@ from diffsim.training import (
     Repeats,
     ReplayBuffer,
     Run,
+    SomeWidths,
     Transition,
-    Widths,
     command,
     distributed,
     evaluate,
@@ -75,7 +75,19 @@ LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
 class Args(ParallelFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "steps", "actor_lr", "critic_lr", "temperature_lr", "target_entropy")
+    MAY_CHANGE = (
+        *ParallelFlags.MAY_CHANGE,
+        *(
+            "steps",
+            "updates_per_step",
+            "actor_updates",
+            "batch_size",
+            "critic_subset",
+            "target_entropy",
+            "gamma",
+            "tau",
+        ),
+    )
 
     iterations: Count = 20_000
     """learning iterations, `steps` control steps of all environments with their updates each (per task)"""
@@ -95,7 +107,7 @@ class Args(ParallelFlags):
     """transitions in the replay buffer, over all environments"""
     seed_steps: Natural = 640
     """control steps of each environment with random actions before the first update (per task)"""
-    hidden: Widths = (256, 128, 64)
+    hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
     critics: Repeats = 2
     """value functions"""

@@ -21,9 +21,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from diffsim import DiffEnv
+from diffsim import DiffEnv, Integration
 from diffsim.tasks import TASKS, Task
 from diffsim.training import (
+    ClippedAdam,
     Count,
     Decay,
     Ensemble,
@@ -35,6 +36,7 @@ from diffsim.training import (
     Positive,
     Repeats,
     Run,
+    SomeWidths,
     Widths,
     command,
     distributed,
@@ -45,20 +47,33 @@ from diffsim.training import (
     parse,
 )
 
-# SHAC's networks; docs/sapo.md has what was measured with these settings.
+# SHAC's networks; docs/sapo.md has what was measured with these settings, which are those of its best results.
 # fmt: off
 COLUMNS = ("actor_hidden", "critic_hidden", "activation", "actor_lr", "critic_lr", "target_alpha", "initial_log_std",
            "initial_target_entropy", "target_entropy", "population", "num_envs", "iterations", "critic_iterations")
 PER_TASK = {
     "cartpole":     ((64, 64),      (64, 64),   "elu",  1e-2, 1e-3, 0.2,  -1.0,  0.0, -1.5,  1,   64,  500, 16),
-    "hopper":       ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-4, 0.9,  -1.0,  0.0, -1.5,  8, 1024, 1500, 16),
+    "hopper":       ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-4, 0.9,  -1.0,  0.0, -1.5,  8, 1024, 1100, 16),
     "half_cheetah": ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0,  1,  256, 2000, 16),
     "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0, 16, 2048, 2500, 16),
     "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
     "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400, 16),
     "humanoid_imitation": ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
 }
+# How --accuracy default integrates, where that is not as in the paper.
+INTEGRATION = {
+    "hopper": TASKS["hopper"].integration("fast"),
+    "half_cheetah": TASKS["half_cheetah"].integration("fast"),
+    "ant": TASKS["ant"].integration("fast"),
+    "humanoid": Integration("implicit", 16),
+    "humanoid_mtu": Integration("implicit", 16),
+}
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
+ON_CPU = {
+    "ant": {"iterations": 1500},
+    "humanoid": {"critic_iterations": 4},
+    "humanoid_mtu": {"critic_iterations": 4, "iterations": 1000},
+}
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
 START_NOISE = 0.15  # standard deviation around the policy to start from, so that it is seen off its path too
@@ -70,7 +85,11 @@ SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
 class Args(ParallelFlags):
     """The algorithm. With --no-entropy --no-state-std --critics 1 --activation elu it is SHAC."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "actor_lr", "critic_lr", "final_lr", "temperature_lr")
+    MAY_CHANGE = (
+        *ParallelFlags.MAY_CHANGE,
+        *("horizon", "actor_lr", "critic_lr", "final_lr", "temperature_lr", "betas", "max_grad_norm", "gamma"),
+        *("td_lambda", "target_alpha", "target_entropy", "critic_iterations", "critic_minibatches"),
+    )
 
     entropy: bool = True
     """the policy's entropy is part of the reward"""
@@ -102,9 +121,9 @@ class Args(ParallelFlags):
     """learning rate of the temperature's logarithm"""
     horizon: Count = 32
     """control steps h of a window (1/60 s each)"""
-    actor_hidden: Widths = (256, 128)
+    actor_hidden: SomeWidths = (256, 128)
     """units of the actor's hidden layers (per task)"""
-    critic_hidden: Widths = (128, 128)
+    critic_hidden: SomeWidths = (128, 128)
     """units of the critics' hidden layers (per task)"""
     actor_lr: Positive = 2e-3
     """initial learning rate of the actor (per task)"""
@@ -133,6 +152,9 @@ class Args(ParallelFlags):
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
+            values |= ON_CPU.get(self.env, {})
+        if (self.accuracy, self.contact) == ("default", "soft") and self.env in INTEGRATION:
+            values |= INTEGRATION[self.env]._asdict()
         return values
 
     def check(self) -> None:
@@ -169,24 +191,23 @@ def critic(args: Args, obs_dim: int) -> nn.Sequential:
 
 
 class Actor(nn.Module):
-    """pi(a|s) of K members: tanh of a Gaussian. Observations are normalized by the statistics of all."""
+    """pi(a|s): tanh of a Gaussian."""
+
+    body: Any
+    mean: Any
+    spread: Any
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
         super().__init__()
-        K, width = args.population, args.actor_hidden[-1]
+        width = args.actor_hidden[-1]
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = Ensemble([mlp(obs_dim, args.actor_hidden, args.activation) for _ in range(K)])
-        self.mean = Ensemble([nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)])
-        spread = nn.Linear(width, action_dim)
-        with torch.no_grad():
-            spread.weight.mul_(0.1)
-            spread.bias.fill_(args.initial_log_std)
-        self.spread = Ensemble([nn.Sequential(spread)] * K) if args.state_std else None
-        self.log_std = nn.Parameter(torch.full((K, 1, action_dim), args.initial_log_std))
-        self.log_std.requires_grad_(not args.state_std)
+        self.body = mlp(obs_dim, args.actor_hidden, args.activation)
+        self.mean = nn.Linear(width, action_dim)
+        self.spread = spread(args, width, action_dim) if args.state_std else None
+        self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not args.state_std)
 
     def forward(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Of normalized observations (K, B, obs_dim): the actions, and minus their log density per action (K, B)."""
+        """Of normalized observations (..., obs_dim): the actions, and minus their log density per action (...)."""
         features = self.body(obs)
         log_std = self.log_std if self.spread is None else self.spread(features).clamp(*LOG_STD)
         u = self.mean(features) + log_std.exp() * noise
@@ -195,25 +216,29 @@ class Actor(nn.Module):
         return torch.tanh(u), surprise.mean(-1)
 
     def act(self, obs: Tensor) -> Tensor:
-        """Of normalized observations (K, B, obs_dim): the actions without noise."""
+        """The actions without noise, of normalized observations (..., obs_dim)."""
         return torch.tanh(self.mean(self.body(obs)))
 
-    def deterministic(self, member: int) -> nn.Sequential:
-        """The policy of a member without noise."""
-        return nn.Sequential(self.normalizer, *self.body[member], *self.mean[member], nn.Tanh())
+    def deterministic(self, member: int = 0) -> nn.Sequential:
+        """The policy without noise, of observations as they come, with the same weights."""
+        return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
 
 
-class Population(nn.Module):
-    """What a member has beside networks: its temperature and its running mean reward; and whether all are one."""
+def spread(args: Args, width: int, action_dim: int) -> nn.Linear:
+    """The layer of the log standard deviation, which begins almost constant."""
+    layer = nn.Linear(width, action_dim)
+    with torch.no_grad():
+        layer.weight.mul_(0.1)
+        layer.bias.fill_(args.initial_log_std)
+    return layer
 
-    score: Tensor
-    tied: Tensor
+
+class Temperature(nn.Module):
+    """The weight of the entropy."""
 
     def __init__(self, args: Args) -> None:
         super().__init__()
-        self.log_temperature = nn.Parameter(torch.full((args.population, 1, 1), math.log(args.initial_temperature)))
-        self.register_buffer("score", torch.zeros(args.population))
-        self.register_buffer("tied", torch.zeros(()))
+        self.log = nn.Parameter(torch.full((args.population,), math.log(args.initial_temperature)))
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -233,54 +258,47 @@ class Rollout(NamedTuple):
 class SAPO:
     """All that the next iteration depends on, and its two halves.
 
-    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph. The N
-    environments are those of K members one after the other; the critics are the first ones of all members, then the
-    second ones.
+    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
     """
+
+    actor: Actor
+    actor_optimizer: ClippedAdam
+    temperature_optimizer: ClippedAdam
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        obs_dim, samples = env.task.obs_dim, args.horizon * env.num_envs // args.population * (1 + args.symmetric)
         if args.symmetric:
             self.mirror = env.task.mirror
-        self.actor = Actor(args, obs_dim, env.scene.nu).to(env.device)
-        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * args.population)]).to(env.device)
+        self.build()
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        self.population = Population(args).to(env.device)
-        options = args.population, args.max_grad_norm, args.betas, self.population.tied
-        self.actor_optimizer = EnsembleAdam(self.actor, *options)
-        self.critic_optimizer = EnsembleAdam(self.critics, *options)
-        self.temperature_optimizer = EnsembleAdam(self.population, *options)
         self.temperature_optimizer.lr.fill_(args.temperature_lr)
         self.target_entropy = torch.zeros((), device=env.device)
-        self.obs = torch.zeros(args.population, samples, obs_dim, device=env.device)  # the critics' samples
-        self.value = torch.zeros(args.population, samples, device=env.device)
+
+    def build(self) -> None:
+        """The networks, their optimisers, and the critics' samples of a window."""
+        args, env, obs_dim = self.args, self.env, self.env.task.obs_dim
+        self.actor = Actor(args, obs_dim, env.scene.nu).to(env.device)
+        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics)]).to(env.device)
+        self.temperature = Temperature(args).to(env.device)
+        self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
+        self.critic_optimizer = EnsembleAdam(self.critics, 1, args.max_grad_norm, args.betas)
+        self.temperature_optimizer = ClippedAdam(self.temperature, args.max_grad_norm, args.betas)
+        samples = args.horizon * env.num_envs * (1 + args.symmetric)
+        self.obs = torch.zeros(samples, obs_dim, device=env.device)
+        self.value = torch.zeros(samples, device=env.device)
 
     @property
     def policy(self) -> nn.Sequential:
-        """Of the member with the largest reward."""
-        return self.actor.deterministic(int(self.population.score.argmax()))
+        return self.actor.deterministic()
 
     def prepare(self, iteration: int) -> None:
-        """The iteration's learning rates and target entropy; the members become one when it is time."""
+        """The iteration's learning rates and target entropy."""
         args, done = self.args, (iteration - 1) / self.args.iterations
         self.actor_optimizer.lr.fill_(args.actor_lr + (args.final_lr - args.actor_lr) * done)
         self.critic_optimizer.lr.fill_(args.critic_lr + (args.final_lr - args.critic_lr) * done)
         self.target_entropy.fill_(
             args.initial_target_entropy + (args.target_entropy - args.initial_target_entropy) * done
         )
-        if args.population > 1 and iteration == 1 + round(args.selection * args.iterations):
-            self.select(int(self.population.score.argmax()))
-
-    def select(self, member: int) -> None:
-        """From now on all members are this one, and learn from the samples of all."""
-        self.actor_optimizer.tie(member)
-        self.critic_optimizer.tie(member)
-        self.temperature_optimizer.tie(member)
-        for p in self.targets.parameters():
-            members = p.unflatten(0, (self.args.critics, -1))
-            members.copy_(members[:, member, None].clone().expand_as(members))
-        self.population.tied.fill_(1.0)
 
     def update_actor(self) -> dict[str, Tensor]:
         """Descend the soft loss of a window of all environments; keep the critics' samples of it."""
@@ -289,81 +307,32 @@ class SAPO:
         next_values = self.next_values(rollout)
         reward = rollout.reward
         if args.entropy:
-            temperature = self.population.log_temperature.detach().exp()
-            reward = reward + (temperature * self.by_member((1 + rollout.entropy) / 2)).movedim(0, 1).flatten(1)
+            weight = self.temperature.log.detach().exp().repeat_interleave(len(reward[0]) // args.population)
+            reward = reward + weight * (1 + rollout.entropy) / 2
         loss = actor_loss(reward, next_values.mean(0), rollout.done, args.gamma)
         if args.symmetric:
             loss = loss + args.symmetry_weight * self.asymmetry(rollout.obs.detach())
         norm = self.actor_optimizer.step(args.population * loss)
         rollout = Rollout(*(tensor.detach() for tensor in rollout))
         self.keep(rollout, reward.detach(), next_values.detach())
-        entropy = self.by_member(rollout.entropy).mean((1, 2))
-        gap = (entropy - self.target_entropy).detach()
-        self.temperature_optimizer.step((self.population.log_temperature.exp().flatten() * gap).sum())
-        self.population.score.lerp_(distributed.average(self.by_member(rollout.reward).mean((1, 2))), SCORE_RATE)
-        temperature = self.population.log_temperature.detach().exp().mean()
-        metrics = {"charts/entropy": entropy.mean().detach(), "charts/temperature": temperature}
-        return {"losses/actor": loss.detach(), "grad/norm": norm} | metrics
-
-    def act(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Each member acts in its environments: actions (N, nu) and entropy (N,) of obs (N, obs_dim), noise (N, nu)."""
-        members = self.args.population, -1
-        action, entropy = self.actor(self.actor.normalizer(obs).unflatten(0, members), noise.unflatten(0, members))
-        return action.flatten(0, 1), entropy.flatten()
-
-    def keep(self, rollout: Rollout, reward: Tensor, next_values: Tensor) -> None:
-        """A window's observations with their TD(lambda) returns, which the critics are to learn."""
-        args, normalizer, samples = self.args, self.actor.normalizer, rollout.obs
-        value = td_lambda(reward, next_values.amin(0), rollout.done, args.gamma, args.td_lambda)
-        if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
-            samples = torch.stack((samples, self.mirror.obs(samples)), 1).flatten(0, 1)
-            value = value.repeat_interleave(2, 0)
-        self.value.copy_(self.by_member(value).flatten(1))
-        self.obs.copy_(self.by_member(normalizer(samples)).flatten(1, 2))
-        normalizer.update(rollout.obs)
-
-    def imitate(self, policy: nn.Module, lead: bool) -> Tensor:
-        """A window from whose states the actors learn another policy's actions, and the critics the returns.
-
-        Either that policy acts in it, with noise, or the actors do, which shows them where their errors lead (Ross et
-        al. 2011, https://arxiv.org/abs/1011.0686). Returns their mean squared error () before.
-        """
-        with torch.no_grad():
-
-            def act(obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-                return policy(obs) + START_NOISE * noise, torch.zeros_like(noise[:, 0])
-
-            rollout = collect(self.env, act if lead else self.act, self.args.horizon)
-            goal = self.by_member(policy(rollout.obs).clamp(-1.0, 1.0)).flatten(1, 2)
-            obs = self.by_member(self.actor.normalizer(rollout.obs)).flatten(1, 2)
-            self.keep(rollout, rollout.reward, self.next_values(rollout))
-        errors = []
-        for samples, actions in zip(obs.chunk(8, 1), goal.chunk(8, 1), strict=True):
-            mean, entropy = self.actor(samples, torch.zeros_like(actions))
-            errors.append((mean - actions).square().mean())
-            self.actor_optimizer.step(self.args.population * errors[-1] + 0 * entropy.sum())  # the noise stays
-        self.update_critic()
-        return errors[0].detach()
-
-    def asymmetry(self, obs: Tensor) -> Tensor:
-        """Mean squared difference between the actions in mirrored states and the mirrored actions, without noise."""
-        there = self.actor.act(self.by_member(self.actor.normalizer(self.mirror.obs(obs))).flatten(1, 2))
-        here = self.actor.act(self.by_member(self.actor.normalizer(obs)).flatten(1, 2))
-        return (there - self.mirror.action(here)).square().mean()
-
-    def by_member(self, tensor: Tensor) -> Tensor:
-        """(H, N, ...) -> (K, H, N / K, ...)."""
-        return tensor.unflatten(1, (self.args.population, -1)).movedim(1, 0)
+        entropy = self.flatten(rollout.entropy).mean(-1)
+        self.temperature_optimizer.step((self.temperature.log.exp() * (entropy - self.target_entropy)).sum())
+        return {
+            "losses/actor": loss.detach(),
+            "grad/norm": norm,
+            "charts/reward": self.flatten(rollout.reward).mean(-1),
+            "charts/entropy": entropy.mean(),
+            "charts/temperature": self.temperature.log.detach().exp().mean(),
+        }
 
     def update_critic(self) -> dict[str, Tensor]:
         """Fit the critics to the window's soft TD(lambda) returns, and let the target critics follow."""
         args = self.args
-        obs, value = self.obs.repeat(args.critics, 1, 1), self.value.repeat(args.critics, 1)
-        batches = obs.chunk(args.critic_minibatches, 1), value.chunk(args.critic_minibatches, 1)
+        batches = self.obs.chunk(args.critic_minibatches, -2), self.value.chunk(args.critic_minibatches, -1)
         for _ in range(args.critic_iterations):
             losses = []
             for obs, value in zip(*batches, strict=True):
-                errors = (self.critics(obs).squeeze(-1) - value).square().mean(1)
+                errors = (self.values(self.critics, obs) - value).square().mean(-1)
                 self.critic_optimizer.step(errors.sum())
                 losses.append(errors.detach().mean())
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -372,12 +341,67 @@ class SAPO:
         skipped = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
         return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
 
+    def act(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (N, nu) and entropy (N,) of obs (N, obs_dim) and noise (N, nu)."""
+        return self.actor(self.actor.normalizer(obs), noise)
+
+    def values(self, critics: Ensemble, obs: Tensor) -> Tensor:
+        """Each critic's V (C, B) of normalized observations (B, obs_dim)."""
+        return critics(obs.expand(self.args.critics, *obs.shape)).squeeze(-1)
+
     def next_values(self, rollout: Rollout) -> Tensor:
         """Each critic's V(s_{t+1}) (C, H, N): of an episode's last state where its time ran out, zero if terminated."""
-        args = self.args
-        obs = self.by_member(self.actor.normalizer(rollout.next_obs)).flatten(1, 2).repeat(args.critics, 1, 1)
-        values = self.targets(obs).view(args.critics, args.population, args.horizon, -1).movedim(1, 2).flatten(2)
+        obs = self.flatten(self.actor.normalizer(rollout.next_obs))
+        values = self.unflatten(self.values(self.targets, obs))
         return torch.where(rollout.terminated, torch.zeros_like(values), values)
+
+    def flatten(self, tensor: Tensor) -> Tensor:
+        """The samples of a window (H, N, ...) as networks take them, (B, ...)."""
+        return tensor.flatten(0, 1)
+
+    def unflatten(self, values: Tensor) -> Tensor:
+        """The other way, of values (C, B) -> (C, H, N)."""
+        return values.unflatten(-1, (self.args.horizon, -1))
+
+    def keep(self, rollout: Rollout, reward: Tensor, next_values: Tensor) -> None:
+        """A window's observations with their TD(lambda) returns, which the critics are to learn."""
+        args, normalizer, samples = self.args, self.actor.normalizer, rollout.obs
+        value = td_lambda(reward, next_values.amin(0), rollout.done, args.gamma, args.td_lambda)
+        if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
+            samples = torch.stack((samples, self.mirror.obs(samples)), 1).flatten(0, 1)
+            value = value.repeat_interleave(2, 0)
+        self.value.copy_(self.flatten(value))
+        self.obs.copy_(self.flatten(normalizer(samples)))
+        normalizer.update(rollout.obs)
+
+    def asymmetry(self, obs: Tensor) -> Tensor:
+        """Mean squared difference between the actions in mirrored states and the mirrored actions, without noise."""
+        there = self.actor.act(self.flatten(self.actor.normalizer(self.mirror.obs(obs))))
+        here = self.actor.act(self.flatten(self.actor.normalizer(obs)))
+        return (there - self.mirror.action(here)).square().mean()
+
+    def imitate(self, policy: nn.Module, lead: bool) -> Tensor:
+        """A window from whose states the actor learns another policy's actions, and the critics the returns.
+
+        Either that policy acts in it, with noise, or the actor does, which shows it where its errors lead (Ross et al.
+        2011, https://arxiv.org/abs/1011.0686). Returns the mean squared error () before.
+        """
+        with torch.no_grad():
+
+            def act(obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+                return policy(obs) + START_NOISE * noise, torch.zeros_like(noise[:, 0])
+
+            rollout = collect(self.env, act if lead else self.act, self.args.horizon)
+            goal = self.flatten(policy(rollout.obs).clamp(-1.0, 1.0))
+            obs = self.flatten(self.actor.normalizer(rollout.obs))
+            self.keep(rollout, rollout.reward, self.next_values(rollout))
+        errors = []
+        for samples, actions in zip(obs.chunk(8, -2), goal.chunk(8, -2), strict=True):
+            mean, entropy = self.actor(samples, torch.zeros_like(actions))
+            errors.append((mean - actions).square().mean())
+            self.actor_optimizer.step(self.args.population * errors[-1] + 0 * entropy.sum())  # the noise stays
+        self.update_critic()
+        return errors[0].detach()
 
 
 def collect(env: DiffEnv, act: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], horizon: int) -> Rollout:
@@ -412,13 +436,113 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
     return returns
 
 
+# A population ---------------------------------------------------------------------------------------------------------
+
+
+class Actors(Actor):
+    """The actors of K members, on (K, B, ...). Observations are normalized by the statistics of all."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        nn.Module.__init__(self)
+        K, width = args.population, args.actor_hidden[-1]
+        self.normalizer = ObsNormalizer(obs_dim)
+        self.body = Ensemble([mlp(obs_dim, args.actor_hidden, args.activation) for _ in range(K)])
+        self.mean = Ensemble([nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)])
+        shared = nn.Sequential(spread(args, width, action_dim))
+        self.spread = Ensemble([shared] * K) if args.state_std else None
+        start = torch.full((K, 1, action_dim), args.initial_log_std)
+        self.log_std = nn.Parameter(start, requires_grad=not args.state_std)
+
+    def deterministic(self, member: int = 0) -> nn.Sequential:
+        return nn.Sequential(self.normalizer, *self.body[member], *self.mean[member], nn.Tanh())
+
+
+class Running(nn.Module):
+    """The running mean reward (K,) of each member; whether all are one ()."""
+
+    reward: Tensor
+    tied: Tensor
+
+    def __init__(self, members: int) -> None:
+        super().__init__()
+        self.register_buffer("reward", torch.zeros(members))
+        self.register_buffer("tied", torch.zeros(()))
+
+
+class Population(SAPO):
+    """K members that learn side by side, each in its share of the environments, until the best one goes on in all.
+
+    The N environments are those of the members one after the other; the critics are the first ones of all members, then
+    the second ones.
+    """
+
+    actor_optimizer: EnsembleAdam
+    temperature_optimizer: EnsembleAdam
+
+    def build(self) -> None:
+        args, env, K, obs_dim = self.args, self.env, self.args.population, self.env.task.obs_dim
+        self.actor = Actors(args, obs_dim, env.scene.nu).to(env.device)
+        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * K)]).to(env.device)
+        self.temperature = Temperature(args).to(env.device)
+        self.score = Running(K).to(env.device)
+        options = K, args.max_grad_norm, args.betas, self.score.tied
+        self.actor_optimizer = EnsembleAdam(self.actor, *options)
+        self.critic_optimizer = EnsembleAdam(self.critics, *options)
+        self.temperature_optimizer = EnsembleAdam(self.temperature, *options)
+        samples = args.horizon * env.num_envs // K * (1 + args.symmetric)
+        self.obs = torch.zeros(K, samples, obs_dim, device=env.device)
+        self.value = torch.zeros(K, samples, device=env.device)
+
+    @property
+    def policy(self) -> nn.Sequential:
+        """Of the member with the largest reward."""
+        return self.actor.deterministic(int(self.score.reward.argmax()))
+
+    def prepare(self, iteration: int) -> None:
+        super().prepare(iteration)
+        if iteration == 1 + round(self.args.selection * self.args.iterations):
+            self.select(int(self.score.reward.argmax()))
+
+    def select(self, member: int) -> None:
+        """From now on all members are this one, and learn from the samples of all."""
+        for optimizer in (self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer):
+            optimizer.tie(member)
+        for p in self.targets.parameters():
+            members = p.unflatten(0, (self.args.critics, -1))
+            members.copy_(members[:, member, None].clone().expand_as(members))
+        self.score.tied.fill_(1.0)
+
+    def update_actor(self) -> dict[str, Tensor]:
+        metrics = super().update_actor()
+        self.score.reward.lerp_(distributed.average(metrics["charts/reward"]), SCORE_RATE)
+        return metrics | {"charts/reward": metrics["charts/reward"].mean()}
+
+    def act(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        members = self.args.population, -1
+        action, entropy = self.actor(self.actor.normalizer(obs).unflatten(0, members), noise.unflatten(0, members))
+        return action.flatten(0, 1), entropy.flatten()
+
+    def values(self, critics: Ensemble, obs: Tensor) -> Tensor:
+        """(K, B, obs_dim) -> (C, K, B)"""
+        values = critics(obs.repeat(self.args.critics, 1, 1))
+        return values.squeeze(-1).unflatten(0, (self.args.critics, -1))
+
+    def flatten(self, tensor: Tensor) -> Tensor:
+        """(H, N, ...) -> (K, B, ...)"""
+        return tensor.unflatten(1, (self.args.population, -1)).movedim(1, 0).flatten(1, 2)
+
+    def unflatten(self, values: Tensor) -> Tensor:
+        """(C, K, B) -> (C, H, N)"""
+        return super().unflatten(values).movedim(1, 2).flatten(2)
+
+
 # The run --------------------------------------------------------------------------------------------------------------
 
 
 def train(args: Args) -> None:
     run = Run(args)
     env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
-    sapo = run.restore(SAPO(args, env))
+    sapo = run.restore((Population if args.population > 1 else SAPO)(args, env))
     update_actor, update_critic = run.capture(sapo.update_actor, env), run.capture(sapo.update_critic)
     for iteration in run:
         sapo.prepare(iteration)

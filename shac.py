@@ -58,7 +58,11 @@ PER_TASK = {
 class Args(ParallelFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "actor_lr", "critic_lr", "final_lr")
+    MAY_CHANGE = (
+        *ParallelFlags.MAY_CHANGE,
+        *("horizon", "actor_lr", "critic_lr", "final_lr", "betas", "max_grad_norm", "gamma", "td_lambda"),
+        *("target_alpha", "critic_iterations", "critic_minibatches"),
+    )
 
     horizon: Count = 32
     """control steps h of a window (1/60 s each)"""

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from diffsim.training import command
+
 ROOT = Path(__file__).resolve().parents[1]
 # Windows of cartpole with a time-out on the way (240 steps), an evaluation before the end and one at it.
 _SMALL = (
@@ -75,10 +77,10 @@ def assert_derivatives(
 
 
 def refusal(call: Callable[[], object], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line with which a call ends the script, exit code 2."""
+    """The one line with which a call ends a script, exit code 2."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as exit:
-        call()
+        command(call)()
     out, error = capsys.readouterr()
     assert exit.value.code == 2 and out == "" and error.count("\n") == 1
     return error.strip()

@@ -5,24 +5,22 @@ from __future__ import annotations
 import ast
 import csv
 import functools
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from statistics import mean, median, pstdev
 from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
-PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+LOG = ROOT / "results" / "README.md"
+PAGES = [README, ROOT / "CONTRIBUTING.md", LOG, *sorted((ROOT / "docs").glob("*.md"))]
 # Tables of these pages use the column names of the csv file that the text below them names.
-CHECKED = [
-    README,
-    *(
-        ROOT / "docs" / name
-        for name in ("shac.md", "sapo.md", "bptt.md", "pods.md", "ppo.md", "experiments.md", "robustness.md")
-    ),
-]
+LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo", "sac", "mbpo", "humanoid_mtu", "experiments")
+CHECKED = [README, *(ROOT / "docs" / f"{name}.md" for name in (*LEARNERS, "robustness"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
@@ -34,6 +32,7 @@ class Table(NamedTuple):
     header: list[str]
     rows: list[list[str]]
     source: Path | None  # the csv file named between the table and the next table or heading
+    curves: str = ""  # the machine whose training curves are named there
 
     def columns(self) -> list[str]:
         """Those that the csv file has, too."""
@@ -47,7 +46,8 @@ def tables(page: Path) -> Iterator[Table]:
         rows = [row for cells in joined for row in seeds(header, cells)]
         below = re.split(r"^#", text, flags=re.MULTILINE)[0]
         source = re.search(r"results/\w+/\w+\.csv", below)
-        yield Table(header, rows, ROOT / source[0] if source else None)
+        curves = re.search(r"results/([\w<>]+)/<learner>_<task>\.csv", below)
+        yield Table(header, rows, ROOT / source[0] if source and not curves else None, curves[1] if curves else "")
 
 
 def seeds(header: list[str], cells: list[str]) -> list[list[str]]:
@@ -83,11 +83,52 @@ def test_tables_agree_with_the_csv_files_that_they_name(page: Path) -> None:
         measured = read_csv(table.source)
         for row in table.rows:
             shown = dict(zip(table.header, row, strict=False))
+            if "machine" in shown:  # whose folder has the file
+                measured = read_csv(table.source.parents[1] / shown["machine"] / table.source.name)
             key, *figures = columns
             if all(shown[key] != line[key] for line in measured):  # not measured, so nothing may be claimed
                 assert not any(re.search(r"\d", shown[name]) for name in figures), f"{table.source.name} lacks {shown}"
                 continue
             assert any(all(same(shown[c], line[c]) for c in columns) for line in measured), f"{table.source}: {shown}"
+
+
+@pytest.mark.parametrize("page", CHECKED, ids=lambda page: page.stem)
+def test_tables_agree_with_the_training_curves_that_they_name(page: Path) -> None:
+    for table in tables(page):
+        for row in table.rows if table.curves else ():
+            shown = dict(zip(table.header, row, strict=True))
+            machine = shown.get("machine", table.curves)
+            measured = summary(ROOT / "results" / machine / f"{shown['learner']}_{shown['task']}.csv", shown)
+            shared = {name: shown[name] for name in measured if shown.get(name)}
+            assert shared and shared == {name: measured[name] for name in shared}, f"{machine}: {shown}"
+
+
+def summary(path: Path, shown: Mapping[str, str]) -> dict[str, str]:
+    """What a table's row may show of a file of training curves: medians over its seeds, of the best return the mean."""
+    runs: dict[str, list[dict[str, str]]] = {}
+    for line in read_csv(path):
+        runs.setdefault(line["seed"], []).append(line)
+
+    def last(name: str) -> float:
+        ends = [values[-1] for run in runs.values() if (values := [line[name] for line in run if line[name]])]
+        return median(map(float, ends)) if ends else math.nan
+
+    def passing(name: str) -> float:
+        target = float(shown.get("target", "inf"))
+        above = ([line for line in run if line["return"] and float(line["return"]) >= target] for run in runs.values())
+        return median(float(lines[0][name] or "nan") if lines else math.inf for lines in above)
+
+    best = [max(float(line["return"]) for line in run if line["return"]) for run in runs.values()]
+    found = {
+        "seeds": f"{len(runs)}",
+        "best return of training": f"{mean(best):.0f}" + (f" ± {pstdev(best):.0f}" if len(best) > 1 else ""),
+        "iterations": f"{last('iteration'):g}",
+        "control steps": f"{last('control_steps') / 1e6:.3g} M",
+        "last evaluation": f"{last('eval_return'):.0f}",
+        "steps to target": f"{passing('control_steps') / 1e6:.3g} M",
+        "s to target": f"{passing('seconds'):.0f}",
+    }
+    return {name: "never" if text in ("inf", "inf M") else text for name, text in found.items()}
 
 
 def test_readme_has_the_return_of_every_task() -> None:
@@ -101,7 +142,8 @@ def test_readme_has_the_return_of_every_task() -> None:
 
 def test_every_csv_file_says_where_it_comes_from() -> None:
     paths = sorted((ROOT / "results").glob("*/*.csv"))
-    assert paths and not [path for path in (ROOT / "results").rglob("*") if path.is_file() and path not in paths]
+    files = {path for path in (ROOT / "results").rglob("*") if path.is_file()}
+    assert paths and files == {*paths, LOG}
     for path in paths:
         origin = path.read_text().splitlines()[0]
         assert re.match(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python \w+", origin), path

@@ -84,6 +84,26 @@ def test_episodes_end_restart_and_are_counted():
     assert ends >= 6
 
 
+def test_statistics_are_sums_since_they_were_taken():
+    env = diffsim.make("cartpole", num_envs=3, horizon=1, max_episode_steps=4)
+    env.reset(seed=0)
+    expected = {"episodes": 0.0, "return": 0.0, "length": 0.0, "nonfinite": 1.0, "nonfinite_gradients": 3.0}
+    with torch.no_grad():
+        for step, action in enumerate(random_actions(env, 10)):
+            if step == 1:  # thrown out of the finite numbers, it ends and starts anew
+                env.qvel = torch.where(torch.tensor([[True], [False], [False]]), torch.inf, env.qvel)
+            info = env.step(action)[-1]
+            ended = info["_episode"]
+            expected["episodes"] += ended.sum().item()
+            expected["return"] += info["episode"]["r"][ended].sum().item()
+            expected["length"] += info["episode"]["l"][ended].sum().item()
+    env.sim.nonfinite_gradients += 1
+    taken = env.take_statistics()
+    assert expected["episodes"] == 7
+    assert {name: value.item() for name, value in taken.items()} == pytest.approx(expected)
+    assert not any(value.any() for value in env.take_statistics().values())
+
+
 def test_time_limit_truncates():
     env = diffsim.make("cartpole", num_envs=2, seed=0)
     with torch.no_grad():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -171,38 +170,14 @@ def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch
         diffsim.make("cartpole", 1)
 
 
-@pytest.mark.parametrize("kept_back", [False, True])
-def test_an_interrupted_import_ends_in_one_line(kept_back: bool, tmp_path: Path) -> None:
-    """Also where another package makes an ImportError of it, as extensions in C++ do."""
-    program = tmp_path / "train.py"
-    program.write_text(f"""
-import signal, sys
-class Finder:
-    def find_spec(name, *_):
-        if name == "gymnasium":
-            try:
-                signal.raise_signal(signal.SIGINT)
-            except KeyboardInterrupt:
-                if {kept_back}:
-                    raise ImportError("initialization failed")
-                raise
-sys.meta_path.insert(0, Finder)
-import diffsim
-""")
-    done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, env=os.environ | PATH)
-    assert done.returncode != 0 and (done.stdout, done.stderr) == ("", "train.py: interrupted\n")
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler  # in a program that was not interrupted
-
-
-def test_a_script_ends_in_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    others = list[object]()
-    monkeypatch.setattr(startup, "_one_line", ())
-    monkeypatch.setattr(startup, "_others", lambda *arguments: others.append(arguments[0]))
-    startup.end_in_one_line(ZeroDivisionError)
-    for error in (KeyboardInterrupt(), ZeroDivisionError("no such number"), KeyError("a mistake")):
-        sys.excepthook(type(error), error, None)
-    assert capsys.readouterr().err == "diffsim: interrupted\ndiffsim: no such number\n"
-    assert others == [KeyError]
+def test_an_import_changes_nothing_in_its_host() -> None:
+    program = """
+import signal, sys, threading
+before = sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT)
+import diffsim, diffsim.training
+assert before == (sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT))
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_a_full_kernel_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -78,8 +78,7 @@ def test_elites_predict_and_no_others() -> None:
     torch.testing.assert_close(reward, own + 37.0, atol=2e-3, rtol=0)
 
 
-def learner_of(bandit: bool, flags: str, monkeypatch: pytest.MonkeyPatch) -> mbpo.MBPO:
-    monkeypatch.setattr(mbpo, "episode_metrics", lambda *_: {})
+def learner_of(bandit: bool, flags: str) -> mbpo.MBPO:
     torch.manual_seed(0)
     common = "--hidden 32 32 --model-hidden 32 32 --num-envs 20 --steps 8 --batch-size 128 --actor-lr 3e-3"
     common += " --gamma 0.9 --temperature-lr 1e-12 --tau 0.05 --model-lr 3e-3 --model-updates 20"
@@ -90,9 +89,9 @@ def learner_of(bandit: bool, flags: str, monkeypatch: pytest.MonkeyPatch) -> mbp
     return learner
 
 
-def test_a_linear_system_is_identified(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_linear_system_is_identified() -> None:
     """Its two coefficients, its noise, its cost; and the error on held-out transitions is the noise's share."""
-    learner = learner_of(False, "--model-updates 60", monkeypatch)
+    learner = learner_of(False, "--model-updates 60")
     for _ in range(15):
         learner.explore()
         found = learner.fit()
@@ -114,7 +113,7 @@ def test_a_linear_system_is_identified(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_best_on_held_out_transitions_become_elites(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = learner_of(False, "--elites 3 --model-updates 40", monkeypatch)
+    learner = learner_of(False, "--elites 3 --model-updates 40")
     for _ in range(5):
         learner.fit()
     last, step = learner.models.ensemble.layers[-1], learner.model_optimizer.step
@@ -149,7 +148,7 @@ def test_held_out_environments_are_not_learnt_from() -> None:
 
 def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Real states are -1; each step adds 1; what passes 2 has failed; the length rises over half of the iterations."""
-    learner = learner_of(False, "--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5", monkeypatch)
+    learner = learner_of(False, "--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
     learner.real.rows[:, 0] = -1.0
     learner.env.task.terminated = lambda obs: obs[:, 0] > 2.5
     monkeypatch.setattr(learner.models, "predict", lambda obs, action: (torch.ones(250, 1), action[:, 0]))
@@ -165,8 +164,8 @@ def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatc
         torch.testing.assert_close(rows.reward, rows.action.squeeze(1))
 
 
-def test_without_early_termination_no_rollout_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = learner_of(False, "--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5", monkeypatch)
+def test_without_early_termination_no_rollout_fails() -> None:
+    learner = learner_of(False, "--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
     learner.env.task.terminated = lambda obs: torch.ones_like(obs[:, 0], dtype=torch.bool)
     for early in (True, False):
         learner.args.early_termination = early
@@ -174,8 +173,8 @@ def test_without_early_termination_no_rollout_fails(monkeypatch: pytest.MonkeyPa
         assert (learner.imagined.split(learner.imagined.rows).terminated == early).all()
 
 
-def test_the_mixture_has_its_share_of_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = learner_of(False, "--real-ratio 0.25", monkeypatch)
+def test_the_mixture_has_its_share_of_real_transitions() -> None:
+    learner = learner_of(False, "--real-ratio 0.25")
     learner.real.rows[:, 2], learner.imagined.rows[:, 2] = 1.0, 2.0
     learner.imagined.count.fill_(100)
     assert learner.mixture().reward.tolist() == [1.0] * 32 + [2.0] * 96
@@ -299,7 +298,7 @@ def test_targets_and_losses(monkeypatch: pytest.MonkeyPatch) -> None:
 def learnt(bandit: bool, temperature: float, iterations: int, monkeypatch: pytest.MonkeyPatch) -> mbpo.MBPO:
     """From rollouts of the models alone, which have learnt from random actions."""
     flags = f"--real-ratio 0 --updates 10 --model-updates 80 --initial-temperature {temperature}"
-    learner = learner_of(bandit, flags, monkeypatch)
+    learner = learner_of(bandit, flags)
     for _ in range(10):
         learner.explore()
         learner.fit()

@@ -98,8 +98,7 @@ def test_targets_and_losses(redq: bool, monkeypatch: pytest.MonkeyPatch) -> None
     torch.testing.assert_close(losses[1], 0.3 * (8 - density.mean().detach()))
 
 
-def learnt(bandit: bool, temperature: float, iterations: int, monkeypatch: pytest.MonkeyPatch) -> sac.SAC:
-    monkeypatch.setattr(sac, "episode_metrics", lambda *_: {})
+def learnt(bandit: bool, temperature: float, iterations: int) -> sac.SAC:
     torch.manual_seed(0)
     rates = f"--actor-lr 3e-3 --critic-lr 3e-3 --temperature-lr 1e-12 --initial-temperature {temperature} --gamma 0.9"
     flags = "--hidden 32 32 --num-envs 16 --steps 8 --batch-size 128 --tau 0.05 --buffer-size 5000"
@@ -111,12 +110,19 @@ def learnt(bandit: bool, temperature: float, iterations: int, monkeypatch: pytes
     return learner
 
 
-def test_a_bandit_is_learnt_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_bandit_learnt(learnt(True, 0.05, 60, monkeypatch).actor, 0.05, 0.03)
+def test_a_bandit_is_learnt_with_its_noise() -> None:
+    assert_bandit_learnt(learnt(True, 0.05, 60).actor, 0.05, 0.03)
 
 
-def test_a_linear_quadratic_system_is_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_system_controlled(learnt(False, 0.1, 75, monkeypatch).policy)
+def test_a_linear_quadratic_system_is_controlled() -> None:
+    assert_system_controlled(learnt(False, 0.1, 75).policy)
+
+
+def test_skipped_updates_of_every_optimizer_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = build("--hidden", "4", "--num-envs", "2", "--steps", "1", env=Problem(True, 2))
+    for k, optimizer in enumerate((learner.actor_optimizer, learner.critic_optimizer, learner.temperature_optimizer)):
+        optimizer.skipped += 10**k
+    assert learner.explore()["grad/skipped"] == 111
 
 
 def test_a_run_resumes_bitwise_with_its_buffer(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def random_rollout(rng: np.random.Generator, horizon: int = 12, num_envs: int = 
     size = (horizon, num_envs)
     kind = rng.choice(3, size=size, p=(0.8, 0.1, 0.1))
     real = [torch.tensor(rng.normal(size=s), requires_grad=True) for s in ((*size, obs_dim), (*size, obs_dim), size)]
-    return shac.Rollout(*real, torch.tensor(kind == 1), torch.tensor(kind > 0), *[torch.zeros(size)] * 3)
+    return shac.Rollout(*real, torch.tensor(kind == 1), torch.tensor(kind > 0))
 
 
 def build(task: str, *arguments: str, dtype: torch.dtype = torch.float32) -> shac.SHAC:

@@ -162,7 +162,7 @@ def _check_structure(state: Mapping[str, Any]) -> None:
         rng = x.get("rng") if is_named(x) else None
         return isinstance(rng, Tensor) and rng.dtype == torch.uint8 and (x.get("env") is None or is_named(x["env"]))
 
-    check("script", lambda x: isinstance(x, str) and x.isidentifier(), "the name of a script")
+    check("script", lambda x: isinstance(x, str) and x.isprintable(), "the name of a script")
     check("args", lambda x: is_named(x) and isinstance(x.get("env"), str), "the arguments of a run")
     check("iteration", is_count, "a count")
     check("policy", is_policy, "a policy")

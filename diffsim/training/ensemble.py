@@ -98,7 +98,7 @@ class EnsembleAdam(ClippedAdam):
         module: all of whose parameters have E = (networks of a member) * members as their first size, in this order.
         members: how many.
         max_norm, betas, skip_norm: see ClippedAdam.
-        tied: () whether the members are tied, 0 or 1; a captured graph reads its present value.
+        tied: () whether the members are tied, 0 or 1; a captured graph reads its present value. None: never.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class EnsembleAdam(ClippedAdam):
         members: int,
         max_norm: float,
         betas: tuple[float, float],
-        tied: Tensor,
+        tied: Tensor | None = None,
         skip_norm: float = 1e6,
     ) -> None:
         self.members, self.tied = members, tied
@@ -121,13 +121,13 @@ class EnsembleAdam(ClippedAdam):
         start = 0
         for p in self.parameters:
             end = start + p[0].numel()
-            p.data = vector.flatten(0, 1)[:, start:end].unflatten(1, p.shape[1:])
+            p.data = vector.flatten(0, 1)[:, start:end].view(p.shape)
             start = end
 
     def step(self, loss: Tensor) -> Tensor:
         """One descent step of each; returns the gradients' largest norm () before clipping."""
         gradient = distributed.average(self._flatten(torch.autograd.grad(loss, self.parameters)))
-        if self.members > 1:
+        if self.tied is not None:
             gradient = torch.where(self.tied > 0, gradient.mean(1, keepdim=True), gradient)
         norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
         good = norm < self.skip_norm

@@ -51,7 +51,8 @@ Positive = Annotated[float, Range("positive", lambda value: value > 0)]
 NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
 Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]
 Decay = Annotated[float, Range("in [0, 1)", lambda value: 0 <= value < 1)]
-Widths = Annotated[tuple[Width, ...], Range("at least one number", lambda value: len(value) > 0)]
+Widths = tuple[Width, ...]
+SomeWidths = Annotated[Widths, Range("at least one number", lambda value: len(value) > 0)]
 ClipFile = Annotated[
     Clip | None,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -212,7 +213,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args = _continue(kind, argv, args, path)
     else:
         args.device = distributed.choose_device(args.device)
-        defaults = dataclasses.replace(kind(), **_presets(args), **args.task_defaults())
+        defaults = dataclasses.replace(kind(), **(_presets(args) | args.task_defaults()))
         if issubclass(task := TASKS[args.env], HumanoidImitation):
             defaults.clip = read_clip(task.default_clip)
         args = _cli(kind, argv, defaults)

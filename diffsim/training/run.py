@@ -105,7 +105,7 @@ class Run:
         self._written_steps = 0
         self._saved = self._state["iteration"] if self._state else 0
         self.last = min(args.iterations, args.stop_after or args.iterations)
-        self._totals, self._episodes = dict.fromkeys(TOTALS, 0), EpisodeStatistics()
+        self._totals, self._episodes = {f"sim/{name}": 0 for name in TOTALS}, EpisodeStatistics()
         self._env: DiffEnv | None = None
         self._variation: Variation | None = None
         self._samples = 0  # control steps of an iteration, of all ranks
@@ -273,8 +273,8 @@ class Run:
         if "episodes" in scalars:
             self._episodes.add(*(ranks * scalars.pop(name) for name in ("episodes", "return", "length")))
             for name in TOTALS:
-                self._totals[name] += round(ranks * scalars.pop(name))
-                scalars[f"sim/{name}"] = self._totals[name]
+                self._totals[f"sim/{name}"] += round(ranks * scalars.pop(name))
+            scalars |= self._totals
             if self._episodes.windows:
                 scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
         scalars |= {"charts/SPS": steps / seconds, "time/total": seconds}
@@ -386,7 +386,7 @@ class Run:
             f"{self.seconds:.1f} s of training"
         )
         if "grad/skipped" in self._scalars:
-            states, gradients = (self._totals[name] for name in TOTALS)
+            states, gradients = self._totals.values()
             skipped = int(self._scalars["grad/skipped"])
             print(f"skipped {skipped} updates, contained {states} non-finite states and {gradients} gradients")
         if self._evaluation:

@@ -19,7 +19,7 @@ import ppo_baseline
 import sapo
 import shac
 from diffsim.env import DiffEnv
-from diffsim.training import Learner, Run, distributed
+from diffsim.training import Learner, Run, checkpoint, distributed
 
 streams = WeakKeyDictionary[object, torch.Generator]()
 runs: list[tuple[Run, Learner]] = []
@@ -59,7 +59,7 @@ def main(directory: str, *setting: str) -> None:
         rank, path = distributed.rank(), Path(directory) / script.__name__
         script.main([*setting, "--run-dir", str(path)])
         run, learner = runs[-1]
-        modules = {name: module.state_dict() for name, module in learner.modules.items()}
+        modules = {name: part.state_dict() for name, part in checkpoint.parts(learner).items()}
         state = dict(modules=modules, episodes=list(run._episodes.windows), control_steps=run.control_steps)
         torch.save(state, path.with_suffix(f".{rank}.pt"))
 

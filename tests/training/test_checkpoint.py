@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,8 +12,18 @@ from learners import SCRIPTS, refusal
 from torch import nn
 
 import diffsim
-from diffsim.training import Stateful, load_policy, parse
+from diffsim.training import load_policy, parse
 from diffsim.training.checkpoint import FORMAT, load, restore, save
+
+STATE: dict[str, Any] = {
+    "args": {"env": "cartpole"},
+    "iteration": 1,
+    "control_steps": 5,
+    "seconds": 0.5,
+    "totals": {"sim/nonfinite": 0},
+    "episodes": [(2.0, 3.0, 4.0)],
+    "ranks": [{"env": None, "rng": torch.get_rng_state()}],
+}
 
 
 class Tiny:
@@ -19,12 +31,12 @@ class Tiny:
 
     def __init__(self) -> None:
         self.policy = nn.Sequential(nn.Linear(2, 1))
-        self.modules: dict[str, Stateful] = {}
+        self.layer = nn.Linear(2, 1)
 
 
 def test_a_crash_while_saving_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "checkpoint.pt"
-    save(path, "shac", Tiny(), {"iteration": 1})
+    save(path, "shac", Tiny(), STATE)
     whole = path.read_bytes()
 
     def crash(file: Path, data: bytes) -> None:
@@ -33,11 +45,11 @@ def test_a_crash_while_saving_leaves_the_old_one(tmp_path: Path, monkeypatch: py
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="no space"):
         patch.setattr(Path, "write_bytes", crash)
-        save(path, "shac", Tiny(), {"iteration": 2})
+        save(path, "shac", Tiny(), STATE | {"iteration": 2})
     assert list(tmp_path.iterdir()) == [path]
     assert path.read_bytes() == whole and load(path, "shac")["iteration"] == 1
     assert load(path)["format"] == FORMAT and load(path)["script"] == "shac"
-    save(path, "shac", Tiny(), {"iteration": 3})
+    save(path, "shac", Tiny(), STATE | {"iteration": 3})
     assert load(path)["iteration"] == 3
     assert list(tmp_path.iterdir()) == [path]
 
@@ -46,22 +58,74 @@ def test_anything_else_is_refused_in_one_line(tmp_path: Path, capsys: pytest.Cap
     path = tmp_path / "checkpoint.pt"
     assert refusal(lambda: load(path), capsys).endswith(f": no such checkpoint: {path}")
     assert refusal(lambda: load(tmp_path), capsys).endswith(f": no such checkpoint: {tmp_path}")
-    save(path, "shac", Tiny(), {})
-    assert refusal(lambda: load(path, "bptt"), capsys).endswith(f": {path} is a checkpoint of shac.py, not of bptt.py")
+    save(path, "shac", Tiny(), STATE)
+    assert refusal(lambda: load(path, "bptt"), capsys).endswith(f": {path} is a checkpoint of 'shac', not of bptt.py")
     whole = path.read_bytes()
     middle = len(whole) // 2
     inverted = whole[:middle] + bytes(255 - byte for byte in whole[middle : middle + 400]) + whole[middle + 400 :]
     for broken in (b"", b"hello", whole[:100], whole[:-10], inverted):
         path.write_bytes(broken)
-        assert refusal(lambda: load(path, "bptt"), capsys).endswith(f": {path} is not a whole checkpoint of bptt.py")
-        assert refusal(lambda: load(path), capsys).endswith(f": {path} is not a whole checkpoint")
+        assert f": {path} is not a whole checkpoint of bptt.py" in refusal(lambda: load(path, "bptt"), capsys)
+        assert f": {path} is not a whole checkpoint" in refusal(lambda: load(path), capsys)
     for older in ("shac-1", 1):
         torch.save({"format": older, "actor": {}}, path)
-        message = f": {path} is a checkpoint of format {older}, and this version reads format {FORMAT}"
+        message = f": {path} is a checkpoint of format {older!r}, and this version reads format {FORMAT}"
         assert refusal(lambda: load(path, "shac"), capsys).endswith(message)
     for foreign in ({"weights": torch.zeros(3)}, [1, 2], {"format": FORMAT}):
         torch.save(foreign, path)
-        assert refusal(lambda: load(path), capsys).endswith(f": {path} is not a whole checkpoint")
+        assert f": {path} is not a whole checkpoint" in refusal(lambda: load(path), capsys)
+
+
+NAN, NO_POLICY = float("nan"), {"layers": [["Linear", 2, 1]], "weights": {}}
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("script", [None, 3, "shac\x1b[31m"]),
+        ("args", [None, [], {"gamma": 1.0}, {1: 2, "env": "ant"}]),
+        ("iteration", [None, -1, 1.5, NAN, True, 2**70]),
+        ("control_steps", [None, -1, "5"]),
+        ("seconds", [None, -1.0, NAN]),
+        ("totals", [None, [], {"sim/nonfinite": 0.5}]),
+        ("episodes", [None, {}, [(1.0, 2.0)], [(1.0, 2.0, NAN)], [(1.0, 2.0, "x")]]),
+        (
+            "ranks",
+            [None, [], [None], [{"env": None}], [{"env": None, "rng": torch.zeros(3)}], [{"env": 3, "rng": None}]],
+        ),
+        ("modules", [None, [], {3: {}}]),
+        ("policy", [None, {}, NO_POLICY | {"layers": [["Dropout"]]}, NO_POLICY | {"layers": [[]]}, {"layers": []}]),
+    ],
+)
+def test_a_damaged_entry_is_named(
+    name: str, values: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "checkpoint.pt"
+    save(path, "shac", Tiny(), STATE)
+    state = torch.load(path)
+    for value in values:
+        torch.save(state | {name: value}, path)
+        line = refusal(lambda: load(path), capsys)
+        assert f"{path} is not a whole checkpoint: {name} is not " in line
+    if name != "modules":  # an exported policy has none
+        torch.save({key: value for key, value in state.items() if key != name}, path)
+        assert refusal(lambda: load(path), capsys).endswith(f"{path} is not a whole checkpoint: {name} is missing")
+
+
+def test_a_compressed_file_is_refused_before_it_is_unpacked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "checkpoint.pt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("checkpoint/data.pkl", bytes(10**7))
+    assert "compressed" in refusal(lambda: load(path), capsys)
+
+
+def test_weights_are_compared_before_layers_are_built(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "checkpoint.pt"
+    save(path, "shac", Tiny(), STATE)
+    state = torch.load(path)
+    for layers in ([["Linear", 10**9, 10**9]], [["Linear", "2", 1]], [["Linear"]], [["LayerNorm", -1]]):
+        torch.save(state | {"policy": state["policy"] | {"layers": layers}}, path)
+        assert "its policy's weights do not fit its layers" in refusal(lambda: load_policy(path), capsys)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -76,12 +140,12 @@ def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> Non
             parameter.add_(0.1 * torch.randn_like(parameter))
     learner.policy[0].update(3.0 + 2.0 * torch.randn(100, env.task.obs_dim))
     path = tmp_path / "checkpoint.pt"
-    save(path, f"my-{name}", learner, {"args": {"env": "cartpole"}, "iteration": 7})
+    save(path, f"my_{name}", learner, STATE | {"iteration": 7})
     loaded, obs = load_policy(path), 3.0 + 2.0 * torch.randn(7, 5, env.task.obs_dim)
-    assert (loaded.script, loaded.args, loaded.iteration) == (f"my-{name}", {"env": "cartpole"}, 7)
+    assert (loaded.script, loaded.args, loaded.iteration) == (f"my_{name}", {"env": "cartpole"}, 7)
     torch.testing.assert_close(loaded.network(obs), learner.policy(obs), rtol=0, atol=0)
-    state = load(path, f"my-{name}")
-    assert state["modules"].keys() == learner.modules.keys()
+    state = load(path, f"my_{name}")
+    assert {"actor", "actor_critic"} & state["modules"].keys() and not {"env", "policy"} & state["modules"].keys()
     for parameter in learner.policy.parameters():
         parameter.data.zero_()
     assert loaded.network(obs).abs().max() > 1e-3  # its weights are its own
@@ -93,23 +157,12 @@ def test_a_layer_that_cannot_be_saved_is_named(tmp_path: Path) -> None:
     learner = Tiny()
     learner.policy.append(nn.Dropout())
     with pytest.raises(TypeError, match="layer Dropout; .* has ELU, LayerNorm, Likeliest, Linear"):
-        save(tmp_path / "checkpoint.pt", "shac", learner, {})
+        save(tmp_path / "checkpoint.pt", "shac", learner, STATE)
     assert not list(tmp_path.iterdir())
 
 
 def test_weights_of_other_sizes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     learner = Tiny()
-    learner.modules = {"policy": learner.policy}
-    for other in ({"policy": nn.Sequential(nn.Linear(3, 1)).state_dict()}, {}):
+    for other in ({"layer": nn.Linear(3, 1).state_dict()}, {}, {"layer": 3}):
         error = refusal(lambda other=other: restore(learner, {"modules": other}), capsys)  # type: ignore[misc]
         assert "the checkpoint does not fit the script as it is now: " in error
-
-
-def test_a_policy_that_is_not_whole_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "checkpoint.pt"
-    save(path, "shac", Tiny(), {"args": {}, "iteration": 1})
-    state = load(path)
-    assert load_policy(path).iteration == 1
-    for policy in ({}, state["policy"] | {"weights": {}}):
-        torch.save(state | {"policy": policy}, path)
-        assert refusal(lambda: load_policy(path), capsys).endswith(f"{path} is not a whole checkpoint")

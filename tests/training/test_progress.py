@@ -29,7 +29,7 @@ def test_columns_are_named_after_scalars() -> None:
         "charts/SPS": "charts_SPS",
         "eval/return": "eval_return",
         "losses/actor": "losses_actor",
-        "time/sim_forward": "time_sim_forward",
+        "time/update_actor": "time_update_actor",
     }
     assert {name: column(name) for name in names} == names
 

@@ -19,11 +19,9 @@ from learners import SMALL, read_progress, refusal, run
 from torch import Tensor, nn
 
 import bptt
-import diffsim
 import shac
 from diffsim.env import DiffEnv
 from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, evaluate, parse
-from diffsim.training import run as run_module
 from diffsim.training.progress import COLUMNS
 
 # Iterations of a few milliseconds.
@@ -100,8 +98,9 @@ def test_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
     raised.clear()
     monkeypatch.setattr(bptt, "bptt_loss", interrupted(2))
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(SystemExit) as exit:
         run(bptt, tmp_path / "twice", *arguments)
+    assert exit.value.code == 130 and capsys.readouterr().err == "bptt.py: interrupted\n"
     assert not (tmp_path / "twice" / "checkpoint.pt").exists()
 
 
@@ -307,12 +306,12 @@ class Counter:
     """A learner that needs no environment: it counts."""
 
     def __init__(self) -> None:
-        self.policy = nn.Sequential(nn.Linear(5, 1))
-        self.modules: dict[str, checkpoint.Stateful] = {"policy": self.policy}
+        self.layer = nn.Linear(5, 1)
+        self.policy = nn.Sequential(self.layer)
 
     @property
     def bias(self) -> Tensor:
-        return self.policy.get_parameter("0.bias")
+        return self.layer.bias
 
     def update(self) -> dict[str, Tensor]:
         with torch.no_grad():
@@ -326,7 +325,7 @@ def count(args: bptt.Args) -> Counter:
     eval_env, counter = run.make_eval_env(), run.restore(Counter())
     update = run.capture(counter.update)
     for iteration in run:
-        run.log(update() | {"charts/square": iteration**2}, control_steps=100 * iteration)
+        run.log(update() | {"charts/square": iteration**2}, control_steps=100)
         if run.evaluation_due:
             evaluation = evaluate(eval_env, counter.policy)
             evaluation.others["further"] = 3.5
@@ -358,17 +357,10 @@ def test_a_learner_without_training_environments(tmp_path: Path, capsys: pytest.
     assert "skipped" not in capsys.readouterr().out
 
 
-def test_episode_metrics() -> None:
-    env = diffsim.make("cartpole", num_envs=2, horizon=1)
-    env.sim.nonfinite_gradients += 3
-    done = torch.tensor([[False, True], [True, False], [False, True]])
-    episode = {"r": torch.tensor([[1.0, 2.0], [4.0, 8.0], [16.0, 32.0]]), "l": torch.tensor([[1, 2], [3, 4], [5, 6]])}
-    metrics = run_module.episode_metrics(env, done, episode, nonfinite=done & (episode["l"] > 2))
-    assert {name: value.item() for name, value in metrics.items()} == {
-        "episodes/count": 3,
-        "episodes/return": 38.0,
-        "episodes/length": 11,
-        "sim/nonfinite": 2,
-        "sim/nonfinite_gradients": 6,
-    }
-    assert not env.sim.nonfinite_gradients.any()
+def test_control_steps_accumulate_when_a_resume_changes_the_window(tmp_path: Path) -> None:
+    run(bptt, tmp_path, *TINY, "--iterations", 4, "--stop-after", 2, "--quiet")
+    bptt.main(["--resume", str(tmp_path / "checkpoint.pt"), "--horizon", "3"])
+    rows = read_progress(tmp_path)
+    assert [row["control_steps"] for row in rows] == ["16", "32", "38", "44"]
+    assert all(float(row["charts_SPS"]) > 0 for row in rows)
+    assert checkpoint.load(tmp_path / "checkpoint.pt")["control_steps"] == 44
