@@ -11,9 +11,9 @@ import gps_variants
 import numpy as np
 import pytest
 import torch
-from common import RESULTS
+from common import DOCS, RESULTS
 from learners import run
-from tables import read_csv, write_csv
+from tables import markdown, read_csv, write_csv
 
 import bptt
 import diffsim
@@ -125,3 +125,8 @@ def test_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     with pytest.raises(SystemExit) as exit:
         experiments.main(["--record", str(path)])
     assert exit.value.code == 2 and "--record needs --actor" in capsys.readouterr().err
+
+
+def test_the_page_has_the_table_of_the_csv_file() -> None:
+    runs = experiments.grouped(read_csv(RESULTS / "cpu" / "gps_runs.csv"), *experiments.RUN)
+    assert markdown(experiments.table(runs)) in (DOCS / "gps.md").read_text()

@@ -10,9 +10,9 @@ import gps_terrain
 import numpy as np
 import pytest
 import torch
-from common import CheckpointFlags
+from common import DOCS, RESULTS, CheckpointFlags
 from learners import run
-from tables import read_csv
+from tables import markdown, read_csv
 
 import gps
 from diffsim.terrain import named_terrains
@@ -93,3 +93,8 @@ def test_until_a_fall() -> None:
     standing, distance = gps_terrain.until_fall(x, 1)
     assert standing.tolist() == [True, False]
     assert distance.tolist() == [3.5, 0.5]
+
+
+def test_the_page_has_the_table_of_the_csv_file() -> None:
+    rows = [row for row in read_csv(RESULTS / "cpu" / "gps_terrain.csv") if row["env"] == "walker"]
+    assert markdown(gps_terrain.table(rows)) in (DOCS / "gps_terrain.md").read_text()
