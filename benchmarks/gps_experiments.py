@@ -5,11 +5,9 @@
     python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
     python benchmarks/gps_experiments.py --list           a command for each plan, and for each run, to run side by side
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
-    python benchmarks/gps_experiments.py --runs runs/short -- --iterations 5      what follows "--" goes to gps.py
 
-Writes gps_runs.csv (every iteration of every run), gps_generalisation.csv (the policy, the DDP controller and that of
-the nearest step, from perturbed starts and under pushes), the table of gps.md, and the pictures gps_variants.png and
-gps_generalisation.png: Figures 2 and 3 of the paper.
+What follows "--" goes to gps.py. Writes gps_runs.csv (every iteration of every run), gps_generalisation.csv (controllers
+from perturbed starts and under pushes), the table of gps.md, and pictures of the paper's Figures 2 and 3.
 """
 
 from __future__ import annotations
@@ -165,20 +163,17 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 
-def script(case: str) -> str:
-    return "benchmarks/gps_variants.py" if case in VARIANTS else "gps.py"
-
-
 def train(directory: Path, flags: Sequence[str], count: int) -> str:
     """Trains, or resumes, or finds that it is done, and perturbs; returns what there is to say."""
     path, (env, case, seed) = directory / "checkpoint.pt", directory.name.split("__")
+    script = "benchmarks/gps_variants.py" if case in VARIANTS else "gps.py"
     start = ["--env", env, *CASES[case].split(), "--seed", seed]
     if path.exists():
         state = checkpoint.load(path)
         if state["iteration"] >= state["args"]["iterations"]:
             return f"{directory.name}: done before"
         start = ["--resume", str(path)]
-    line = [sys.executable, str(ROOT / script(case)), *start, "--run-dir", str(directory), "--threads", "1", *flags]
+    line = [sys.executable, str(ROOT / script), *start, "--run-dir", str(directory), "--threads", "1", *flags]
     with (directory.parent / f"{directory.name}.log").open("a") as log:
         code = subprocess.run(line, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT).returncode
     if code:
@@ -225,9 +220,6 @@ def load_search(path: Path) -> gps.Search:
     return search
 
 
-# Generalisation -------------------------------------------------------------------------------------------------------
-
-
 def controllers(search: gps.Search) -> dict[str, Act]:
     """The policy's mean; the DDP controller; and the DDP controller of the step that looks most alike (TBDP)."""
     system, policy, guide = search.system, search.network, search.guides[0]
@@ -270,7 +262,7 @@ def generalisation(search: gps.Search, count: int) -> list[Row]:
 
 
 def number(text: str) -> float:
-    return float(text) if text else math.nan
+    return float(text or "nan")
 
 
 def grouped(rows: Iterable[dict[str, str]], *keys: str) -> Runs:

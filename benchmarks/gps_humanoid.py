@@ -1,7 +1,6 @@
 """How long a robot of guided policy search runs, beside its guides: with noise, pushed off its start, on rough ground.
 
     python benchmarks/gps_humanoid.py runs/gps/humanoid__spread-3__1 runs/gps/humanoid__spread-30__1
-    python benchmarks/gps_humanoid.py --draw-only
 
 Figure 5 of the paper, of runs of gps.py in folders TASK__CASE__SEED. The policy, the DDP controller and that of the
 step that looks most alike (TBDP) run for 8 s, until the task says that they fell: from the guides' start with the

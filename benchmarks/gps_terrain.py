@@ -1,7 +1,6 @@
 """Guided policy search on slopes, steps and rough ground, beside its guides (Figures 3 and 4).
 
     python benchmarks/gps_terrain.py runs/gps/walker__feedback-short__1 runs/gps/hopper__feedback__1
-    python benchmarks/gps_terrain.py --draw-only
 
 Takes runs of gps_experiments.py. Each terrain has ten profiles: a slope or step begins at ten places 10 cm apart, so
 that a robot meets it in ten phases of its gait; rough ground has ten seeds. All controllers get heights over the ground

@@ -89,13 +89,7 @@ def save_demonstration(
 
 
 def follow_demonstration(system: Dynamics, x: Tensor, u: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """A trajectory of the system that tracks an example x (T + 1, nx), u (T, nu), which it need not reproduce.
-
-    Args:
-        weight: of the squared deviation, see Tracking.
-
-    Returns:
-        x (1, T + 1, nx), u (1, T, nu).
+    """A trajectory x (1, T + 1, nx), u (1, T, nu) that tracks an example x (T + 1, nx), u (T, nu); see Tracking.
 
     Raises:
         ValueError: the linear controller about the example left the finite numbers.
