@@ -6,7 +6,7 @@
     python benchmarks/gps_experiments.py --list           a command for each plan, and for each run, to run side by side
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
 
-What follows "--" goes to gps.py. Writes gps_runs.csv (every iteration of every run), gps_generalisation.csv (controllers
+What follows "--" goes to gps.py. Writes gps_runs.csv (every iteration of all runs), gps_generalisation.csv (controllers
 from perturbed starts and under pushes), the table of gps.md, and pictures of the paper's Figures 2 and 3.
 """
 
