@@ -19,22 +19,9 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Decay,
-    Finite,
-    Fraction,
-    ObsNormalizer,
-    ParallelFlags,
-    Positive,
-    Run,
-    Widths,
-    command,
-    evaluate,
-    evaluate_checkpoint,
-    parse,
-)
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, evaluate, evaluate_checkpoint
+from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
 
 # Windows: section 4.2 of the SHAC paper; everything else: its authors' released settings.
 # fmt: off

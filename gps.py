@@ -37,8 +37,9 @@ from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.errors import command, fail
 from diffsim.training.evaluation import SEED, Evaluation, travels
-from diffsim.training.flags import Count, Finite, Flags, Natural, NonNegative, Positive, Repeats, parse
+from diffsim.training.flags import Flags, parse
 from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive, Repeats
 from diffsim.training.run import Run
 
 LESSONS, REACH, BLEND = 20_000, 0.5, 0.1  # feedback: states of a fit; how far a guide teaches; over which guides mix

@@ -26,27 +26,13 @@ from torch.func import functional_call
 from diffsim import DiffEnv
 from diffsim.planning import Dynamics
 from diffsim.tasks import TASKS
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Ensemble,
-    Fraction,
-    Natural,
-    ObsNormalizer,
-    ParallelFlags,
-    Positive,
-    ReplayBuffer,
-    Run,
-    SomeWidths,
-    Transition,
-    Widths,
-    command,
-    distributed,
-    evaluate,
-    evaluate_checkpoint,
-    fail,
-    parse,
-)
+from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
+from diffsim.training.ensemble import Ensemble
+from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.ranges import Count, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
+from diffsim.training.replay import ReplayBuffer, Transition
 
 # Policies and values: as SAC's, from Table 3 of the SHAC paper. Rollout lengths: MBPO's released settings.
 # fmt: off
@@ -61,7 +47,6 @@ PER_TASK = {
     "humanoid_imitation": ((512, 256),           (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
 }
 # fmt: on
-SIZES = ("buffer_size", "branches", "rollout_lengths", "retain")  # of buffers
 LOG_STD = (-5.0, 2.0)  # bounds of the policy's log standard deviation
 LOG_VAR = (-10.0, 0.5)  # where the bounds of the models' log variance begin, in normalized units
 BOUND_WEIGHT = 0.01  # of the pull that closes them
@@ -85,13 +70,13 @@ class Args(ParallelFlags):
     """control steps of each environment with random actions before anything is learnt"""
     buffer_size: Count = 1_000_000
     """real transitions that are kept, over all environments"""
-    models: Count = 7
+    models: Repeats = 7
     """networks of the ensemble"""
-    elites: Count = 5
+    elites: Repeats = 5
     """of which so many, those that predict held-out transitions best, make the rollouts"""
     model_hidden: Widths = (200, 200, 200, 200)
     """units of the models' hidden layers (per task)"""
-    model_updates: Count = 50
+    model_updates: Repeats = 50
     """gradient updates of the models in an iteration"""
     model_batch_size: Count = 256
     """samples of each model in such an update"""
@@ -101,13 +86,13 @@ class Args(ParallelFlags):
     """rollouts that each elite makes at once, branched from real states"""
     rollout_lengths: tuple[Count, Count] = (1, 1)
     """steps of a rollout at first and from the middle of the iterations on, with a linear rise between (per task)"""
-    retain: Count = 4
+    retain: Repeats = 4
     """iterations whose rollouts are kept"""
     sample_enhance: Natural = 0
     """SE-MBPO: so many transitions around each real one, by the simulator's Jacobians (0: MBPO)"""
     enhance_scale: Positive = 0.2
     """their distance: of states in control steps' root mean square change, of actions in units before tanh"""
-    updates: Count = 160
+    updates: Repeats = 160
     """gradient updates of actor, critics and temperature in an iteration"""
     batch_size: Count = 256
     """samples of such an update"""
@@ -236,28 +221,6 @@ def gaussian_nll(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
     return 0.5 * ((target - mean).square() * (-log_var).exp() + log_var + math.log(2 * math.pi))
 
 
-# Sample enhancement ---------------------------------------------------------------------------------------------------
-
-
-def enhance(dynamics: Dynamics, x: Tensor, action: Tensor, samples: int, scale: float) -> tuple[Tensor, ...]:
-    """Steps near those from states x (n, nx) with actions (n, nu), to first order; all in float64.
-
-    x + d -> f(x, u) + J d, where u = artanh(action), so no action leaves its bounds, and d is a random tangent vector.
-
-    Returns:
-        States, actions and next states (samples, n, ...); whether the given steps are finite (n,).
-    """
-    u = action.clamp(-1 + 1e-6, 1 - 1e-6).atanh()
-    following, _, finite = dynamics.rollout(x, 1, lambda *_: u)
-    following = following[:, 1]
-    change = dynamics.difference(following, x).square().mean(0).sqrt()  # of a control step: a scale for each number
-    d = scale * torch.randn(samples, len(x), dynamics.nd + dynamics.nu, dtype=x.dtype, device=x.device)
-    d[..., : dynamics.nd] *= change
-    end = (dynamics.jacobians(x, u, following) @ d.unsqueeze(-1)).squeeze(-1)
-    start, push = d.split((dynamics.nd, dynamics.nu), -1)
-    return dynamics.retract(x, start), (u + push).tanh(), dynamics.retract(following, end), finite[:, 0]
-
-
 # The algorithm --------------------------------------------------------------------------------------------------------
 
 
@@ -319,29 +282,12 @@ class MBPO:
             seen = Transition(*(x[self.held_out :] for x in made))
             self.real.add(seen)
             if state is not None:
-                self.real.add(self.around(state[self.held_out :], seen))
+                self.real.add(enhance(self, self.dynamics, state[self.held_out :], seen))
             self.actor.normalizer.update(obs)
             self.models.target.update(self.changes(seen))
             obs = next_obs
         optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer, self.model_optimizer
         return {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
-
-    def around(self, state: Tensor, made: Transition) -> Transition:
-        """SE-MBPO: transitions near real ones, observed and rewarded as the task does."""
-        task, args, nq = self.env.task, self.args, self.env.scene.nq
-        doubled = state.double(), made.action.double()
-        *near, finite = enhance(self.dynamics, *doubled, args.sample_enhance, args.enhance_scale)
-        start, action, end = (x.to(state.dtype) for x in near)
-
-        def observe(x: Tensor, action: Tensor) -> Tensor:
-            return task.observe(x[..., :nq], x[..., nq:], action)
-
-        # A part of the observation may be the action before, which stays as it was.
-        obs = made.obs + observe(start, 0 * action) - observe(state, 0 * made.action)
-        next_obs = observe(end, action)
-        reward, terminated = task.reward(next_obs, action) * finite, self.failed(next_obs) | ~finite
-        parts = Transition(obs, action, reward, next_obs, terminated.to(reward.dtype))
-        return Transition(*(x.flatten(0, 1) for x in parts))
 
     def failed(self, obs: Tensor) -> Tensor:
         """Whether an observation (..., obs_dim) ends its episode."""
@@ -450,6 +396,45 @@ class MBPO:
 def soft_bellman(reward: Tensor, next_soft_value: Tensor, terminated: Tensor, gamma: float) -> Tensor:
     """r + gamma V(s'), without a value after a failure; where time ran out the episode could have gone on."""
     return reward + gamma * (1 - terminated) * next_soft_value
+
+
+# SE-MBPO --------------------------------------------------------------------------------------------------------------
+
+
+def nearby(dynamics: Dynamics, x: Tensor, action: Tensor, samples: int, scale: float) -> tuple[Tensor, ...]:
+    """Steps near those from states x (n, nx) with actions (n, nu), to first order; all in float64.
+
+    x + d -> f(x, u) + J d, where u = artanh(action), so no action leaves its bounds, and d is a random tangent vector.
+
+    Returns:
+        States, actions and next states (samples, n, ...); whether the given steps are finite (n,).
+    """
+    u = action.clamp(-1 + 1e-6, 1 - 1e-6).atanh()
+    following, _, finite = dynamics.rollout(x, 1, lambda *_: u)
+    following = following[:, 1]
+    change = dynamics.difference(following, x).square().mean(0).sqrt()  # of a control step: a scale for each number
+    d = scale * torch.randn(samples, len(x), dynamics.nd + dynamics.nu, dtype=x.dtype, device=x.device)
+    d[..., : dynamics.nd] *= change
+    end = (dynamics.jacobians(x, u, following) @ d.unsqueeze(-1)).squeeze(-1)
+    start, push = d.split((dynamics.nd, dynamics.nu), -1)
+    return dynamics.retract(x, start), (u + push).tanh(), dynamics.retract(following, end), finite[:, 0]
+
+
+def enhance(mbpo: MBPO, dynamics: Dynamics, state: Tensor, made: Transition) -> Transition:
+    """Transitions near those made from states (n, nx), observed and rewarded as the task does (Qiao et al. 2021)."""
+    args, task, nq = mbpo.args, mbpo.env.task, dynamics.nq
+    *near, finite = nearby(dynamics, state.double(), made.action.double(), args.sample_enhance, args.enhance_scale)
+    start, action, end = (x.to(state.dtype) for x in near)
+
+    def observe(x: Tensor, action: Tensor) -> Tensor:
+        return task.observe(x[..., :nq], x[..., nq:], action)
+
+    # A part of the observation may be the action before, which stays as it was.
+    obs = made.obs + observe(start, 0 * action) - observe(state, 0 * made.action)
+    next_obs = observe(end, action)
+    reward, terminated = task.reward(next_obs, action) * finite, mbpo.failed(next_obs) | ~finite
+    parts = Transition(obs, action, reward, next_obs, terminated.to(reward.dtype))
+    return Transition(*(x.flatten(0, 1) for x in parts))
 
 
 # The run --------------------------------------------------------------------------------------------------------------

@@ -24,22 +24,9 @@ from diffsim import DiffEnv
 from diffsim.planning import REAL, AfterStep, Cost, Dynamics, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Task
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Flags,
-    NonNegative,
-    ObsNormalizer,
-    Positive,
-    Run,
-    Widths,
-    command,
-    distributed,
-    evaluate,
-    evaluate_checkpoint,
-    fail,
-    parse,
-)
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, distributed, evaluate, evaluate_checkpoint, fail
+from diffsim.training.flags import Flags, parse
+from diffsim.training.ranges import Count, NonNegative, Positive, Widths
 
 # fmt: off
 COLUMNS = ("hidden", "horizon", "normalize_obs")

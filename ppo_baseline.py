@@ -20,27 +20,11 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks import TASKS, Task
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Finite,
-    Fraction,
-    Natural,
-    NonNegative,
-    ObsNormalizer,
-    ParallelFlags,
-    Positive,
-    Repeats,
-    Run,
-    Widths,
-    command,
-    distributed,
-    evaluate,
-    evaluate_checkpoint,
-    fail,
-    moments,
-    parse,
-)
+from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
+from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.normalizer import ObsNormalizer, moments
+from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
 
 # Table 2 of the SHAC paper; networks, iterations, hopper and half_cheetah: its authors' released settings. They have no
 # entropy bonus, with which hopper and ant learn more (docs/ppo.md).

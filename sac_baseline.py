@@ -22,28 +22,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Ensemble,
-    Finite,
-    Fraction,
-    Natural,
-    ObsNormalizer,
-    ParallelFlags,
-    Positive,
-    Repeats,
-    ReplayBuffer,
-    Run,
-    SomeWidths,
-    Transition,
-    command,
-    distributed,
-    evaluate,
-    evaluate_checkpoint,
-    fail,
-    parse,
-)
+from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
+from diffsim.training.ensemble import Ensemble
+from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.ranges import Count, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
+from diffsim.training.replay import ReplayBuffer, Transition
 
 # Table 3 of the SHAC paper; networks, seed steps, hopper and half_cheetah: its authors' released settings.
 # fmt: off

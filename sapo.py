@@ -23,29 +23,12 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
 from diffsim.tasks import TASKS, Task
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Decay,
-    Ensemble,
-    EnsembleAdam,
-    Finite,
-    Fraction,
-    ObsNormalizer,
-    ParallelFlags,
-    Positive,
-    Repeats,
-    Run,
-    SomeWidths,
-    Widths,
-    command,
-    distributed,
-    evaluate,
-    evaluate_checkpoint,
-    fail,
-    load_policy,
-    parse,
-)
+from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail, load_policy
+from diffsim.training.ensemble import Ensemble, EnsembleAdam
+from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
 
 # SHAC's networks; docs/sapo.md has what was measured with these settings, which are those of its best results.
 # fmt: off

@@ -21,23 +21,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Decay,
-    Finite,
-    Fraction,
-    ObsNormalizer,
-    ParallelFlags,
-    Positive,
-    Repeats,
-    Run,
-    Widths,
-    command,
-    evaluate,
-    evaluate_checkpoint,
-    parse,
-)
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, evaluate, evaluate_checkpoint
+from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
 # fmt: off

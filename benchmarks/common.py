@@ -24,7 +24,7 @@ from diffsim import DiffEnv
 from diffsim.sim.simulator import check_device
 from diffsim.training import SavedPolicy, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
-from diffsim.training.flags import check_ranges
+from diffsim.training.ranges import check_ranges
 
 RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
 OUTPUT = ROOT / "runs" / "benchmarks"

@@ -8,7 +8,7 @@ Writes stability_*.csv, stability.png and, with --update-results, the tables of 
 All is float32, from states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below
 twice the largest kinetic energy of a reference, 64 times as fine. "sweeps" drives one thing to an extreme: without
 motors the energy must never exceed that of the start, springs included, by 10 %; under actions, the kinetic one not
-twice the reference's.
+twice the reference's. "energy" swings chains without damping for 10 s.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 import motions
@@ -35,7 +37,7 @@ from diffsim import Scene, Simulator
 from diffsim.tasks import Contact
 from diffsim.training import Count
 
-Part = Literal["step", "sweeps", "horizon", "long"]
+Part = Literal["step", "sweeps", "horizon", "long", "energy"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 HORIZONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -52,11 +54,12 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "alternating action": (1,),
 }
 NEEDS_GROUND = list(SWEEPS)[:5]
+CHAINS, CHAIN_SUBSTEPS = (1, 5, 20), (16, 32, 64)  # links; substeps
 
 
 @dataclass
 class Args(PolicyFlags):
-    parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long")  # tables to measure
+    parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long", "energy")  # tables to measure
     contact: Contact = "soft"  # constants of contact and limits; firm of the tasks that have such
     states: Count = 8  # start states
     steps: Count = 1_000_000  # control steps of the table "long", over all of its 64 environments
@@ -263,6 +266,45 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
     yield row | {"episodes": len(returns), "median return": float(np.median(returns)) if returns else math.nan}
 
 
+def chain(links: int) -> Scene:
+    """A fixed chain of capsules of 0.2 m on parallel hinges, without damping and contact."""
+    link = '<joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.04" contype="0" conaffinity="0"/>'
+    bodies = "".join(f'<body pos="{0.2 * (k > 0)} 0 0">{link}' for k in range(links)) + links * "</body>"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "chain.xml"
+        path.write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+        return diffsim.load_scene(path)
+
+
+def measure_energy(links: int, states: int) -> Iterator[Row]:
+    """Chains fall from about horizontal at rest: how far the energy leaves that of the start, relative to the fall."""
+    scene, generator = chain(links), torch.Generator().manual_seed(0)
+    qpos = 0.1 * torch.randn((states, links), generator=generator, dtype=torch.float64)
+    down = torch.zeros(1, links, dtype=torch.float64)
+    down[0, 0] = math.pi / 2
+    least = mechanics(scene.mj_model, down, torch.zeros_like(down))[1]
+    for substeps in CHAIN_SUBSTEPS:
+        for integrator in ("semi_implicit", "extrapolated"):
+            sim = simulator(scene, integration(integrator, substeps), states)
+            q, v, bad = replay(sim, qpos, torch.zeros_like(qpos), torch.zeros(600, states, 0))
+            energy = np.array([mechanics(scene.mj_model, a, b)[1] for a, b in zip(q, v, strict=True)]) - least
+            drift = np.median(abs(energy / energy[0] - 1).max(0))
+            row = {"links": links, "substeps": substeps, "integrator": integrator, "energy drift": float(drift)}
+            yield row | {"chains": states, "not finite": bad}
+
+
+def energies(args: Args) -> list[Row]:
+    """The table of chains: a row for each number of links and substeps, a column for each integrator."""
+    for row in () if args.draw_only else (row for links in CHAINS for row in measure_energy(links, args.states)):
+        args.merge("stability_energy", [row], ("links", "substeps", "integrator"))
+    table: dict[tuple[str, str], dict[str, object]] = {}
+    for row in args.read("stability_energy"):
+        line = table.setdefault((row["links"], row["substeps"]), {"links": row["links"], "substeps": row["substeps"]})
+        lost = f" ({row['not finite']} of {row['chains']} not finite)" if int(row["not finite"]) else ""
+        line[row["integrator"]] = row["energy drift"] + lost
+    return list(table.values())
+
+
 def draw(args: Args, rows: list[dict[str, str]]) -> None:
     panels = list[Panel]()
     for name in dict.fromkeys(row["task"] for row in rows):
@@ -289,6 +331,9 @@ def main(args: Args) -> None:
     if args.contact == "firm":
         args.env = tuple(name for name in args.env if hasattr(diffsim.TASKS[name], "firm"))
     for part in args.parts:
+        if part == "energy":
+            args.publish(part, markdown(energies(args)), "stability.md")
+            continue
         rows = measured(args, f"stability_{part}", *MEASURES[part])
         if part != "horizon":
             args.publish(part, markdown(summary(rows) if part == "sweeps" else rows), "stability.md")

@@ -149,6 +149,57 @@ def test_every_csv_file_says_where_it_comes_from() -> None:
         assert re.match(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python \w+", origin), path
 
 
+SIMULATOR = [ROOT / "docs" / f"{name}.md" for name in ("accuracy", "stability", "performance")]
+
+
+@pytest.mark.parametrize("page", SIMULATOR, ids=lambda page: page.stem)
+def test_tables_of_the_simulator_agree_with_their_files(page: Path) -> None:
+    """A header is a column of the file, or a value in one: then the cell begins with a number of such a line."""
+    checked = 0
+    for table in tables(page):
+        for row in table.rows if table.source else ():
+            shown = dict(zip(table.header, row, strict=True))
+            folder = table.source.parents[1] / shown.get("machine", table.source.parent.name)
+            measured = read_csv(folder / table.source.name)
+            values = {value for line in measured for value in line.values()}
+            own = [name for name in shown if name in measured[0]]
+            lines = [line for line in measured if all(same(shown[name], line[name]) for name in own)]
+            assert own and lines, f"{table.source.name} lacks {shown}"
+            for name in (name for name in shown if name in values and name not in own):
+                cell, found = shown[name].split(" (")[0], [line for line in lines if name in line.values()]
+                assert cell == "-" or any(same(cell, value) for line in found for value in line.values()), shown
+            checked += 1
+    assert checked
+
+
+def test_the_table_of_sweeps_has_the_first_value_that_fails() -> None:
+    (table,) = (each for each in tables(ROOT / "docs" / "stability.md") if "sweep" in each.header)
+    measured = read_csv(ROOT / "results" / "cpu" / "stability_sweeps.csv")
+    shown = {tuple(row[:2]): row[2:] for row in table.rows}
+    failed = {(line["task"], line["sweep"]) for line in measured if "False" in line.values()}
+    assert {key for key in failed if not key[0].endswith("firm")} == {*shown}
+    for (task, sweep), cells in shown.items():
+        for integrator, cell in zip(table.header[2:], cells, strict=True):
+            lines = [x for x in measured if (x["task"], x["sweep"], x["integrator"]) == (task, sweep, integrator)]
+            bad = [line for line in lines if "False" in (line["finite"], line["energy bounded"])]
+            how = bad and ("energy" if bad[0]["finite"] == "True" else "not finite")
+            assert cell == (f"{bad[0]['value']} ({how})" if bad else "-"), (task, sweep, integrator)
+
+
+def test_the_table_of_transfer_has_medians_over_seeds() -> None:
+    (table,) = (each for each in tables(ROOT / "docs" / "transfer.md") if "worst" in each.header)
+    measured = read_csv(ROOT / "results" / "cpu" / "transfer.csv")
+    for row in table.rows:
+        shown = dict(zip(table.header, row, strict=True))
+        own = [line for line in measured if line["checkpoint"].startswith(f"{shown['learner']}/{shown['task']}__")]
+        assert len({line["seed"] for line in own}) == int(shown["seeds"]), shown
+        for condition in ("here", "MuJoCo x0.7", "MuJoCo x1", "MuJoCo x1.3"):
+            speeds = [float(line["speed"]) for line in own if line["condition"] == condition]
+            assert shown[condition] == f"{median(speeds):.2f}", (shown, condition)
+        kept = [float(line["kept"]) for line in own if line["condition"] == "MuJoCo x1"]
+        assert (shown["kept"], shown["worst"]) == (f"{median(kept):.0%}", f"{min(kept):.0%}"), shown
+
+
 @each_page
 def test_no_spread_of_a_single_seed(page: Path) -> None:
     assert not re.search(r"±\s*0(?![.\d])", page.read_text()), "the spread of one run is not 0: print the seed count"
@@ -179,21 +230,21 @@ def test_relative_links_and_pictures_exist(page: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{page.name}: {link} has no such heading"
 
 
-def test_what_is_where_names_files_that_exist_and_all_of_the_package() -> None:
-    (section,) = re.findall(r"^## What is where\n(.*?)(?=^## |\Z)", README.read_text(), re.MULTILINE | re.DOTALL)
-    named, folder = set(), ""
-    for line in section.splitlines():
-        names = re.findall(r"[\w.-]+(?:\.(?:py|md)\b|/)", line)
-        if names and line.startswith(names[0]):
-            folder = names[0] if names[0].endswith("/") else ""
-        for name in names:
-            found = (ROOT / name).exists() or any((ROOT / folder).glob(name)) or any((ROOT / folder).glob(f"*/{name}"))
-            assert found, f"README names {folder}{name}, which does not exist"
-        named.update(names)
-    scripts = {path.name for path in ROOT.glob("*.py")}
-    modules = {path.name for path in (ROOT / "diffsim").glob("*.py")} - {"__init__.py"}
-    packages = {f"{path.parent.name}/" for path in (ROOT / "diffsim").glob("*/__init__.py")}
-    assert scripts | modules | packages <= named, f"not in README: {sorted(scripts | modules | packages - named)}"
+def test_readme_is_short_and_begins_with_the_commands_of_a_fresh_machine() -> None:
+    text = README.read_text()
+    first = FENCE.findall(text)[0][1].splitlines()
+    expected = ["pip install -e . && python shac.py --env ant --seed 1", 'pip install -e ".[test]" && pytest']
+    assert [line.split("  ")[0] for line in first] == expected and len(text.split()) <= 1000
+
+
+def test_what_is_where_names_all_scripts_and_packages_once() -> None:
+    (section,) = re.findall(r"^## What is where\n\n```\n(.*?)^```$", README.read_text(), re.MULTILINE | re.DOTALL)
+    first = [line.split()[0] for line in section.splitlines() if re.match(r" *[\w./]+ {2}", line)]
+    packages = [f"{path.parent.name}/" for path in (ROOT / "diffsim").glob("*/__init__.py")]
+    folders = [f"{name}/" for name in ("diffsim", "benchmarks", "tests", "examples", "tools")]
+    assert sorted(first) == sorted([*(path.name for path in ROOT.glob("*.py")), *packages, *folders])
+    for name in re.findall(r"docs/[\w.]+", section):
+        assert (ROOT / name).is_file(), f"README names {name}, which does not exist"
 
 
 # Flags ----------------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ import diffsim
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
 from diffsim.training import Count, NonNegative, Positive, evaluate, fail, load_policy, make_policy_env, parse_penalty
 from diffsim.training.evaluation import travels
-from diffsim.training.flags import check_ranges
+from diffsim.training.ranges import check_ranges
 from diffsim.view.render import VIDEO_FPS, Frame, render_frames
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"

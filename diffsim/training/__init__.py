@@ -11,26 +11,22 @@ from diffsim.training.checkpoint import Learner, SavedPolicy, export_policy, loa
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, command, fail
 from diffsim.training.evaluation import Evaluation, evaluate
-from diffsim.training.flags import (
-    Count,
-    Decay,
-    Finite,
-    Flags,
-    Fraction,
-    Natural,
-    NonNegative,
-    ParallelFlags,
-    Positive,
-    Repeats,
-    SomeWidths,
-    Width,
-    Widths,
-    parse,
-    parse_penalty,
-)
+from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
 from diffsim.training.likeliest import Likeliest
 from diffsim.training.normalizer import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.ranges import (
+    Count,
+    Decay,
+    Finite,
+    Fraction,
+    Natural,
+    NonNegative,
+    Positive,
+    Repeats,
+    SomeWidths,
+    Widths,
+)
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run
 from diffsim.view.gait import Gait, describe
@@ -60,7 +56,6 @@ __all__ = [
     "SomeWidths",
     "Transition",
     "UsageError",
-    "Width",
     "Widths",
     "command",
     "describe",

@@ -3,56 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-import torch
 import tyro
 
 from diffsim.tasks import TASKS, HumanoidImitation
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
+from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, flag
 from diffsim.training.variation import parse_ranges
 from diffsim.view import render
 
-LARGEST = torch.finfo(torch.float32).max
 RANDOMISED = ("stiffness=0.45:2.2", "friction=0.85:1.17")  # with --contact firm
-
-
-@dataclass(frozen=True)
-class Range:
-    """What a value on the command line may be."""
-
-    words: str
-    holds: Callable[[Any], bool]
-
-    def complaint(self, value: Any) -> str | None:
-        if isinstance(value, float) and not abs(value) <= LARGEST:
-            return f"must be finite{' in single precision' if math.isfinite(value) else ''}, not {value}"
-        return None if self.holds(value) else f"must be {self.words}, not {value}"
-
-
-def _whole(least: int, most: int) -> Range:
-    return Range(f"from {least} to {most:,}", lambda value: least <= value <= most)
-
-
-Count = Annotated[int, _whole(1, 10**9)]
-Natural = Annotated[int, _whole(0, 10**9)]
-Repeats = Annotated[int, _whole(1, 10_000)]  # passes, networks: what takes time or memory one after the other
-Width = Annotated[int, _whole(1, 65_536)]
-Finite = Annotated[float, Range("finite", math.isfinite)]
-Positive = Annotated[float, Range("positive", lambda value: value > 0)]
-NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
-Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]
-Decay = Annotated[float, Range("in [0, 1)", lambda value: 0 <= value < 1)]
-Widths = tuple[Width, ...]
-SomeWidths = Annotated[Widths, Range("at least one number", lambda value: len(value) > 0)]
 ClipFile = Annotated[
     Clip | None,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -183,11 +151,6 @@ class ParallelFlags(Flags):
 Args = TypeVar("Args", bound=Flags)
 
 
-def flag(name: str) -> str:
-    """The command line's name of a field."""
-    return "--" + name.replace("_", "-")
-
-
 def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     """The command line as complete, checked arguments.
 
@@ -278,25 +241,6 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
     return tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
-
-
-def check_ranges(args: object) -> None:
-    """Raise a ValueError where a value of a dataclass of flags is not what its type asks for."""
-    for name, hint in get_type_hints(type(args), include_extras=True).items():
-        for value, allowed in _ranges(hint, getattr(args, name, None)):
-            if complaint := allowed.complaint(value):
-                fail(f"{flag(name)} {complaint}")
-
-
-def _ranges(hint: Any, value: Any) -> list[tuple[Any, Range]]:
-    """A value, and those inside a tuple, each with what it may be."""
-    found = [(value, marker) for marker in getattr(hint, "__metadata__", ()) if isinstance(marker, Range)]
-    hint = hint.__origin__ if hasattr(hint, "__metadata__") else hint
-    if get_origin(hint) is tuple:
-        kinds = get_args(hint)
-        kinds = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
-        found += [part for kind, number in zip(kinds, value, strict=True) for part in _ranges(kind, number)]
-    return found
 
 
 def parse_penalty(items: Sequence[str]) -> dict[str, float]:

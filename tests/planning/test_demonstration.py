@@ -77,9 +77,7 @@ def test_a_header_that_asks_for_terabytes_is_refused_before_memory_is_taken(
             archive.writestr(name, content)
     read = np.lib.format.read_array
     monkeypatch.setattr(np.lib.format, "read_array", lambda file, **how: "qvel" in file.name or read(file, **how))
-    with pytest.raises(
-        ValueError, match=r"qvel has shape \(1000000000000, 2\) of float64, must be"
-    ):
+    with pytest.raises(ValueError, match=r"qvel has shape \(1000000000000, 2\) of float64, must be"):
         load_demonstration(task_system("cartpole"), path, 9)
 
 

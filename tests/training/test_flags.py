@@ -23,7 +23,7 @@ import sac_baseline
 import sapo
 import shac
 from diffsim.tasks import Task
-from diffsim.training import checkpoint, flags, parse
+from diffsim.training import checkpoint, flags, parse, ranges
 from diffsim.training.assess import make_env
 
 
@@ -151,7 +151,7 @@ def test_every_number_has_a_range(script: ModuleType) -> None:
         numbers = value if isinstance(value, tuple) else [value]
         if name not in ("seed", "MAY_CHANGE") and type(numbers[0] if numbers else None) in (int, float):
             assert len(
-                [number for number, _ in flags._ranges(hint, value) if number is not value or numbers == [value]]
+                [number for number, _ in ranges._ranges(hint, value) if number is not value or numbers == [value]]
             ) == len(numbers), name
 
 
