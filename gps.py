@@ -38,7 +38,7 @@ from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.errors import command, fail
 from diffsim.training.evaluation import SEED, Evaluation, travels
 from diffsim.training.flags import Flags, parse
-from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.layers import ObsNormalizer
 from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive, Repeats
 from diffsim.training.run import Run
 

@@ -29,7 +29,7 @@ from diffsim.tasks import TASKS
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags, parse
-from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.layers import ObsNormalizer
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
 from diffsim.training.replay import ReplayBuffer, Transition

@@ -1,8 +1,9 @@
 """PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301).
 
-Each action has particles: normal distributions whose locations and scales are the same in all states, and whose weights
-the network gives. The policy is their mixture, which can have several peaks where a Gaussian has one. Particles without
-weight are moved to those that have it. PPO, SHAC and SAC train it, and the policies with which the paper compares it.
+A Gaussian policy has one peak. Here each action has particles: normal distributions whose locations and scales are the
+same in all states, and whose weights the network gives. The policy is their mixture, which can have several peaks.
+Particles without weight are moved to those that have it. PPO, SHAC and SAC train this policy, and the policies with
+which the paper compares it.
 
     python pfpn.py --env ant --seed 1                        by PPO; writes runs/ant__pfpn__1__<time>/
     python pfpn.py --env ant --algorithm shac                by the simulator's gradient; --algorithm sac: off-policy
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -23,30 +24,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import (
-    ClippedAdam,
-    Count,
-    Ensemble,
-    Fraction,
-    Likeliest,
-    Natural,
-    NonNegative,
-    ObsNormalizer,
-    ParallelFlags,
-    Positive,
-    ReplayBuffer,
-    Run,
-    SomeWidths,
-    Transition,
-    Widths,
-    command,
-    distributed,
-    evaluate,
-    evaluate_checkpoint,
-    fail,
-    moments,
-    parse,
-)
+from diffsim.training import ClippedAdam, Ensemble, Run, command, distributed, evaluate, evaluate_checkpoint, fail
+from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.layers import Likeliest, ObsNormalizer, moments
+from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Positive, Repeats, SomeWidths
+from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of ppo_baseline.py, shac.py and sac_baseline.py, so that only the policy differs.
 # fmt: off
@@ -128,7 +110,7 @@ class Args(ParallelFlags):
     """discount factor"""
     trace_decay: Fraction = 0.95
     """lambda of PPO's advantages and of SHAC's values"""
-    epochs: Count = 5
+    epochs: Repeats = 5
     """passes over a window's samples: of PPO, of SHAC's critic; SAC: updates per control step (per task)"""
     minibatch_size: Count = 8192
     """samples of an update (per task; PPO on a CPU: at most 2048)"""
@@ -154,23 +136,23 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        if self.policy != "gaussian" and self.particles < 2:
-            fail(f"--particles {self.particles}: --policy {self.policy} needs at least 2")
-        if self.dead == 1:
-            fail("--dead 1: with equal weights all particles would be dead")
-        if self.policy == "discrete" and self.algorithm == "sac":
-            fail("--policy discrete has no density, whose entropy --algorithm sac needs")
-        if self.policy == "discrete" and self.algorithm == "shac" and self.estimator == "implicit":
-            fail("--policy discrete has no implicit gradient: choose --estimator straight-through or mixed")
-        if self.algorithm == "sac" and self.estimator == "mixed":
-            fail("--estimator mixed needs the rewards of a window, which --algorithm sac has not")
-        if self.algorithm == "sac" and distributed.size() > 1:
-            fail("--algorithm sac is one process alone: a replay buffer is not shared among ranks")
-        if self.algorithm == "sac" and self.buffer_size < self.horizon * self.num_envs:
-            fail(f"--buffer-size {self.buffer_size} holds no window of {self.horizon} steps of {self.num_envs}")
+        sac, discrete, window = self.algorithm == "sac", self.policy == "discrete", self.horizon * self.num_envs
+        few = self.policy != "gaussian" and not 2 <= self.particles <= 1000
+        pathless = discrete and self.algorithm == "shac" and self.estimator == "implicit"
+        for wrong, message in (
+            (few, f"--particles must be from 2 to 1,000 with --policy {self.policy}, not {self.particles}"),
+            (self.dead == 1, "--dead 1: with equal weights all particles would be dead"),
+            (discrete and sac, "--policy discrete has no density, whose entropy --algorithm sac needs"),
+            (pathless, "--policy discrete has no implicit gradient: choose --estimator straight-through or mixed"),
+            (sac and self.estimator == "mixed", "--estimator mixed needs the rewards of a window: not --algorithm sac"),
+            (sac and distributed.size() > 1, "--algorithm sac is one process: ranks do not share a replay buffer"),
+            (sac and self.buffer_size < window, f"--buffer-size {self.buffer_size} holds no window of {window} steps"),
+        ):
+            if wrong:
+                fail(message)
 
 
-# The policy -----------------------------------------------------------------------------------------------------------
+# Policies -------------------------------------------------------------------------------------------------------------
 
 
 class Mixture:
@@ -206,47 +188,6 @@ class Mixture:
             return (self.log_std + (1 + math.log(2 * math.pi)) / 2).sum((-1, -2))
         return -(self.log_weight.exp() * self.log_weight).sum((-1, -2))
 
-    @torch.no_grad()
-    def sample(self) -> Tensor:
-        """u (..., m), Eq. 4 and 5."""
-        return self.rsample("mixed")[0]
-
-    def rsample(self, estimator: Estimator, floor: float = 0.0) -> tuple[Tensor, Tensor]:
-        """u (..., m), differentiable, and the log probability of the chosen components (...), which "mixed" needs."""
-        noise, std = torch.randn_like(self.logits[..., 0]), self.log_std.exp()
-        if self.logits.shape[-1] == 1:  # a Gaussian
-            return self.loc.squeeze(-1) + std.squeeze(-1) * noise, torch.zeros_like(self.logits[..., 0, 0])
-        if estimator == "straight-through":
-            scores = self.logits - torch.empty_like(self.logits).exponential_().log()  # Gumbel noise
-            index = scores.argmax(-1, keepdim=True)
-        else:  # the same choice, with less noise to draw
-            total = self.logits.detach().softmax(-1).cumsum(-1)
-            level = (1 - torch.rand_like(noise).unsqueeze(-1)) * total[..., -1:]
-            index = (total < level).sum(-1, keepdim=True)
-        loc, scale = (x.expand_as(self.logits).gather(-1, index).squeeze(-1) for x in (self.loc, std))
-        u = loc + scale * noise
-        if estimator == "straight-through":
-            each = self.loc + std * noise.unsqueeze(-1)  # what each component would have drawn
-            u = u + self.relaxation(u.detach(), each.detach(), scores)
-        if estimator == "implicit":
-            u = self.attach(u.detach(), floor)
-        return u, self.log_weight.gather(-1, index).squeeze(-1).sum(-1)
-
-    def relaxation(self, u: Tensor, each: Tensor, scores: Tensor) -> Tensor:
-        """Zero, whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
-        x = scores.softmax(-1)  # Concrete distribution of temperature 1
-        gap = self.action(each) - self.action(u).unsqueeze(-1)
-        gap = gap / self.log_slope(u).exp().clamp(min=1e-3).unsqueeze(-1)  # of u, for the same gap of actions
-        return (gap * (x - x.detach())).sum(-1)
-
-    def attach(self, u: Tensor, floor: float) -> Tensor:
-        """u with its implicit gradient: its cumulative probability F(u) stays, so du = -dF / p(u) (Figurnov 2018)."""
-        z = (u.unsqueeze(-1) - self.loc) * (-self.log_std).exp()
-        cumulative = (self.logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
-        least = floor * self.log_slope(u).exp()  # the floor is of the action's density
-        density = torch.maximum(self.log_density(u).detach().exp(), least)
-        return u - (cumulative - cumulative.detach()) / density
-
 
 def logsumexp(x: Tensor) -> Tensor:
     """Over the last dimension. torch's own takes several times as long on a CPU where an exponential underflows."""
@@ -262,71 +203,52 @@ class Bins(Mixture):
         return self.log_weight.gather(-1, nearest).squeeze(-1)
 
 
-# Its parameters, of a network's features: deterministic holds the layers of the action without noise, before any tanh.
+class Head(nn.Module):
+    """Features of a network (..., inputs) -> the mixture of each of m actions. What of it depends on the state:
 
-
-class Particles(nn.Module):
-    """PFPN (Figure 2), whose weights alone depend on the state; or the bins of DISCRETE, which stay where they are."""
+    pfpn      the weights (Figure 2)
+    discrete  the weights; the components are points, which stay where they are
+    gmm       weights, locations and scales
+    gaussian  the location of its only component; with SAC its scale too, as in the other scripts
+    """
 
     def __init__(self, args: Args, inputs: int, actions: int) -> None:
         super().__init__()
-        bins = args.policy == "discrete"
-        self.mixture = Bins if bins else Mixture
-        self.shape, self.squashed = (actions, args.particles), args.algorithm != "ppo" and not bins
+        self.policy, n = args.policy, 1 if args.policy == "gaussian" else args.particles
+        self.shape, self.squashed = (actions, n), args.algorithm != "ppo" and args.policy != "discrete"
+        self.scale: nn.Linear | None = None
         loc, log_std = spread(*self.shape, self.squashed)
-        self.linear, self.likeliest = almost_constant(inputs, torch.zeros_like(loc)), Likeliest(*self.shape)
-        self.loc.data.copy_(loc)
-        self.loc.requires_grad_(not bins)
-        self.log_std = nn.Parameter(log_std.masked_fill(torch.tensor(bins), -math.inf), requires_grad=not bins)
-        self.deterministic = [self.linear, self.likeliest]
+        if self.policy == "gaussian":
+            self.linear = nn.Linear(inputs, actions)
+            if args.algorithm == "sac":
+                self.scale = nn.Linear(inputs, actions)
+            else:
+                self.log_std = nn.Parameter(torch.full(self.shape, -1.0 if args.algorithm == "shac" else 0.0))
+        elif self.policy == "gmm":
+            self.linear = almost_constant(inputs, torch.stack((torch.zeros_like(loc), loc)))
+            self.scale = almost_constant(inputs, log_std)
+            self.likeliest = Likeliest(*self.shape, shared=False)
+        else:
+            moving = self.policy == "pfpn"
+            self.linear, self.likeliest = almost_constant(inputs, torch.zeros_like(loc)), Likeliest(*self.shape)
+            self.loc.requires_grad_(moving).data.copy_(loc)
+            self.log_std = nn.Parameter(log_std if moving else log_std.fill_(-math.inf), requires_grad=moving)
 
     @property
     def loc(self) -> nn.Parameter:
+        """(m, n) with pfpn and discrete."""
         return self.likeliest.get_parameter("loc")
 
     def forward(self, features: Tensor) -> Mixture:
-        logits = self.linear(features).unflatten(-1, self.shape)
-        return self.mixture(logits, self.loc, self.log_std, self.squashed)
-
-
-class GMM(nn.Module):
-    """A Gaussian mixture: locations and scales depend on the state too."""
-
-    def __init__(self, args: Args, inputs: int, actions: int) -> None:
-        super().__init__()
-        self.shape, self.squashed = (actions, args.particles), args.algorithm != "ppo"
-        loc, log_std = spread(*self.shape, self.squashed)
-        self.linear = almost_constant(inputs, torch.stack((torch.zeros_like(loc), loc)))
-        self.log_std = almost_constant(inputs, log_std)
-        self.deterministic = [self.linear, Likeliest(*self.shape, shared=False)]
-
-    def forward(self, features: Tensor) -> Mixture:
-        logits, loc = self.linear(features).unflatten(-1, (2, *self.shape)).unbind(-3)
-        log_std = self.log_std(features).unflatten(-1, self.shape).clamp(*LOG_STD)
-        return Mixture(logits, loc, log_std, self.squashed)
-
-
-class Gaussian(nn.Module):
-    """A single component, as the other scripts have it: its scale depends on the state with SAC alone."""
-
-    def __init__(self, args: Args, inputs: int, actions: int) -> None:
-        super().__init__()
-        self.shape, self.squashed = (actions, 1), args.algorithm != "ppo"
-        self.linear = nn.Linear(inputs, actions)
-        own = torch.full(self.shape, -1.0 if args.algorithm == "shac" else 0.0)
-        self.log_std = nn.Linear(inputs, actions) if args.algorithm == "sac" else nn.Parameter(own)
-        self.deterministic = [self.linear]
-
-    def forward(self, features: Tensor) -> Mixture:
-        loc, log_std = self.linear(features).unsqueeze(-1), self.log_std
-        if isinstance(log_std, nn.Linear):
-            log_std = log_std(features).unsqueeze(-1).clamp(*LOG_STD)
-        return Mixture(torch.zeros_like(loc), loc, log_std, self.squashed)
-
-
-Head = Particles | GMM | Gaussian
-HEADS: dict[str, type[Particles] | type[GMM] | type[Gaussian]]
-HEADS = {"pfpn": Particles, "discrete": Particles, "gmm": GMM, "gaussian": Gaussian}
+        out = self.linear(features)
+        if self.policy == "gaussian":
+            logits, loc = torch.zeros_like(out).unsqueeze(-1), out.unsqueeze(-1)
+        elif self.policy == "gmm":
+            logits, loc = out.unflatten(-1, (2, *self.shape)).unbind(-3)
+        else:
+            logits, loc = out.unflatten(-1, self.shape), self.loc
+        scale = self.scale(features).unflatten(-1, self.shape).clamp(*LOG_STD) if self.scale else self.log_std
+        return (Bins if self.policy == "discrete" else Mixture)(logits, loc, scale, self.squashed)
 
 
 def spread(actions: int, n: int, squashed: bool) -> tuple[Tensor, Tensor]:
@@ -346,6 +268,88 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
     nn.init.trunc_normal_(layer.weight, std=0.01, a=-0.02, b=0.02)
     layer.bias.data.copy_(output.flatten())
     return layer
+
+
+def mlp(inputs: int, hidden: Sequence[int], activation: type[nn.Module] = nn.ELU, norm: bool = False) -> nn.Sequential:
+    """Linear, activation and, if asked for, LayerNorm per hidden layer."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), activation(), *([nn.LayerNorm(width)] if norm else [])]
+        inputs = width
+    return nn.Sequential(*layers)
+
+
+class Actor(nn.Module):
+    """pi(a|s), of normalized observations; with PPO also V(s), in units of its normalizer, of the same features."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.normalizer = ObsNormalizer(obs_dim)
+        activation = nn.ReLU if args.algorithm == "sac" else nn.ELU
+        self.body = mlp(obs_dim, args.hidden, activation, norm=args.algorithm == "shac")
+        self.head = Head(args, args.hidden[-1], action_dim)
+        self.value = nn.Linear(args.hidden[-1], 1) if args.algorithm == "ppo" else None
+
+    def forward(self, obs: Tensor) -> Mixture:
+        mixture: Mixture = self.head(self.body(obs))
+        return mixture
+
+    def both(self, obs: Tensor) -> tuple[Mixture, Tensor]:
+        assert self.value is not None
+        features = self.body(obs)
+        return self.head(features), self.value(features).squeeze(-1)
+
+    def deterministic(self) -> nn.Sequential:
+        """The locations of the largest weights, of observations as they come, with the same weights."""
+        likeliest = [] if self.head.policy == "gaussian" else [self.head.likeliest]
+        squash = [nn.Tanh()] if self.head.squashed else []
+        return nn.Sequential(self.normalizer, *self.body, self.head.linear, *likeliest, *squash)
+
+
+# Estimators: how the gradient of a sampled action reaches the policy --------------------------------------------------
+
+
+def sample(mixture: Mixture, estimator: Estimator = "mixed", floor: float = 0.0) -> tuple[Tensor, Tensor]:
+    """u (..., m), Eq. 4 and 5, and the log probability of the chosen components (...).
+
+    Locations and scales have the gradient of the chosen component. The weights have that of the estimator; with "mixed"
+    the caller adds the score function, for which it needs the log probability.
+    """
+    noise, std = torch.randn_like(mixture.logits[..., 0]), mixture.log_std.exp()
+    if mixture.logits.shape[-1] == 1:  # a Gaussian
+        return mixture.loc.squeeze(-1) + std.squeeze(-1) * noise, torch.zeros_like(noise[..., 0])
+    if estimator == "straight-through":
+        scores = mixture.logits - torch.empty_like(mixture.logits).exponential_().log()  # Gumbel noise
+        index = scores.argmax(-1, keepdim=True)
+    else:  # the same choice, with less noise to draw
+        total = mixture.logits.detach().softmax(-1).cumsum(-1)
+        level = (1 - torch.rand_like(noise).unsqueeze(-1)) * total[..., -1:]
+        index = (total < level).sum(-1, keepdim=True)
+    loc, scale = (x.expand_as(mixture.logits).gather(-1, index).squeeze(-1) for x in (mixture.loc, std))
+    u = loc + scale * noise
+    if estimator == "straight-through":
+        each = mixture.loc + std * noise.unsqueeze(-1)  # what each component would have drawn
+        u = u + straight_through(mixture, u.detach(), each.detach(), scores)
+    if estimator == "implicit":
+        u = implicit(mixture, u.detach(), floor)
+    return u, mixture.log_weight.gather(-1, index).squeeze(-1).sum(-1)
+
+
+def straight_through(mixture: Mixture, u: Tensor, each: Tensor, scores: Tensor) -> Tensor:
+    """Zero, whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
+    x = scores.softmax(-1)  # Concrete distribution of temperature 1
+    gap = mixture.action(each) - mixture.action(u).unsqueeze(-1)
+    gap = gap / mixture.log_slope(u).exp().clamp(min=1e-3).unsqueeze(-1)  # of u, for the same gap of actions
+    return (gap * (x - x.detach())).sum(-1)
+
+
+def implicit(mixture: Mixture, u: Tensor, floor: float) -> Tensor:
+    """u with its implicit gradient: its cumulative probability F(u) stays, so du = -dF / p(u) (Figurnov 2018)."""
+    z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()
+    cumulative = (mixture.logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
+    least = floor * mixture.log_slope(u).exp()  # the floor is of the action's density
+    density = torch.maximum(mixture.log_density(u).detach().exp(), least)
+    return u - (cumulative - cumulative.detach()) / density
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
@@ -377,7 +381,6 @@ class Resampling(nn.Module):
         """Resample if it is time; that is decided on the device, so a captured iteration does the same."""
         if not self.active:
             return {}
-        assert isinstance(head, Particles)
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
         due = self.age % self.args.resampling_interval == 0
@@ -400,7 +403,7 @@ class Resampling(nn.Module):
         self.total *= ~due
         return found
 
-    def move(self, head: Particles, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
+    def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
         """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
 
         |D| copies share the weight of their target: log(|D| + 1) less in the logits of each. Adam's moments of what is
@@ -412,8 +415,7 @@ class Resampling(nn.Module):
         target = torch.where(dead, (chance.unsqueeze(1) / draws).argmax(-1), own)
         copies = torch.zeros_like(chance).scatter_add(1, target, dead.to(chance.dtype))
         head.linear.bias.data.view(m, n).sub_(torch.log1p(copies))
-        parameters = head.linear.weight, head.linear.bias, head.loc, head.log_std
-        for parameter in parameters:
+        for parameter in (head.linear.weight, head.linear.bias, head.loc, head.log_std):
             rows = parameter.data.view(m, n, -1)
             rows.copy_(rows.gather(1, target.unsqueeze(-1).expand_as(rows)))
             for moment in optimizer.moments(parameter):
@@ -423,53 +425,7 @@ class Resampling(nn.Module):
         self.moved += dead.sum()
 
 
-# Networks -------------------------------------------------------------------------------------------------------------
-
-
-def mlp(inputs: int, hidden: Widths, activation: type[nn.Module] = nn.ELU, norm: bool = False) -> nn.Sequential:
-    """Linear, activation and, if asked for, LayerNorm per hidden layer."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), activation(), *([nn.LayerNorm(width)] if norm else [])]
-        inputs = width
-    return nn.Sequential(*layers)
-
-
-class Actor(nn.Module):
-    """pi(a|s), of normalized observations."""
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
-        super().__init__()
-        self.normalizer = ObsNormalizer(obs_dim)
-        activation = nn.ReLU if args.algorithm == "sac" else nn.ELU
-        self.body = mlp(obs_dim, args.hidden, activation, norm=args.algorithm == "shac")
-        self.head = HEADS[args.policy](args, args.hidden[-1], action_dim)
-
-    def forward(self, obs: Tensor) -> Mixture:
-        mixture: Mixture = self.head(self.body(obs))
-        return mixture
-
-    def deterministic(self) -> nn.Sequential:
-        """The locations of the largest weights, of observations as they come, with the same weights."""
-        squash = [nn.Tanh()] if self.head.squashed else []
-        return nn.Sequential(self.normalizer, *self.body, *self.head.deterministic, *squash)
-
-
-class ActorCritic(Actor):
-    """And V(s), in units of its normalizer, of the same features."""
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
-        super().__init__(args, obs_dim, action_dim)
-        self.value = nn.Linear(args.hidden[-1], 1)
-
-    def both(self, obs: Tensor) -> tuple[Mixture, Tensor]:
-        features = self.body(obs)
-        return self.head(features), self.value(features).squeeze(-1)
-
-
-# What the algorithms share --------------------------------------------------------------------------------------------
-# In each, the halves of an iteration, interact and learn, change tensors in place and never wait for the device: on a
-# GPU each becomes one CUDA graph.
+# Learners -------------------------------------------------------------------------------------------------------------
 
 
 class Window(NamedTuple):
@@ -482,24 +438,70 @@ class Window(NamedTuple):
     done: Tensor  # terminated or truncated
 
 
-def collect(env: DiffEnv, horizon: int, act: Callable[[Tensor], tuple[Tensor, ...]]) -> tuple[Window, list[Tensor]]:
-    """Steps of all environments from where they stand, and what `act` returned beside the actions (H, N, ...)."""
-    steps, obs = [], env.detach()
-    for _ in range(horizon):
-        action, *beside = act(obs)
-        next_obs, reward, terminated, truncated, info = env.step(action)
-        steps.append((obs, info["final_obs"], reward, terminated, terminated | truncated, *beside))
-        obs = next_obs
-    columns = [torch.stack(tensors) for tensors in zip(*steps, strict=True)]
-    known = len(Window._fields)
-    return Window(*columns[:known]), columns[known:]
+class Learner:
+    """What the algorithms share. Each adds the two halves of an iteration, interact and learn.
+
+    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
+    """
+
+    max_grad_norm, betas = 1.0, (0.9, 0.999)
+    samples: list[Tensor]  # (H N, ...) of a window
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        self.actor = Actor(args, env.task.obs_dim, env.scene.nu).to(env.device)
+        self.policy = self.actor.deterministic()
+        self.resampling = Resampling(args, self.actor.head).to(env.device)
+        self.optimizer = ClippedAdam(self.actor, self.max_grad_norm, self.betas, args.lr)
+
+    def add_critic(self, critic: nn.Module) -> None:
+        self.critic = critic.to(self.env.device)
+        self.target = copy.deepcopy(self.critic).requires_grad_(False)
+        self.critic_optimizer = ClippedAdam(self.critic, self.max_grad_norm, self.betas, self.args.critic_lr)
+
+    def schedule(self, iteration: int) -> None:
+        """Set the learning rates of an iteration."""
+
+    def act(self, obs: Tensor) -> tuple[Tensor, ...]:
+        """The action of one step, and what else of it the algorithm needs."""
+        raise NotImplementedError
+
+    def collect(self) -> tuple[Window, list[Tensor]]:
+        """A window of all environments from where they stand, and what else `act` returned (H, N, ...)."""
+        steps, obs = [], self.env.detach()
+        for _ in range(self.args.horizon):
+            action, *beside = self.act(obs)
+            next_obs, reward, terminated, truncated, info = self.env.step(action)
+            steps.append((obs, info["final_obs"], reward, terminated, terminated | truncated, *beside))
+            obs = next_obs
+        columns = [torch.stack(tensors) for tensors in zip(*steps, strict=True)]
+        return Window(*columns[:5]), columns[5:]
+
+    def keep(self, *tensors: Tensor) -> None:
+        for samples, tensor in zip(self.samples, tensors, strict=True):
+            samples.copy_(tensor.flatten(0, 1))
+
+    def minibatches(self, order: Tensor | slice) -> Iterator[tuple[Tensor, ...]]:
+        parts = math.ceil(len(self.samples[0]) / self.args.minibatch_size * distributed.size())
+        return zip(*(samples[order].chunk(parts) for samples in self.samples), strict=True)
+
+    def follow(self) -> None:
+        """target <- (1 - rate) target + rate critic."""
+        for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
+            slow.lerp_(fast.detach(), self.args.target_rate)
+
+    def end_iteration(self, rows: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+        """Resample; returns the means of the updates' metrics with what every algorithm logs."""
+        found = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
+        skipped = [value.skipped for value in vars(self).values() if isinstance(value, ClippedAdam)]
+        found["grad/skipped"] = torch.stack(skipped).sum()
+        return found | self.resampling.end_iteration(self.actor.head, self.optimizer)
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
     """SHAC's Eq. 7 of (H, N) steps, backward in time: the value's targets; minus the value, PPO's advantages.
 
-    A done ends the return as the window's end does. next_value is V(s_{t+1}), before any reset: zero where the episode
-    terminated, but not where its time ran out.
+    A done ends the return as the window's end does. next_value is V(s_{t+1}) before any reset, 0 where terminated.
     """
     returns = torch.empty_like(reward)
     following = next_value[-1]
@@ -509,150 +511,114 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
     return returns
 
 
-def follow(slow: nn.Module, fast: nn.Module, rate: float) -> None:
-    """slow <- (1 - rate) slow + rate fast."""
-    for own, other in zip(slow.parameters(), fast.parameters(), strict=True):
-        own.lerp_(other.detach(), rate)
-
-
-# PPO ------------------------------------------------------------------------------------------------------------------
-
-
-class PPO:
+class PPO(Learner):
     """Proximal Policy Optimization, with the constants of ppo_baseline.py."""
 
     target_kl, lr_bounds, clip_coef, value_coef, bound_coef = 0.008, (1e-6, 1e-2), 0.2, 2.0, 1e-4
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.args, self.env = args, env
-        obs_dim, action_dim, samples = env.task.obs_dim, env.scene.nu, args.horizon * env.num_envs
-        self.actor = ActorCritic(args, obs_dim, action_dim).to(env.device)
-        self.policy = self.actor.deterministic()
-        self.resampling = Resampling(args, self.actor.head).to(env.device)
+        super().__init__(args, env)
         self.return_normalizer = ObsNormalizer().to(env.device)
-        self.optimizer = ClippedAdam(self.actor, 1.0, lr=args.lr)
-        sizes = (obs_dim,), (action_dim,), (), (), ()  # normalized s_t; u; its log probability; advantage; target
-        self.samples = [torch.zeros(samples, *size, device=env.device) for size in sizes]
-        self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
+        sizes = (env.task.obs_dim,), (env.scene.nu,), (), (), ()  # see update
+        self.samples = [torch.zeros(args.horizon * env.num_envs, *size, device=env.device) for size in sizes]
 
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
         mixture, value = self.actor.both(self.actor.normalizer(obs))
         self.resampling.record(mixture)
-        u = mixture.sample()
+        u, _ = sample(mixture)
         return u, u, mixture.log_prob(u), value
 
     @torch.no_grad()
     def interact(self) -> dict[str, Tensor]:
         """Act for a window, and keep its samples with their advantages and value targets."""
         args, normalizer = self.args, self.actor.normalizer
-        window, (u, log_prob, value) = collect(self.env, args.horizon, self.act)
-        next_value = self.return_normalizer.inverse(self.actor.both(normalizer(window.next_obs))[1])
-        next_value = next_value.masked_fill(window.terminated, 0.0)
+        window, (u, log_prob, value) = self.collect()
+        mixture, next_value = self.actor.both(normalizer(window.next_obs))
+        next_value = self.return_normalizer.inverse(next_value).masked_fill(window.terminated, 0.0)
         target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
         advantage = target - self.return_normalizer.inverse(value)
         self.return_normalizer.update(target)
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
-        samples = normalizer(window.obs), u, log_prob, advantage, self.return_normalizer(target)
-        for buffer, tensor in zip(self.samples, samples, strict=True):
-            buffer.copy_(tensor.flatten(0, 1))
+        self.keep(normalizer(window.obs), u, log_prob, advantage, self.return_normalizer(target))
         normalizer.update(window.obs)
-        return {}
+        return {"charts/entropy": mixture.entropy().mean()}
 
     def learn(self) -> dict[str, Tensor]:
         """Descend the clipped loss in epochs of minibatches."""
-        args, metrics = self.args, []
-        for _ in range(args.epochs):
+        rows = []
+        for _ in range(self.args.epochs):
             order = torch.randperm(len(self.samples[0]), device=self.env.device)
-            batches = (tensor[order].chunk(self.minibatches) for tensor in self.samples)
-            for obs, u, log_prob, advantage, target in zip(*batches, strict=True):
-                mixture, value = self.actor.both(obs)
-                log_ratio = mixture.log_prob(u) - log_prob
-                kl = (log_ratio.detach().expm1() - log_ratio.detach()).mean()  # estimated; not below zero
-                adapt(self.optimizer.lr, distributed.average(kl), self.target_kl, self.lr_bounds)
-                ratio = log_ratio.exp()
-                clipped = ratio.clamp(1 - self.clip_coef, 1 + self.clip_coef)
-                policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()
-                value_loss = (value - target).square().mean()
-                bound_loss = (mixture.loc.abs() - 1.1).clamp(min=0).square().mean(-1).sum(-1).mean()
-                loss = policy_loss + self.value_coef * value_loss + self.bound_coef * bound_loss
-                if args.entropy_coef:
-                    loss = loss - args.entropy_coef * mixture.entropy().mean()
-                norm = self.optimizer.step(loss)
-                metrics.append(torch.stack((policy_loss.detach(), value_loss.detach(), kl, norm)))
-        names = ("losses/policy", "losses/value", "losses/kl", "grad/norm")
-        return dict(zip(names, torch.stack(metrics).mean(0), strict=True)) | {
-            "grad/skipped": self.optimizer.skipped,
-            "charts/learning_rate": self.optimizer.lr,
-            "charts/entropy": mixture.entropy().detach().mean(),  # of the last minibatch
-            **self.resampling.end_iteration(self.actor.head, self.optimizer),
-        }
+            rows += [self.update(*batch) for batch in self.minibatches(order)]
+        return self.end_iteration(rows) | {"charts/learning_rate": self.optimizer.lr}
+
+    def update(self, obs: Tensor, u: Tensor, log_prob: Tensor, advantage: Tensor, target: Tensor) -> dict[str, Tensor]:
+        """One step on a minibatch of normalized s_t, u, its log probability, the advantage and the value's target."""
+        mixture, value = self.actor.both(obs)
+        log_ratio = mixture.log_prob(u) - log_prob
+        kl = distributed.average((log_ratio.detach().expm1() - log_ratio.detach()).mean())  # estimated; not below zero
+        up, down = (x.to(kl.dtype) for x in (kl < self.target_kl / 2, kl > 2 * self.target_kl))
+        self.optimizer.lr.mul_(1.5 ** (up - down)).clamp_(*self.lr_bounds)
+        ratio = log_ratio.exp()
+        clipped = ratio.clamp(1 - self.clip_coef, 1 + self.clip_coef)
+        policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()
+        value_loss = (value - target).square().mean()
+        bound_loss = (mixture.loc.abs() - 1.1).clamp(min=0).square().mean(-1).sum(-1).mean()
+        loss = policy_loss + self.value_coef * value_loss + self.bound_coef * bound_loss
+        if self.args.entropy_coef:
+            loss = loss - self.args.entropy_coef * mixture.entropy().mean()
+        found = {"losses/policy": policy_loss.detach(), "losses/value": value_loss.detach(), "losses/kl": kl}
+        return found | {"grad/norm": self.optimizer.step(loss)}
 
 
-@torch.no_grad()
-def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) -> None:
-    """Divides lr by 1.5 where kl is beyond twice the target, and multiplies it by 1.5 below half of it."""
-    lr.mul_(1.5 ** ((kl < target / 2).to(lr.dtype) - (kl > 2 * target).to(lr.dtype))).clamp_(*bounds)
-
-
-# SHAC -----------------------------------------------------------------------------------------------------------------
-
-
-class SHAC:
+class SHAC(Learner):
     """Short-Horizon Actor-Critic, with the constants of shac.py. The gradient goes on through the sampled actions."""
 
     betas, final_lr = (0.7, 0.95), 1e-5
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.args, self.env = args, env
-        obs_dim, samples = env.task.obs_dim, args.horizon * env.num_envs
-        self.actor = Actor(args, obs_dim, env.scene.nu).to(env.device)
-        self.policy = self.actor.deterministic()
-        self.resampling = Resampling(args, self.actor.head).to(env.device)
-        self.critic = mlp(obs_dim, args.critic_hidden, norm=True).append(nn.Linear(args.critic_hidden[-1], 1))
-        for layer in self.critic:
+        super().__init__(args, env)
+        critic = mlp(env.task.obs_dim, args.critic_hidden, norm=True).append(nn.Linear(args.critic_hidden[-1], 1))
+        for layer in critic:
             if isinstance(layer, nn.Linear):
                 nn.init.orthogonal_(layer.weight, math.sqrt(2))
                 nn.init.zeros_(layer.bias)
-        self.critic.to(env.device)
-        self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.optimizer = ClippedAdam(self.actor, 1.0, self.betas)
-        self.critic_optimizer = ClippedAdam(self.critic, 1.0, self.betas)
-        self.obs = torch.zeros(samples, obs_dim, device=env.device)  # the critic's samples
-        self.value = torch.zeros(samples, device=env.device)
-        self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
+        self.add_critic(critic)
+        sizes = (env.task.obs_dim,), ()  # normalized s_t; the value's target
+        self.samples = [torch.zeros(args.horizon * env.num_envs, *size, device=env.device) for size in sizes]
 
     def schedule(self, iteration: int) -> None:
         """Linear decay of the learning rates."""
-        args, done = self.args, (iteration - 1) / self.args.iterations
-        self.optimizer.lr.fill_(args.lr + (self.final_lr - args.lr) * done)
-        self.critic_optimizer.lr.fill_(args.critic_lr + (self.final_lr - args.critic_lr) * done)
+        done = (iteration - 1) / self.args.iterations
+        for optimizer, lr in ((self.optimizer, self.args.lr), (self.critic_optimizer, self.args.critic_lr)):
+            optimizer.lr.fill_(lr + (self.final_lr - lr) * done)
 
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
         mixture = self.actor(self.actor.normalizer(obs))
         self.resampling.record(mixture)
-        u, chosen = mixture.rsample(self.args.estimator, self.args.density_floor)
+        u, chosen = sample(mixture, self.args.estimator, self.args.density_floor)
         return mixture.action(u), chosen, mixture.entropy().expand_as(chosen)
 
     def interact(self) -> dict[str, Tensor]:
         """Descend the loss of a window of all environments; keep the critic's samples of it."""
         args, normalizer = self.args, self.actor.normalizer
-        window, (chosen, entropy) = collect(self.env, args.horizon, self.act)
+        window, (chosen, entropy) = self.collect()
         loss = self.loss(window, chosen, entropy)
         norm = self.optimizer.step(loss)
         window = Window(*(tensor.detach() for tensor in window))
         value = td_lambda(window.reward, self.next_values(window), window.done, args.gamma, args.trace_decay)
-        self.value.copy_(value.flatten())
-        self.obs.copy_(normalizer(window.obs).flatten(0, 1))
+        self.keep(normalizer(window.obs), value)
         normalizer.update(window.obs)
         return {"losses/actor": loss.detach(), "charts/entropy": entropy.detach().mean(), "grad/norm": norm}
 
     def loss(self, window: Window, chosen: Tensor, entropy: Tensor) -> Tensor:
-        """Eq. 5: each environment's window is cut at its dones; of (H, N) choices' log probabilities and entropies."""
-        args, (reward, done) = self.args, (window.reward, window.done)
-        next_value, discount = self.next_values(window), discounts(done, args.gamma, reward.dtype)
-        ends = done.clone()
-        ends[-1] = True
+        """Eq. 5, cut at the dones, with the chosen components' log probabilities and the policy's entropies (H, N)."""
+        args, reward, done, next_value = self.args, window.reward, window.done, self.next_values(window)
+        t = torch.arange(len(done), device=done.device).unsqueeze(1)
+        starts, ends = done.roll(1, 0), done.clone()
+        starts[0] = ends[-1] = True
+        age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values  # steps since the start or the last done
+        discount = args.gamma ** age.to(reward.dtype)
         loss = -(discount * reward + discount * args.gamma * ends * next_value).mean()
         if args.estimator == "mixed":  # the score function of the chosen particles
             with torch.no_grad():
@@ -668,116 +634,91 @@ class SHAC:
 
     def learn(self) -> dict[str, Tensor]:
         """Fit the critic to the window's TD(lambda) returns, and let the target critic follow."""
-        args = self.args
-        for _ in range(args.epochs):
-            losses = []
-            for obs, value in zip(self.obs.chunk(self.minibatches), self.value.chunk(self.minibatches), strict=True):
+        for _ in range(self.args.epochs):
+            rows = []  # of the last pass
+            for obs, value in self.minibatches(slice(None)):
                 loss = F.mse_loss(self.critic(obs).squeeze(-1), value)
                 self.critic_optimizer.step(loss)
-                losses.append(loss.detach())
-        follow(self.target, self.critic, args.target_rate)
-        skipped = self.optimizer.skipped + self.critic_optimizer.skipped
-        found = {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
-        return found | self.resampling.end_iteration(self.actor.head, self.optimizer)
+                rows.append({"losses/critic": loss.detach()})
+        self.follow()
+        return self.end_iteration(rows)
 
 
-def discounts(done: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
-    """gamma^t of (H, N) steps, which starts anew after the dones."""
-    t = torch.arange(len(done), device=done.device).unsqueeze(1)
-    starts = done.roll(1, 0)
-    starts[0] = True
-    age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values  # steps since the start or the last done
-    return gamma ** age.to(dtype)
-
-
-# SAC ------------------------------------------------------------------------------------------------------------------
-
-
-class SAC:
+class SAC(Learner):
     """Soft Actor-Critic: see sac_baseline.py. The critics' gradient goes on through the sampled actions."""
 
     max_grad_norm = 100.0
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.args, self.env = args, env
+        super().__init__(args, env)
         obs_dim, action_dim, hidden = env.task.obs_dim, env.scene.nu, args.critic_hidden
-        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
-        self.policy = self.actor.deterministic()
-        self.resampling = Resampling(args, self.actor.head).to(env.device)
         critics = [mlp(obs_dim + action_dim, hidden, nn.ReLU).append(nn.Linear(hidden[-1], 1)) for _ in range(2)]
-        self.critics = Ensemble(critics).to(env.device)
-        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.add_critic(Ensemble(critics))
         self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)
-        self.optimizer = ClippedAdam(self.actor, self.max_grad_norm, lr=args.lr)
-        self.critic_optimizer = ClippedAdam(self.critics, self.max_grad_norm, lr=args.critic_lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, self.max_grad_norm, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
 
     def act(self, obs: Tensor) -> tuple[Tensor, ...]:
         mixture = self.actor(self.actor.normalizer(obs))
         self.resampling.record(mixture)
-        action = mixture.action(mixture.sample())
+        action = mixture.action(sample(mixture)[0])
         return action, action
 
     @torch.no_grad()
     def interact(self) -> dict[str, Tensor]:
         """Act for a window, into the buffer."""
-        window, (action,) = collect(self.env, self.args.horizon, self.act)
-        terminated = window.terminated.to(window.reward.dtype)
-        made = window.obs, action, window.reward, window.next_obs, terminated
+        window, (action,) = self.collect()
+        made = window.obs, action, window.reward, window.next_obs, window.terminated.to(window.reward.dtype)
         self.buffer.add(Transition(*(tensor.flatten(0, 1) for tensor in made)))
         self.actor.normalizer.update(window.obs)
         return {}
 
     def learn(self) -> dict[str, Tensor]:
-        """As many updates as there were control steps."""
-        args, normalizer, rows = self.args, self.actor.normalizer, []
-        for _ in range(args.horizon * args.epochs):
-            batch = self.buffer.sample(args.minibatch_size)
+        """As many updates as there were control steps, times the epochs."""
+        normalizer, rows = self.actor.normalizer, []
+        for _ in range(self.args.horizon * self.args.epochs):
+            batch = self.buffer.sample(self.args.minibatch_size)
             obs, next_obs = normalizer(batch.obs), normalizer(batch.next_obs)
             rows.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
-        found = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
-        found |= self.resampling.end_iteration(self.actor.head, self.optimizer)
-        optimizers = self.optimizer, self.critic_optimizer, self.temperature_optimizer
-        skipped = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
-        return found | {"charts/temperature": self.temperature["log"].detach().exp(), "grad/skipped": skipped}
+        return self.end_iteration(rows) | {"charts/temperature": self.temperature["log"].detach().exp()}
 
     def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
         """Descend the soft Bellman residual, and let the target critics follow."""
-        args = self.args
         with torch.no_grad():
             mixture = self.actor(next_obs)
-            u = mixture.sample()
-            soft = self.values(self.targets, next_obs, mixture.action(u)).amin(0)
+            u, _ = sample(mixture)
+            soft = values(self.target, next_obs, mixture.action(u)).amin(0)
             soft = soft - self.temperature["log"].exp() * mixture.log_prob(u)
-            target = batch.reward + args.gamma * (1 - batch.terminated) * soft
-        values = self.values(self.critics, obs, batch.action)
-        loss = (values - target).square().mean(1).sum()
+            target = batch.reward + self.args.gamma * (1 - batch.terminated) * soft
+        value = values(self.critic, obs, batch.action)
+        loss = (value - target).square().mean(1).sum()
         self.critic_optimizer.step(loss)
-        follow(self.targets, self.critics, args.target_rate)
-        return {"losses/critic": loss.detach() / 2, "charts/value": values.detach().mean()}
+        self.follow()
+        return {"losses/critic": loss.detach() / 2, "charts/value": value.detach().mean()}
 
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         mixture = self.actor(obs)
-        u, _ = mixture.rsample(self.args.estimator, self.args.density_floor)
+        u, _ = sample(mixture, self.args.estimator, self.args.density_floor)
         density = mixture.log_prob(u)
-        value = self.values(self.critics, obs, mixture.action(u)).amin(0)
+        value = values(self.critic, obs, mixture.action(u)).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         norm = self.optimizer.step(loss)
         surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
 
-    def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-        """Each critic's Q(s, a) (2, B)."""
-        inputs = torch.cat((obs, action), -1)
-        return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
+
+def values(critics: nn.Module, obs: Tensor, action: Tensor) -> Tensor:
+    """Each critic's Q(s, a) (2, B)."""
+    inputs = torch.cat((obs, action), -1)
+    found: Tensor = critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
+    return found
 
 
 # The run --------------------------------------------------------------------------------------------------------------
 
-ALGORITHMS: dict[str, type[PPO] | type[SHAC] | type[SAC]] = {"ppo": PPO, "shac": SHAC, "sac": SAC}
+ALGORITHMS: dict[str, type[PPO | SHAC | SAC]] = {"ppo": PPO, "shac": SHAC, "sac": SAC}
 
 
 def train(args: Args) -> None:
@@ -786,8 +727,7 @@ def train(args: Args) -> None:
     learner = run.restore(ALGORITHMS[args.algorithm](args, env))
     interact, learn = run.capture(learner.interact, env), run.capture(learner.learn)
     for iteration in run:
-        if isinstance(learner, SHAC):
-            learner.schedule(iteration)
+        learner.schedule(iteration)
         run.log(interact() | learn())
         if run.evaluation_due:
             run.log_evaluation(evaluate(eval_env, learner.policy))

@@ -22,7 +22,7 @@ from diffsim import DiffEnv
 from diffsim.tasks import TASKS, Task
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
 from diffsim.training.flags import ParallelFlags, parse
-from diffsim.training.normalizer import ObsNormalizer, moments
+from diffsim.training.layers import ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
 

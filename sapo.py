@@ -26,7 +26,7 @@ from diffsim.tasks import TASKS, Task
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import ParallelFlags, parse
-from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.layers import ObsNormalizer
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
 

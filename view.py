@@ -13,34 +13,24 @@ by 1 m/s; minus and equals change the speed; space pauses; enter starts a new ep
 
 from __future__ import annotations
 
-import copy
 import csv
 import math
-import threading
-import time
-from collections import deque
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import mujoco
 import numpy as np
 import torch
 import tyro
 from numpy.typing import NDArray
 
 from diffsim import DiffEnv
-from diffsim.training import SavedPolicy, command, describe, evaluate, fail, load_policy, make_policy_env
+from diffsim.training import SavedPolicy, command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED
 from diffsim.view import render, web
-
-ROBOT = 1  # MuJoCo's first body after the world
-SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
-PUSH = 1.0  # m/s, of the whole robot
-MAX_PULL = 2.0  # of the mouse, in weights of the robot
-PUSHES = {262: (1, 0, 0), 263: (-1, 0, 0), 264: (0, -1, 0), 265: (0, 1, 0)}  # keys of GLFW: right, left, down, up
-SPACE, ENTER, MINUS, EQUALS = 32, 257, 45, 61
+from diffsim.view.screen import Window
 
 
 @dataclass
@@ -67,7 +57,7 @@ class Args:
     """width and height of the video in pixels, multiples of 16"""
 
     def check(self) -> None:
-        """End with one line where the machine or the arguments forbid what is asked for, before any work."""
+        """Refuse what the machine or the arguments forbid, before any work."""
         if not (self.video or self.web or self.viewer or self.plot):
             fail("nothing to show: give --video, --web, --viewer or --plot")
         if not self.paths:
@@ -78,25 +68,21 @@ class Args:
             fail("--video, --web and --viewer show one checkpoint; several are for --plot")
         if self.viewer and (self.video or self.web):
             fail("--viewer goes without --video and --web")
+        if self.web and self.web.suffix != ".html":
+            fail(f"--web: a page ends in .html, not {self.web.suffix!r}")
         try:
             if self.video:
                 render.check_video(self.video, self.size)
                 render.check_opengl()
-        except (ValueError, RuntimeError) as error:
-            fail(f"--video: {error}")
-        if self.web and self.web.suffix != ".html":
-            fail(f"--web: a page ends in .html, not {self.web.suffix!r}")
-        if self.viewer:
-            try:
+            if self.viewer:
                 render.check_display()
-            except RuntimeError as error:
-                fail(f"--viewer: {error}; --web and --video need none")
+        except (ValueError, RuntimeError) as error:
+            fail(f"--video: {error}" if self.video else f"--viewer: {error}; --web and --video need none")
 
 
 @command
 def main(argv: Sequence[str] | None = None) -> None:
-    config = (tyro.conf.FlagCreatePairsOff,)
-    args = tyro.cli(Args, args=argv, description=__doc__, config=config)
+    args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
     args.check()
     try:
         if args.plot:
@@ -110,154 +96,66 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def show(saved: SavedPolicy, args: Args) -> None:
     torch.set_num_threads(1)  # operations this small gain nothing from more
-    changes = {} if args.substeps is None else {"substeps": args.substeps}
-    name = f"{saved.args['env']}, {saved.script}.py, iteration {saved.iteration}"
-    if args.video or args.web:
-        env = make_policy_env(saved, args.episodes, **changes)
-        evaluation = evaluate(env, saved.network, args.seed)
-        print(f"{name}, {args.episodes} episodes: {evaluation}")
-        if gait := describe(evaluation):
-            print(f"gait: {gait}")
-        qpos, action = evaluation.median_episode(args.seconds)
-        motion = env.scene, qpos, env.control_dt, action
-        if args.video:
-            print(f"video: {render.film(args.video, *motion, args.size)}")
-        if args.web:
-            caption = f"{saved.script}.py, iteration {saved.iteration}\nreturn {evaluation.returns.median():.1f}"
-            print(f"page: {web.write_page(args.web, *motion, title=saved.args['env'], caption=caption)}")
+    changes: dict[str, Any] = {} if args.substeps is None else {"substeps": args.substeps}
+    task, name = saved.args["env"], f"{saved.script}.py, iteration {saved.iteration}"
     if args.viewer:
-        print(name, (__doc__ or "").rstrip().rpartition("\n\n")[2], sep="\n")
-        Window(make_policy_env(saved, 1, **changes), saved.network, args.seed).run()
+        print(f"{task}, {name}", (__doc__ or "").rstrip().rpartition("\n\n")[2], sep="\n")
+        play(make_policy_env(saved, 1, forces=True, **changes), saved.network, args.seed)
+        return
+    env = make_policy_env(saved, args.episodes, **changes)
+    evaluation = evaluate(env, saved.network, args.seed)
+    print(f"{task}, {name}, {args.episodes} episodes: {evaluation}")
+    if gait := evaluation.gait():
+        print(f"gait: {gait}")
+    qpos, action = evaluation.median_episode(args.seconds)
+    if args.video:
+        print(f"video: {render.film(args.video, env.scene, qpos, env.control_dt, action, args.size)}")
+    if args.web:
+        caption = f"{name}\nreturn {evaluation.returns.median():.1f}"
+        print(f"page: {web.write_page(args.web, env.scene, qpos, env.control_dt, action, task, caption)}")
 
 
-# The window -----------------------------------------------------------------------------------------------------------
-
-
-class Window:
-    """MuJoCo's window on an environment of this simulator, which takes a control step for each picture."""
-
-    def __init__(self, env: DiffEnv, policy: torch.nn.Module, seed: int) -> None:
-        self.env, self.policy = env, policy
-        self.model = copy.copy(env.scene.mj_model)
-        if render.check_display():
-            render.lower_quality(self.model)
-        self.data = mujoco.MjData(self.model)
-        self.obs, _ = env.reset(seed=seed)
-        self.action = torch.zeros(1, env.scene.nu)
-        self.speed, self.paused = 1.0, False
-        self.keys: deque[int] = deque()  # pressed, not yet heeded
-
-    @torch.no_grad()
-    def run(self) -> None:
-        """Until it is closed."""
-        import mujoco.viewer
-
-        self.copy_state()
-        others = set(threading.enumerate())
-        options = dict(key_callback=self.keys.append, show_left_ui=False, show_right_ui=False)
-        with mujoco.viewer.launch_passive(self.model, self.data, **options) as window:
-            camera, orbit = window.cam, web.orbit(self.model)
-            camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, ROBOT
-            camera.azimuth, camera.elevation = math.degrees(orbit["yaw"]) + 180, -math.degrees(orbit["pitch"])
-            camera.distance = orbit["distance"]
-            due = time.perf_counter()
-            while window.is_running():
-                with window.lock():
-                    pushes = self.heed_keys()
-                    if not self.paused:
-                        self.push(pushes, window.perturb)
-                        self.step()
-                window.sync()
-                due += self.env.control_dt / self.speed
-                time.sleep(max(0.0, due - time.perf_counter()))
-                due = max(due, time.perf_counter() - 0.1)  # late: go on from here
-        for thread in set(threading.enumerate()) - others:
-            thread.join(5)  # the viewer's own crashes if the process ends before it does
-
-    def heed_keys(self) -> list[tuple[int, int, int]]:
-        """Do what keys ask for; returns the directions in which they push."""
-        pushes = []
-        while self.keys:
-            key = self.keys.popleft()
-            if key in PUSHES:
-                pushes.append(PUSHES[key])
-            elif key == SPACE:
-                self.paused = not self.paused
-            elif key == ENTER:
-                self.obs, _ = self.env.reset()
-            elif key in (MINUS, EQUALS):
-                place = SPEEDS.index(self.speed) + (1 if key == EQUALS else -1)
-                self.speed = SPEEDS[min(max(place, 0), len(SPEEDS) - 1)]
-                print(f"speed {self.speed:g}")
-        return pushes
-
-    def push(self, pushes: Sequence[tuple[int, int, int]], mouse: mujoco.MjvPerturb) -> None:
-        """Change the velocity as the forces of keys and mouse would in one control step: by M^-1 J^T f dt.
-
-        The simulator itself knows no external forces; Jacobian and mass matrix are MuJoCo's, of the same model.
-        """
-        env, model, data = self.env, self.model, self.data
-        weight = model.body_subtreemass[ROBOT] * np.linalg.norm(model.opt.gravity)
-        data.xfrc_applied[:] = 0
-        if mouse.select > 0 and mouse.active:
-            mujoco.mjv_applyPerturbForce(model, data, mouse)
-            pull, most = np.linalg.norm(data.xfrc_applied[mouse.select, :3]), MAX_PULL * weight
-            data.xfrc_applied *= min(1.0, most / max(pull, 1e-9))  # else a robot that runs away is torn back
-        for direction in pushes:
-            data.xfrc_applied[ROBOT, :3] += PUSH * model.body_subtreemass[ROBOT] / env.control_dt * np.array(direction)
-        if not data.xfrc_applied.any():
-            return
-        force, acceleration = np.zeros(model.nv), np.zeros((1, model.nv))
-        for body in np.flatnonzero(data.xfrc_applied.any(1)):
-            push, turn = np.split(data.xfrc_applied[body], 2)
-            mujoco.mj_applyFT(model, data, push, turn, data.xipos[body], body, force)
-        mujoco.mj_solveM(model, data, acceleration, force[None])
-        env.set_state(env.qpos, env.qvel + torch.as_tensor(acceleration * env.control_dt, dtype=env.dtype))
-        self.obs = env.observe(env.qpos, env.qvel, self.action)
-
-    def step(self) -> None:
-        self.action = self.policy(self.obs)
-        self.obs, *_ = self.env.step(self.action)
-        self.data.time += self.env.control_dt
-        self.copy_state()
-
-    def copy_state(self) -> None:
-        """Let MuJoCo draw the environment's state, and muscles in the colour of their activation."""
-        self.data.qpos[:], self.data.qvel[:] = self.env.qpos[0], self.env.qvel[0]
-        render.colour_muscles(self.model, self.action[0])
-        mujoco.mj_forward(self.model, self.data)
+@torch.no_grad()
+def play(env: DiffEnv, policy: torch.nn.Module, seed: int) -> None:
+    """Let the policy act on one environment, made with forces, in a window where it can be pushed, until it closes."""
+    obs, _ = env.reset(seed=seed)
+    with closing(Window(env.scene, env.control_dt)) as window:
+        while window.is_open:
+            if window.restart:
+                window.restart, (obs, _) = False, env.reset()
+            env.sim.forces = torch.as_tensor(window.forces(), dtype=env.dtype)[None]
+            action = policy(obs)
+            obs, *_ = env.step(action)
+            window.show(env.qpos[0], env.qvel[0], action[0])
 
 
 # The curves -----------------------------------------------------------------------------------------------------------
 
 
 def plot(directories: Sequence[Path], output: Path) -> None:
-    """Return against control steps and seconds: of training a line, of evaluations of the policy alone dots.
+    """Return against control steps and seconds: a line for training, dots for evaluations of the policy alone.
 
     Raises:
         OSError, RuntimeError, ValueError: what is missing to draw or to write.
     """
     try:
-        import matplotlib
+        from matplotlib.figure import Figure
     except ImportError as error:
         raise RuntimeError("--plot needs matplotlib: pip install matplotlib") from error
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 2, figsize=(11, 4.2), sharey=True, layout="constrained")
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
     for number, directory in enumerate(directories):
         columns = read_progress(directory / "progress.csv")
         for axis, x in zip(axes, ("control_steps", "seconds"), strict=True):
-            style = dict(color=f"C{number}", label=directory.resolve().name)
-            axis.plot(columns[x], columns["return"], **style)
+            axis.plot(columns[x], columns["return"], color=f"C{number}", label=directory.resolve().name)
             axis.plot(columns[x], columns["eval_return"], "o", color=f"C{number}", markersize=4)
             axis.set_xlabel(x.replace("_", " "))
             axis.grid(alpha=0.3)
             axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("return (line: training, dots: evaluation)")
     axes[0].legend(frameon=False, fontsize="small")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=150)
+    with render.whole_file(output) as part:
+        figure.savefig(part, dpi=150)
     print(f"curves: {output}")
 
 

@@ -7,12 +7,11 @@
 A recording holds qpos (E, T + 1, nq), qvel (E, T + 1, nv) and ctrl (E, T, nu) of E episodes, one row per control step
 of 1/60 s, ctrl as the task's actions in [-1, 1]; or one episode without the E. The fit starts segments of 0.2 s at
 random rows, simulates them and descends the error of the velocities after 0.05, 0.1 and 0.2 s. A fifth of the episodes
-is held out. Writes calibration.csv: the constants before and after, and both errors.
+is held out. Writes calibration.csv: the constants and the held-out error, before and after.
 """
 
 from __future__ import annotations
 
-import time
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,8 +23,7 @@ import numpy as np
 import torch
 import transfer
 import tyro
-import worlds
-from common import parse
+from common import run
 from tables import Row, markdown
 from torch import Tensor
 
@@ -46,18 +44,18 @@ SKIPPED = 12  # control steps at the start of an episode, which say more of the 
 @dataclass
 class Args(common.CommonFlags):
     checkpoint: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT")] = None
-    # of any script, or its run: the policy that acts in MuJoCo
+    # checkpoint of any script, or its run: the policy that acts in MuJoCo
     recording: Path | None = None  # .npz to fit to instead
     env: common.Tasks = ()  # the task of the recording
     contact: Literal["soft", "firm"] = "firm"  # the constants to begin with
-    fit: tuple[Constant, ...] = CONTACT
-    episodes: Count = 20  # of the policy in MuJoCo
+    fit: tuple[Constant, ...] = CONTACT  # constants to fit
+    episodes: Count = 20  # episodes of the policy in MuJoCo
     steps: Count = 200  # control steps of each
     noise: NonNegative = 0.2  # standard deviation of the noise on its actions
-    segments: Count = 256  # of each iteration, drawn anew
-    iterations: Count = 120
-    lr: Positive = 0.1  # of the constants' logarithms, falling to a tenth
-    substeps: Count = 16  # of the implicit integrator
+    segments: Count = 256  # segments drawn in each iteration
+    iterations: Count = 120  # steps of the optimiser
+    lr: Positive = 0.1  # step size of the constants' logarithms, which falls to a tenth
+    substeps: Count = 16  # substeps of the implicit integrator
 
 
 class Recording(NamedTuple):
@@ -71,30 +69,26 @@ class Recording(NamedTuple):
 
 def record(args: Args, path: Path) -> tuple[str, Recording]:
     """The task and the motion of a policy in MuJoCo, with noise on its actions."""
-    found = transfer.Args(episodes=args.episodes, device="cpu")
-    case = transfer.load(path, found)
-    env, name = case.env, case.saved.args["env"]
+    case = transfer.load(path, transfer.Args(episodes=args.episodes, device="cpu"))
+    env, generator, actions = case.env, torch.Generator().manual_seed(0), list[Tensor]()
     env.reset(seed=SEED)
-    qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
-    generator, actions = torch.Generator().manual_seed(0), list[Tensor]()
+    start = env.qpos.double().numpy(), env.qvel.double().numpy()
 
     def policy(obs: Tensor) -> Tensor:
         action = case.saved.network(obs)
-        action = (action + args.noise * torch.randn(action.shape, generator=generator)).clamp(-1.0, 1.0)
-        actions.append(action)
-        return action
+        actions.append((action + args.noise * torch.randn(action.shape, generator=generator)).clamp(-1.0, 1.0))
+        return actions[-1]
 
-    world = worlds.MuJoCo(env.scene, args.episodes, env.control_dt)
-    task = type(env.task)(dtype=torch.float64)
-    motion = transfer.act(world, task, policy, qpos, qvel, env.scene.nu, args.steps)
-    qpos_path, qvel_path = (torch.from_numpy(x).float().transpose(0, 1) for x in (motion.qpos, motion.qvel))
+    world, task = transfer.MuJoCo(env.scene, args.episodes, env.control_dt), type(env.task)(dtype=torch.float64)
+    motion = transfer.act(world, task, policy, *start, env.scene.nu, args.steps)
+    qpos, qvel = (torch.from_numpy(x).float().transpose(0, 1) for x in (motion.qpos, motion.qvel))
     lengths = torch.from_numpy(motion.lengths - motion.fallen)
-    return name, Recording(qpos_path, qvel_path, torch.stack(actions, 1), lengths)
+    return env.task.name, Recording(qpos, qvel, torch.stack(actions, 1), lengths)
 
 
 def read(path: Path, name: str) -> Recording:
     """The user's recording; one that does not fit the task ends the benchmark with one line."""
-    scene = diffsim.make(name, 1).scene
+    scene, arrays = diffsim.make(name, 1).scene, list[np.ndarray]()
     if not path.is_file():
         fail(f"no such recording: {path}")
     try:
@@ -104,9 +98,8 @@ def read(path: Path, name: str) -> Recording:
         fail(f"{path} is no .npz of qpos, qvel and ctrl: {error}")
     arrays = [array[None] if array.ndim == 2 else array for array in arrays]
     E, T = (*arrays[2].shape, 0, 0)[:2]
-    for key, array, shape in zip(
-        ("qpos", "qvel", "ctrl"), arrays, ((E, T + 1, scene.nq), (E, T + 1, scene.nv), (E, T, scene.nu)), strict=True
-    ):
+    shapes = {"qpos": (E, T + 1, scene.nq), "qvel": (E, T + 1, scene.nv), "ctrl": (E, T, scene.nu)}
+    for (key, shape), array in zip(shapes.items(), arrays, strict=True):
         if array.shape != shape:
             fail(f"{path}: {key} has shape {array.shape}, must be {shape} for task {name}")
         if not np.isfinite(array).all():
@@ -115,34 +108,27 @@ def read(path: Path, name: str) -> Recording:
     return Recording(qpos, qvel, ctrl, torch.full((E,), T))
 
 
-class Segments(NamedTuple):
-    """Rows of a recording at which simulations start: (M,) each."""
-
-    episode: Tensor
-    row: Tensor
-
-
-def starts(recording: Recording, episodes: Sequence[int]) -> Segments:
-    """All rows of some episodes that a whole segment follows."""
-    pairs = [
-        (e, t)
-        for e in episodes
-        for t in range(min(SKIPPED, int(recording.lengths[e]) // 4), int(recording.lengths[e]) - max(STEPS) + 1)
-    ]
+def starts(recording: Recording, episodes: Sequence[int]) -> Tensor:
+    """(M, 2) episode and row of all rows of some episodes that a whole segment follows."""
+    lengths = recording.lengths.tolist()
+    pairs = [(e, t) for e in episodes for t in range(min(SKIPPED, lengths[e] // 4), lengths[e] - max(STEPS) + 1)]
     if not pairs:
-        fail(f"no episode is long enough for a segment of {max(STEPS)} control steps: of what does the robot fall?")
-    return Segments(*torch.tensor(pairs).T)
+        fail(
+            f"no episode is long enough for a segment of {max(STEPS)} control steps: record longer ones, without falls"
+        )
+    return torch.tensor(pairs)
 
 
-def errors(env: DiffEnv, recording: Recording, at: Segments, factors: Tensor) -> Tensor:
+def errors(env: DiffEnv, recording: Recording, at: Tensor, factors: Tensor) -> Tensor:
     """Root mean square error of the velocities (M, len(STEPS)) of segments, differentiable in factors (M, 8)."""
     env.sim.rewind()
     env.sim.factors = factors
-    qpos, qvel, found = recording.qpos[at.episode, at.row], recording.qvel[at.episode, at.row], list[Tensor]()
-    for k in range(max(STEPS)):
-        qpos, qvel = env.sim.step(qpos, qvel, recording.ctrl[at.episode, at.row + k])
-        if k + 1 in STEPS:
-            found.append((qvel - recording.qvel[at.episode, at.row + k + 1]).square().mean(1).add(1e-12).sqrt())
+    episode, row = at.T
+    qpos, qvel, found = recording.qpos[episode, row], recording.qvel[episode, row], list[Tensor]()
+    for k in range(1, max(STEPS) + 1):
+        qpos, qvel = env.sim.step(qpos, qvel, recording.ctrl[episode, row + k - 1])
+        if k in STEPS:
+            found.append((qvel - recording.qvel[episode, row + k]).square().mean(1).add(1e-12).sqrt())
     return torch.stack(found, 1)
 
 
@@ -157,68 +143,59 @@ def fit(args: Args, name: str, recording: Recording) -> list[Row]:
     train = starts(recording, [e for e in range(number) if e not in held] or held)
     test = starts(recording, held)
     generator = torch.Generator().manual_seed(0)
-    columns = [FACTORS.index(constant) for constant in args.fit]
+    columns = torch.tensor([FACTORS.index(constant) for constant in args.fit])
     logs = torch.zeros(len(columns), requires_grad=True)
     optimizer = torch.optim.Adam([logs], lr=args.lr)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, args.iterations)
 
-    def draw(of: Segments) -> Segments:
-        pick = torch.randint(len(of.row), (args.segments,), generator=generator)
-        return Segments(of.episode[pick], of.row[pick])
-
-    def factors(each: Tensor) -> Tensor:
-        """(M, 8) from the logarithms (M, constants fitted)."""
-        return torch.ones(len(each), len(FACTORS)).index_copy(1, torch.tensor(columns), each.exp())
+    def error(rows: Tensor, each: Tensor) -> Tensor:
+        """(M, len(STEPS)) of M of these rows, drawn at random, from the logarithms (M, constants fitted)."""
+        at = rows[torch.randint(len(rows), (args.segments,), generator=generator)]
+        factors = torch.ones(len(each), len(FACTORS)).index_copy(1, columns, each.exp())
+        return errors(env, recording, at, factors)
 
     @torch.no_grad()
-    def check(of: Segments) -> Tensor:
-        """Mean over two drawings of the median error after each of STEPS."""
-        rows = factors(logs.expand(args.segments, -1))
-        return torch.stack([errors(env, recording, draw(of), rows).median(0).values for _ in range(4)]).mean(0)
+    def check(rows: Tensor) -> Tensor:
+        """Mean over four drawings of the median error after each of STEPS."""
+        every = logs.expand(args.segments, -1)
+        return torch.stack([error(rows, every).median(0).values for _ in range(4)]).mean(0)
 
-    before, began = (check(train), check(test)), time.perf_counter()
-    scale = before[0].clamp(min=1e-6)
-    for iteration in range(args.iterations):
+    scale, before = check(train).clamp(min=1e-6), float(check(test)[-1])
+    for iteration in range(1, args.iterations + 1):
         each = logs.detach().expand(args.segments, -1).clone().requires_grad_()  # of each segment its own
-        error = errors(env, recording, draw(train), factors(each)) / scale
-        (gradient,) = torch.autograd.grad(error.clamp(max=4.0).sum(), each)
+        found = error(train, each) / scale
+        (gradient,) = torch.autograd.grad(found.clamp(max=4.0).sum(), each)
         # Some segments' gradients explode through contacts: each votes with its direction and a bounded size.
         norm = gradient.norm(dim=1, keepdim=True)
         bound = norm.median().clamp(min=1e-12)
         logs.grad = (gradient / (norm / bound).clamp(min=1.0)).mean(0) / bound
         optimizer.step()
         schedule.step()
-        if iteration % 20 == 19:
+        if iteration % 20 == 0:
             values = ", ".join(f"{c} x{f:.3g}" for c, f in zip(args.fit, logs.detach().exp().tolist(), strict=True))
-            print(f"  {iteration + 1}: error {error.detach().mean():.3f}; {values}", flush=True)
-    after = check(train), check(test)
-    scene, rows = env.scene, list[Row]()
+            print(f"  {iteration}: error {found.detach().mean():.3f}; {values}", flush=True)
+    after, rows = float(check(test)[-1]), list[Row]()
     for constant, factor in zip(args.fit, logs.detach().exp().tolist(), strict=True):
-        own = {"mass": 1.0, "motor": 1.0}.get(constant) or float(np.max(getattr(scene, constant)))
-        row: dict[str, object] = {"task": name, "reference": args.recording.name if args.recording else "MuJoCo"}
-        row |= {"constant": constant, "before": own, "after": own * factor}
-        for kind, old, new in zip(("error", "held-out error"), before, after, strict=True):
-            for k, a, b in zip(STEPS, old.tolist(), new.tolist(), strict=True):
-                row |= {f"{kind} after {k / 60:.2g} s, before": a, f"{kind} after {k / 60:.2g} s": b}
-        rows.append(row | {"seconds": time.perf_counter() - began})
+        own = {"mass": 1.0, "motor": 1.0}.get(constant) or float(np.max(getattr(env.scene, constant)))
+        reference = args.recording.name if args.recording else "MuJoCo"
+        cells = name, reference, constant, own, own * factor, before, after
+        rows.append(dict(zip(SHOWN, cells, strict=True)))
     return rows
 
 
 def main(args: Args) -> None:
     if (args.checkpoint is None) == (args.recording is None):
         fail("give one of a checkpoint, whose policy acts in MuJoCo, and --recording FILE")
-    name: str
-    if args.recording:
-        if len(args.env) != 1:
-            fail("--recording needs the --env of one task")
+    if args.checkpoint:
+        name, recording = record(args, args.checkpoint)
+    elif args.recording and len(args.env) == 1:
         name, recording = args.env[0], read(args.recording, args.env[0])
     else:
-        assert args.checkpoint
-        name, recording = record(args, args.checkpoint)
+        fail("--recording needs the --env of one task")
     rows = fit(args, name, recording)
     found = args.merge("calibration", rows, ("task", "reference", "constant"))
     args.publish("calibration", markdown(found, SHOWN), "transfer.md")
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

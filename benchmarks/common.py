@@ -1,4 +1,4 @@
-"""What the benchmarks share: their flags, where their files go, and how their pictures are drawn."""
+"""What the benchmarks share: their flags, where their files go, their tables, and how their pictures are drawn."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypeVar, get_args
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import tables
@@ -22,7 +22,7 @@ from tables import ROOT, Row
 import diffsim
 from diffsim import DiffEnv
 from diffsim.sim.simulator import check_device
-from diffsim.training import SavedPolicy, fail, load_policy, make_policy_env
+from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
 from diffsim.training.ranges import check_ranges
 
@@ -30,7 +30,7 @@ RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results
 OUTPUT = ROOT / "runs" / "benchmarks"
 TaskName = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu", "humanoid_imitation"]
 LEARNT: tuple[TaskName, ...] = get_args(TaskName)
-TASKS = LEARNT[:-1]  # of the SHAC paper
+TASKS = LEARNT[:-1]  # those of the SHAC paper
 Tasks = Annotated[tuple[TaskName, ...], tyro.conf.arg(aliases=["--env-id"])]
 F = TypeVar("F", bound="CommonFlags")
 
@@ -42,9 +42,10 @@ class CommonFlags:
     env: Tasks = TASKS  # tasks
     device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
     output: Path | None = None  # directory of csv files (default: runs/benchmarks/cpu or, by the GPU, e.g. .../h100)
-    figures: Path | None = None  # of the pictures (default: that of the csv files)
+    figures: Path | None = None  # directory of the pictures (default: that of the csv files)
     update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
     draw_only: Annotated[bool, tyro.conf.arg(aliases=["--collect-only"])] = False  # measure nothing, read csv files
+    arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
 
     @property
     def directory(self) -> Path:
@@ -62,6 +63,12 @@ class CommonFlags:
 
     def merge(self, name: str, rows: Sequence[Row], key: Sequence[str]) -> list[dict[str, str]]:
         return tables.merge_csv(self.csv(name), rows, key, self.device)
+
+    def keep(self, name: str, row: Row, key: Sequence[str]) -> None:
+        """Print a row, and merge it, as soon as it is measured."""
+        shown = (f"{k} {tables.digits(v)}" for k, v in row.items() if k == "task" or k not in ABOUT)
+        print("  " + ", ".join(shown), flush=True)
+        self.merge(name, [row], key)
 
     def machines(self, name: str) -> dict[str, Path]:
         """The csv files of a name by their machines: all of the tree of results, or the one of --output."""
@@ -83,16 +90,18 @@ class CommonFlags:
         """
         print(text)
         name = name if everywhere or self.directory.name == "cpu" else f"{name}_{self.directory.name}"
-        if self.update_results and f"<!-- {name} -->" in (DOCS / page).read_text():
+        if self.update_results and page and f"<!-- {name} -->" in (DOCS / page).read_text():
             tables.fill(DOCS / page, name, text)
 
 
 @dataclass
 class CheckpointFlags(CommonFlags):
-    """Of benchmarks of saved policies, which say their task."""
+    """What benchmarks of saved policies take. A policy says its task."""
 
     checkpoints: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT", help="of any script, or its run")
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="CHECKPOINT", help="checkpoint of any script, or its run"),
     ] = ()
     env: tyro.conf.Suppress[Tasks] = TASKS
 
@@ -102,6 +111,9 @@ class CheckpointFlags(CommonFlags):
         if not (self.checkpoints or self.draw_only):
             fail("of what? give a checkpoint or the directory of a run")
         return () if self.draw_only else self.checkpoints
+
+
+ABOUT = ("checkpoint", "task", "learner", "contact", "seed", "iteration")  # columns that say which policy a row is of
 
 
 class Case(NamedTuple):
@@ -114,16 +126,12 @@ class Case(NamedTuple):
 
     @property
     def about(self) -> dict[str, object]:
-        """The csv's columns that say which policy it is."""
+        """The cells of ABOUT."""
         args = self.saved.args
-        return {
-            "checkpoint": self.label,
-            "task": self.env.task.name,
-            "learner": " ".join((self.saved.script, *(args[name] for name in ("algorithm", "policy") if name in args))),
-            "contact": " ".join((args.get("contact", "soft"), *args.get("penalty", ()))),
-            "seed": args["seed"],
-            "iteration": self.saved.iteration,
-        }
+        learner = " ".join((self.saved.script, *(args[name] for name in ("algorithm", "policy") if name in args)))
+        contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
+        values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
+        return dict(zip(ABOUT, values, strict=True))
 
 
 def checkpoint_of(path: Path) -> Path:
@@ -151,8 +159,11 @@ def machine(device: str) -> str:
 
 
 def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = None) -> F:
-    """The command line, checked; anything wrong ends the benchmark with one line."""
-    args = tyro.cli(kind, args=argv, description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    """The command line, checked before anything is measured; what follows "--" goes to the scripts that it runs."""
+    words = [*(sys.argv[1:] if argv is None else argv), "--"]
+    end = words.index("--")
+    args = tyro.cli(kind, args=words[:end], description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    args.arguments = tuple(words[end + 1 : -1])
     check_ranges(args)
     if args.output and args.update_results:
         fail("--output and --update-results exclude each other")
@@ -161,19 +172,37 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
         check_device("cpu" if args.draw_only else args.device)
     except ValueError as error:
         fail(error)
+    if args.update_results and (found := tables.unknown(tables.origin(args.device))):
+        fail(f"--update-results needs a known machine, known versions and a committed revision, not {found}")
     torch.set_num_threads(1)  # as in training: idle threads of torch disturb the simulator's
     return args
 
 
-def measured(
-    args: F, name: str, measure: Callable[[F, TaskName], Iterable[Row]], key: Sequence[str]
-) -> list[dict[str, str]]:
-    """All rows of a csv file; those of the tasks asked for are measured, and it has each as soon as it is there."""
+@command
+def run(main: Callable[[F], None], kind: type[F], description: str | None) -> None:
+    """A benchmark from its command line; what its user got wrong ends it with one line."""
+    main(parse(kind, description))
+
+
+class Part(NamedTuple):
+    """One table of a benchmark: what measures it, and where it goes."""
+
+    csv: str
+    measure: Callable[[Any, TaskName], Iterable[Row]]  # called with the flags and a task
+    key: tuple[str, ...]  # columns in which a new row and the one that it replaces agree
+    table: str = ""  # its name in a page
+    page: str = ""
+    shown: Callable[[list[dict[str, str]]], Sequence[Row]] = list  # what the page shows of the rows
+
+
+def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
+    """All rows of a part's csv file; those of the tasks asked for are measured, and each is kept at once."""
     for env in () if args.draw_only else args.env:
-        for row in measure(args, env):
-            print("  " + ", ".join(f"{column} {tables.digits(value)}" for column, value in row.items()), flush=True)
-            args.merge(name, [row], key)
-    return sorted(args.read(name), key=lambda row: LEARNT.index(row["task"].split()[0]))
+        for row in part.measure(args, env):
+            args.keep(part.csv, row, part.key)
+    rows = sorted(args.read(part.csv), key=lambda row: LEARNT.index(row["task"].split()[0]))
+    args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
+    return rows
 
 
 Numbers = Sequence[float] | np.ndarray
@@ -186,6 +215,15 @@ class Line(NamedTuple):
     label: str = ""  # equal ones are one entry of the picture's legend
     width: float = 1.5
     notes: Sequence[str] = ()  # beside the points
+
+
+def lines(rows: Iterable[Mapping[str, str]], x: str, y: str, by: str) -> list[Line]:
+    """A line for each value of the column `by`, through its rows by their x."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        found.setdefault(row[by], []).append((float(row[x]), float(row[y])))
+    curves = {label: np.array(sorted(points)) for label, points in found.items()}
+    return [Line(curve[:, 0], curve[:, 1], f"C{k}o-", label) for k, (label, curve) in enumerate(curves.items())]
 
 
 class Panel(NamedTuple):

@@ -121,7 +121,6 @@ class Args(CommonFlags):
     seeds: tuple[int, ...] = ()  # seeds (default: the suite's)
     cases: tuple[str, ...] = ()  # cases (default: the suite's)
     jobs: int = 1  # runs at a time, each with one thread
-    arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
     count: int = 20  # perturbed starts and pushes of each size
     runs: Path = ROOT / "runs" / "gps"  # directory of the runs: {runs}/{env}__{case}__{seed}
     train_only: bool = False  # only train: several such commands may run side by side
@@ -351,9 +350,7 @@ def kept(rows: list[dict[str, str]], title: str, kind: str) -> Panel:
 
 @command
 def main(argv: Sequence[str] | None = None) -> None:
-    argv = [*(sys.argv[1:] if argv is None else argv), "--"]
-    args = parse(Args, __doc__, argv[: argv.index("--")])
-    args.arguments = tuple(argv[argv.index("--") + 1 : -1])
+    args = parse(Args, __doc__, argv)
     if args.record:
         record(args.record, args.actor, args.steps)
         return

@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import mean
 
 import torch
-from common import CheckpointFlags, checkpoint_of, parse
+from common import CheckpointFlags, checkpoint_of, run
 from gps_experiments import CONTROLLERS, RUN, Act, controllers, environment, grouped, load_search
 from tables import Row, digits, markdown
 from torch import Tensor
@@ -23,7 +23,6 @@ from torch import Tensor
 import gps
 from diffsim.planning import REAL, System
 from diffsim.terrain import named_terrains
-from diffsim.training import command
 
 SECONDS, COUNT = 8.0, 20  # of a trajectory; trajectories from noisy and perturbed starts
 SEEDS = range(1000, 1004)
@@ -97,4 +96,4 @@ def main(args: CheckpointFlags) -> None:
 
 
 if __name__ == "__main__":
-    command(lambda: main(parse(CheckpointFlags, __doc__)))()
+    run(main, CheckpointFlags, __doc__)

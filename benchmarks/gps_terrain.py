@@ -17,14 +17,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
-from common import CheckpointFlags, checkpoint_of, parse
+from common import CheckpointFlags, checkpoint_of, run
 from gps_experiments import RUN, controllers, environment, load_search
 from tables import Row, digits, markdown
 from torch import Tensor
 
 from diffsim.planning import System
 from diffsim.terrain import named_terrains
-from diffsim.training import command
 
 PLACES = [0.5 + 0.1 * i for i in range(10)]  # m, where a slope or a step begins
 SEEDS = range(1000, 1010)
@@ -111,4 +110,4 @@ def main(args: CheckpointFlags) -> None:
 
 
 if __name__ == "__main__":
-    command(lambda: main(parse(CheckpointFlags, __doc__)))()
+    run(main, CheckpointFlags, __doc__)

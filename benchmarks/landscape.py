@@ -22,9 +22,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from common import TASKS, Line, Panel, TaskName, Tasks, can_draw, plot
+from common import TASKS, Line, Panel, TaskName, Tasks, can_draw, plot, run
 from motions import Array, shac
-from runner import Case, Runner, ScriptFlags, parse
+from runner import Case, Runner, ScriptFlags
 from tables import ROOT, Row, markdown
 from torch import Tensor
 from torch.func import functional_call, vmap
@@ -44,8 +44,15 @@ State = tuple[Tensor, Tensor]
 @dataclass
 class Args(ScriptFlags):
     env: Tasks = ("humanoid", "ant")  # tasks
-    seed: int = 1  # of the training, of start states, noise and directions
-    iterations: tuple[Count, ...] = (50, 200, 500, 1000, 1500, 2000)  # of SHAC, for a look; landscapes: the last
+    seed: int = 1  # seed of training, start states, noise and directions
+    iterations: tuple[Count, ...] = (
+        50,
+        200,
+        500,
+        1000,
+        1500,
+        2000,
+    )  # iterations of SHAC at which gradients are measured; landscapes: at the last
     horizon: Count = 1000  # control steps of BPTT's window
     trajectories: Count = 128  # environments that evaluate each variation of the policy
     points: Count = 101  # variations along one weight, from -1 to 1
@@ -84,7 +91,7 @@ class Look:
         return first, (env.qpos, env.qvel)
 
     def rollout(self, loss: Loss, env: DiffEnv, parameters: dict[str, Tensor]) -> list[Tensor]:
-        """Rewards, terminated, truncated and last observations, (horizon, V, trajectories, ...), of V variations."""
+        """Rewards, terminated, truncated and last observations of V variations, (horizon, V, trajectories, ...)."""
         shape = len(parameters["log_std"]), env.num_envs // len(parameters["log_std"])
         torch.manual_seed(0)  # the same noise for every variation, and for every call
         noise = torch.randn(self.horizons[loss], 1, shape[1], env.scene.nu, device=env.device)
@@ -132,7 +139,7 @@ class Look:
         return torch.cat(found).cpu().numpy(), torch.cat(slopes).cpu().numpy() if slope else np.empty((len(steps), 0))
 
     def gradient(self, loss: Loss) -> dict[str, Tensor]:
-        """Of the loss with respect to the policy's parameters, on the CPU."""
+        """The loss's gradient with respect to the policy's parameters, on the CPU."""
         parameters = {name: weight.clone().unsqueeze(0).requires_grad_() for name, weight in self.weights.items()}
         env = self.make_env(self.args.trajectories, self.horizons[loss])
         found = torch.autograd.grad(self.losses(loss, env, parameters).sum(), list(parameters.values()))
@@ -157,7 +164,7 @@ class Look:
 
 
 def gradients(iteration: int, look: Look) -> Row:
-    """Norm and quantiles of the sizes of the entries of both gradients."""
+    """Norms of both gradients, and quantiles of their entries' sizes."""
     sizes: dict[str, object] = {"iteration": iteration}
     for loss in LOSSES:
         gradient = torch.cat([tensor.flatten() for tensor in look.gradient(loss).values()])
@@ -170,7 +177,7 @@ def gradients(iteration: int, look: Look) -> Row:
 
 
 def landscape(look: Look, name: str) -> list[Row]:
-    """Both losses, along one weight also the slope of SHAC's."""
+    """Both losses over the variations; along one weight also the slope of SHAC's."""
     line, count = name == "weight", look.args.points if name == "weight" else look.args.side
     axis = torch.linspace(-1, 1, count, device=look.args.device)
     steps = axis.unsqueeze(1) if line else torch.cartesian_prod(axis, axis)
@@ -240,7 +247,7 @@ def draw(args: Args, task: TaskName) -> None:
 
 
 def section(args: Args, task: TaskName) -> str:
-    """A task's part of the page."""
+    """The page's part on a task."""
     line, sizes = columns_of(args, f"landscape_{task}_weight"), args.read(f"landscape_{task}_gradients")
     rows = list[Row]()
     for loss in LOSSES:
@@ -275,4 +282,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

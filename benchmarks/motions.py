@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 import diffsim
 from diffsim import Integration, Scene, Simulator
-from diffsim.kernels.lanes import Division
 from diffsim.tasks import Task
 from diffsim.training import Count, fail, load_policy, parse
 
@@ -41,17 +40,10 @@ def label(setting: Integration) -> str:
 
 
 def simulator(
-    scene: Scene,
-    setting: Integration,
-    num_envs: int,
-    dtype: torch.dtype = torch.float32,
-    horizon: int = 1,
-    device: str = "cpu",
-    threads: int | None = None,
-    division: Division | None = None,
-    control_dt: float = CONTROL_DT,
+    scene: Scene, setting: Integration, num_envs: int, dtype: torch.dtype = torch.float32, **options: Any
 ) -> Simulator:
-    return Simulator(scene, num_envs, setting, control_dt, horizon, device, dtype, threads, division)
+    """By default of single steps on the CPU; options as Simulator takes them."""
+    return Simulator(scene, num_envs, setting, dtype=dtype, **options)
 
 
 @dataclass
@@ -94,11 +86,10 @@ def visited_states(
     env = diffsim.make(name, num_envs=count, seed=0, penalty=penalty)
     obs, _ = env.reset(seed=0)
     qpos, qvel = env.qpos.double(), env.qvel.double()
-    for step in range(1, 121):
-        obs = env.step(policy(obs.double()).float())[0]
-        if step in (15, 30, 60, 120):
-            rows = slice((15, 30, 60, 120).index(step), None, 4)
-            qpos[rows], qvel[rows] = env.qpos[rows].double(), env.qvel[rows].double()
+    for first, steps in enumerate((15, 15, 30, 60)):
+        for _ in range(steps):
+            obs = env.step(policy(obs.double()).float())[0]
+        qpos[first::4], qvel[first::4] = env.qpos[first::4].double(), env.qvel[first::4].double()
     return qpos, qvel
 
 

@@ -29,8 +29,8 @@ import common
 import mujoco
 import numpy as np
 import torch
-from common import Case, Line, Panel, load_case, parse, plot
-from tables import digits, markdown
+from common import ABOUT, Case, Panel, lines, load_case, plot, run
+from tables import Row, markdown
 from torch import Tensor
 
 import diffsim
@@ -43,14 +43,20 @@ WALK = (2.0, 4.0)  # s before the push
 PUSH = 0.1  # s
 FORWARD, SIDEWAYS = "forward", "sideways"
 DIRECTIONS = {FORWARD: (1.0, 0.0, 0.0), SIDEWAYS: (0.0, 1.0, 0.0)}
-MULTIPLES = np.linspace(0.25, 2.0, 8)  # of the smallest push, in the curves
-FIRST = 1 / 16  # of the weight, the first push
-MOST = 2**10  # times as much is given up
-TOLERANCE = 0.02  # of the smallest push
-KEY = ("checkpoint", "task", "learner", "contact", "seed")
+MULTIPLES = np.linspace(0.25, 2.0, 8)  # levels of the curves, in multiples of the smallest push
+FIRST = 1 / 16  # the first push, as a share of the weight
+MOST = 2**10  # the search ends at this multiple of the first push
+TOLERANCE = 0.02  # relative error of the smallest push
+KEY = ABOUT[:-1]
 CURVE_KEY = (*KEY, "test", "level")  # level: of a push in multiples of the smallest, of a cube in kg
-GROUP = ("task", "learner", "contact", "mass")  # of a row of the table
-EACH = ("seed", "forward N", "sideways N", "forward m/s", "sideways m/s")  # in it of each seed
+GROUP = ("task", "learner", "contact", "mass")  # columns in which the seeds of a table's row agree
+EACH = (
+    "seed",
+    "forward N",
+    "sideways N",
+    "forward m/s",
+    "sideways m/s",
+)  # columns of that row with a value for each seed
 
 
 @dataclass
@@ -58,13 +64,13 @@ class Args(common.CheckpointFlags):
     num_envs: Count = 64  # robots that begin to walk
     body: str = ""  # the pushed one, by its name in the MJCF (default: the robot's first)
     after: Positive = 3.0  # s from the beginning of the push in which a robot falls, or has survived
-    masses: tuple[Positive, ...] = (1, 2, 5, 10, 20, 50, 100)  # of the cubes, kg
-    speed: NonNegative = 0.2  # of the cubes, m/s
+    masses: tuple[Positive, ...] = (1, 2, 5, 10, 20, 50, 100)  # masses of the cubes, kg
+    speed: NonNegative = 0.2  # speed of the cubes, m/s
     restitution: NonNegative = 0.0  # 0: the cube stays with the trunk; 1: it bounces off
 
 
 class State(NamedTuple):
-    """What a policy goes on from."""
+    """The state from which a policy goes on."""
 
     qpos: Tensor  # (n, nq)
     qvel: Tensor  # (n, nv)
@@ -76,9 +82,9 @@ class Walkers:
     """Robots under their policy, which forces may push. Nothing is reset: what has fallen lies there.
 
     Args:
-        env: of the policy's task; its simulator's settings are taken over.
+        env: the policy's environment, whose simulator's settings are taken over.
         policy: observations (n, obs_dim) -> actions (n, nu).
-        body: the pushed one.
+        body: MuJoCo's number of the pushed body.
         state: where they begin.
     """
 
@@ -105,7 +111,7 @@ class Walkers:
             yield state, fallen
 
     def endure(self, seconds: float, force: Tensor, pushed: int) -> Tensor:
-        """(n,) control steps until each falls, all of them for those that do not."""
+        """(n,) control steps until each robot falls; all of them if it does not."""
         steps = torch.zeros(len(self.start.qpos), dtype=torch.long, device=self.sim.device)
         for _, fallen in self.walk(seconds, force, pushed):
             steps += ~fallen
@@ -115,7 +121,7 @@ class Walkers:
 
 
 def starts(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> State:
-    """The states of those that still walk after a time of their own within WALK."""
+    """The states of the robots that still walk after a time, drawn for each, within WALK."""
     env.reset(seed=SEED)
     no_action = torch.zeros(env.num_envs, env.scene.nu, dtype=env.dtype, device=env.device)
     walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action, env.first_step))
@@ -211,65 +217,49 @@ def measure(case: Case, body: int, args: Args) -> None:
     unpushed = fallen(FORWARD, 0.0)
     if unpushed >= 0.5:
         fail(f"{unpushed:.0%} fall without a push")
-    row: dict[str, object] = about | {"robots": count, "unpushed": unpushed, "mass": mass}
+    row = about | {"robots": count, "unpushed": unpushed, "mass": mass}
     for direction in DIRECTIONS if scene.floating else (FORWARD,):  # what is planar does not feel the other
         least = smallest(partial(fallen, direction), FIRST * 9.81 * mass)
-        row |= {f"{direction} N": least, f"{direction} m/s": least * push * env.control_dt / mass}
-        print(f"  {direction}: {digits(least)} N", flush=True)
-        for multiple in MULTIPLES if math.isfinite(least) else ():
-            share = 1 - fallen(direction, multiple * least)
-            kick = float(multiple) * least * push * env.control_dt
-            level: dict[str, object] = {
-                "test": direction,
-                "level": float(multiple),
-                "impulse": kick,
-                "m/s": kick / mass,
-            }
-            args.merge("robustness_curves", [about | level | {"survived": share}], CURVE_KEY)
-    args.merge("robustness", [row], KEY)
+        second = push * env.control_dt  # s, nearly PUSH
+        row |= {f"{direction} N": least, f"{direction} m/s": least * second / mass}
+        for multiple in map(float, MULTIPLES if math.isfinite(least) else ()):
+            kick = multiple * least * second
+            level = {"test": direction, "level": multiple, "impulse": kick, "m/s": kick / mass}
+            args.keep(
+                "robustness_curves", about | level | {"survived": 1 - fallen(direction, multiple * least)}, CURVE_KEY
+            )
+    args.keep("robustness", row, KEY)
 
     hit = target(scene, state, body)
     for kilograms in args.masses:
         kicks = impulse(hit, kilograms, args.speed, args.restitution)
         force = torch.zeros(count, 3, dtype=env.dtype, device=env.device)
         force[:, 0] = torch.as_tensor(kicks / env.control_dt)
-        steps = endured(force, 1).double()
-        found = {
-            "impulse": float(-kicks.mean()),
-            "m/s": float(-kicks.mean()) / mass,
-            "survived": float((steps == limit).double().mean()),
-            "steps": float(steps.mean()),
-            "steps sd": float(steps.std()),
-        }
-        settings = {"speed": args.speed, "restitution": args.restitution}
-        args.merge("robustness_curves", [about | {"test": "cube", "level": kilograms} | found | settings], CURVE_KEY)
-        print(f"  cube of {kilograms:g} kg: " + ", ".join(f"{k} {digits(v)}" for k, v in found.items()), flush=True)
+        steps, kick = endured(force, 1).double(), float(-kicks.mean())
+        level = {"test": "cube", "level": kilograms, "impulse": kick, "m/s": kick / mass}
+        level |= {"survived": float((steps == limit).double().mean()), "steps": float(steps.mean())}
+        level |= {"steps sd": float(steps.std()), "speed": args.speed, "restitution": args.restitution}
+        args.keep("robustness_curves", about | level, CURVE_KEY)
 
 
 def panels(rows: list[dict[str, str]]) -> list[Panel]:
     """Survival against the impulse of pushes, and control steps until the fall against the mass of cubes."""
-    result, labels = list[Panel](), dict.fromkeys(row["checkpoint"] for row in rows)
-    for test in (*DIRECTIONS, "cube"):
-        (x, y), lines = ("level", "steps") if test == "cube" else ("m/s", "survived"), list[Line]()
-        for k, label in enumerate(labels):
-            own = [row for row in rows if row["checkpoint"] == label and row["test"] == test]
-            points = np.array(sorted((float(row[x]), float(row[y])) for row in own)).reshape(-1, 2)
-            lines.append(Line(points[:, 0], points[:, 1], f"C{k}o-", label))
-        if test == "cube":
-            result.append(Panel(lines, test, "its mass (kg)", "control steps until the fall", log="x", zero=True))
-        else:
-            result.append(Panel(lines, test, "impulse per mass (N s/kg)", "share upright", zero=True))
-    return result
+    own = {test: [row for row in rows if row["test"] == test] for test in (*DIRECTIONS, "cube")}
+    pushes = {test: lines(own[test], "m/s", "survived", "checkpoint") for test in DIRECTIONS}
+    cubes = lines(own["cube"], "level", "steps", "checkpoint")
+    return [
+        *(Panel(curves, test, "impulse per mass (N s/kg)", "share upright") for test, curves in pushes.items()),
+        Panel(cubes, "cube", "its mass (kg)", "control steps until the fall", log="x", zero=True),
+    ]
 
 
-def table(rows: list[dict[str, str]]) -> str:
+def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each learner on a task: each seed's smallest pushes, and the change of speed that they would cause."""
     tasks, groups = [*diffsim.TASKS], dict[tuple[str, ...], list[dict[str, str]]]()
     for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"])):
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
     each = ({name: ", ".join(seed.get(name, "") for seed in seeds) for name in EACH} for seeds in groups.values())
-    lines = [seeds[0] | cells for seeds, cells in zip(groups.values(), each, strict=True)]
-    return markdown(lines, (*GROUP, *EACH))
+    return [dict(zip(GROUP, group, strict=True)) | cells for group, cells in zip(groups, each, strict=True)]
 
 
 def main(args: Args) -> None:
@@ -278,8 +268,8 @@ def main(args: Args) -> None:
         measure(case, body, args)
     if rows := args.read("robustness_curves"):
         plot(args.picture("robustness"), [panels(rows)], (3.8, 3.2))
-    args.publish("robustness", table(args.read("robustness")), "robustness.md")
+    args.publish("robustness", markdown(table(args.read("robustness"))), "robustness.md")
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

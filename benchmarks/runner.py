@@ -15,11 +15,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import common
 import numpy as np
-import tyro
 from motions import RUNS
 from tables import ROOT, read_csv
 
@@ -30,7 +29,6 @@ from diffsim.training.evaluation import FINER, kept
 
 COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return")  # kept of progress.csv
 Curve = dict[str, np.ndarray]
-R = TypeVar("R", bound="ScriptFlags")
 
 
 @dataclass
@@ -38,15 +36,6 @@ class ScriptFlags(common.CommonFlags):
     device: str = "auto"  # torch device of the learners (auto: the GPU if there is one)
     time_limit: float | None = None  # seconds after which runs in progress stop and save; the next call goes on
     runs: Path = RUNS  # directory of the runs
-    arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
-
-
-def parse(kind: type[R], description: str | None) -> R:
-    """The command line, of which what follows "--" goes to the scripts."""
-    argv = [*sys.argv[1:], "--"]
-    args = common.parse(kind, description, argv[: argv.index("--")])
-    args.arguments = tuple(argv[argv.index("--") + 1 : -1])
-    return args
 
 
 class Case(NamedTuple):

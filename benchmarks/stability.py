@@ -17,17 +17,17 @@ import copy
 import dataclasses
 import math
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import motions
 import mujoco
 import numpy as np
 import torch
-from common import Line, Panel, TaskName, measured, parse, plot
+from common import Line, Panel, Part, TaskName, lines, measured, plot, run
 from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay, simulator
 from tables import Row, markdown
 from torch import Tensor
@@ -37,7 +37,7 @@ from diffsim import Scene, Simulator
 from diffsim.tasks import Contact
 from diffsim.training import Count
 
-Part = Literal["step", "sweeps", "horizon", "long", "energy"]
+PartName = Literal["step", "sweeps", "horizon", "long", "energy"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 HORIZONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -54,12 +54,14 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "alternating action": (1,),
 }
 NEEDS_GROUND = list(SWEEPS)[:5]
+CONSTANTS = {"contact stiffness x": ("k_n", None), "contact damping x": ("k_d", None), "friction": ("mu", 1.0)}
+SWEEP_KEY = ("task", "integrator", "sweep", "value")
 CHAINS, CHAIN_SUBSTEPS = (1, 5, 20), (16, 32, 64)  # links; substeps
 
 
 @dataclass
 class Args(PolicyFlags):
-    parts: tuple[Part, ...] = ("step", "sweeps", "horizon", "long", "energy")  # tables to measure
+    parts: tuple[PartName, ...] = ("step", "sweeps", "horizon", "long", "energy")  # tables to measure
     contact: Contact = "soft"  # constants of contact and limits; firm of the tasks that have such
     states: Count = 8  # start states
     steps: Count = 1_000_000  # control steps of the table "long", over all of its 64 environments
@@ -71,7 +73,7 @@ def label(args: Args, name: TaskName) -> str:
 
 
 class Case(motions.Case):
-    """With MuJoCo's model for the energies, and a reference so fine that it is stable."""
+    """A motion with MuJoCo's model for its energies, and a reference so fine that it is stable."""
 
     def __init__(self, args: Args, name: TaskName) -> None:
         super().__init__(args, name, diffsim.TASKS[name].penalty(args.contact))
@@ -105,8 +107,8 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
             stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        row = {"task": case.label, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
-        yield row | {"largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
+        row: Row = {"task": case.label, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
+        yield {**row, "largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
 
 
 def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple[float, int]:
@@ -122,12 +124,20 @@ def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -
 
 
 def stored(scene: Scene, model: mujoco.MjModel, qpos: Tensor) -> Array:
-    """At least the energy (N,) in the springs of ground and limits."""
+    """A lower bound (N,) of the energy in the springs of ground and limits."""
     links = np.flatnonzero(np.isfinite(scene.upper))
     joints = qpos[:, scene.qpos_adr[links]].numpy()
     beyond = np.maximum(scene.lower[links] - joints, 0) + np.maximum(joints - scene.upper[links], 0)
     ground = (np.minimum(motions.heights(model, qpos), 0) ** 2).sum(1) if scene.ncontact else 0.0
     return 0.5 * (scene.k_limit[links] * beyond**2).sum(1) + 0.5 * scene.k_n * ground
+
+
+def bounded(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> bool:
+    """Whether the energy along qpos (T, N, nq), qvel (T, N, nv) stays that of the start, springs included, to 10 %."""
+    start = mechanics(model, qpos[0], qvel[0])[1] + stored(scene, model, qpos[0])
+    path = np.array([mechanics(model, q, v)[:2] for q, v in zip(qpos, qvel, strict=True)])
+    floor = (path[:, 1] - path[:, 0]).min(0)  # potential energy has no zero: its least value is taken off
+    return bool((path[:, 1] - floor <= 1.1 * (start - floor) + 1e-3).all())
 
 
 def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, Tensor, Tensor, Tensor]:
@@ -136,12 +146,10 @@ def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, 
     actions = motions.idle(scene).expand(60, case.n, scene.nu)
     height = 2 if scene.floating else 1  # in qpos; the planar robots' second slide
     lowest = torch.tensor(motions.heights(model, qpos).min(1)) if scene.ncontact else 0.0
-    if sweep == "contact stiffness x":
-        scene = dataclasses.replace(scene, k_n=value * scene.k_n)
-    elif sweep == "contact damping x":
-        scene = dataclasses.replace(scene, k_d=value * scene.k_d)
-    elif sweep == "friction":
-        scene = dataclasses.replace(scene, mu=value)
+    if sweep in CONSTANTS:
+        name, start = CONSTANTS[sweep]
+        changes: dict[str, Any] = {name: value * (getattr(scene, name) if start is None else start)}
+        scene = dataclasses.replace(scene, **changes)
     elif sweep == "last link's mass x":
         mass, inertia, model = scene.mass.copy(), scene.inertia.copy(), copy.deepcopy(model)
         mass[-1], inertia[-1] = value * mass[-1], value * inertia[-1]
@@ -184,21 +192,12 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
                 energy, bad = case.kinetic(sim, actions)
                 within = energy < 2 * limit
             else:
-                q, v, bad = replay(sim, qpos, qvel, actions)
-                before = mechanics(model, qpos, qvel)[1] + stored(scene, model, qpos)
-                # Potential energy has no zero; with its least value along the path taken off, all of it is motion.
-                path = np.array([mechanics(model, a, b)[:2] for a, b in zip(q, v, strict=True)])
-                floor = (path[:, 1] - path[:, 0]).min(0)
-                within = bool((path[:, 1] - floor <= 1.1 * (before - floor) + 1e-3).all())
+                *path, bad = replay(sim, qpos, qvel, actions)
+                within = bounded(scene, model, *path)
             norm, lost = gradient_norm(sim, qpos, qvel, actions)
-            row = {
-                "task": case.label,
-                "integrator": integrator,
-                "sweep": sweep,
-                "value": float(value),
-                "finite": bad == 0,
-            }
-            yield row | {"contained": bad, "energy bounded": within, "gradient": norm, "gradients not finite": lost}
+            row: Row = {"task": case.label, "integrator": integrator, "sweep": sweep, "value": float(value)}
+            row = {**row, "finite": bad == 0, "contained": bad, "energy bounded": within}
+            yield {**row, "gradient": norm, "gradients not finite": lost}
 
 
 def summary(rows: list[dict[str, str]]) -> list[Row]:
@@ -236,14 +235,9 @@ def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
                 bad += int(sim.nonfinite.sum())
                 total = total + task.reward(task.observe(q, v, action), action).mean() / horizon
             found = [g.flatten() for g in torch.autograd.grad(total, weights, allow_unused=True) if g is not None]
-            lost = int(sim.nonfinite_gradients.sum()) - before
-            row = {
-                "task": case.label,
-                "integrator": integrator,
-                "horizon": horizon,
-                "gradient": torch.cat(found).norm().item(),
-            }
-            yield row | {"gradients not finite": lost, "contained": bad}
+            row: Row = {"task": case.label, "integrator": integrator, "horizon": horizon}
+            row = {**row, "gradient": torch.cat(found).norm().item()}
+            yield {**row, "gradients not finite": int(sim.nonfinite_gradients.sum()) - before, "contained": bad}
 
 
 @torch.no_grad()
@@ -257,13 +251,9 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
         bad += info["nonfinite"].sum()
         fastest = torch.maximum(fastest, env.qvel.abs().max())
         returns += info["episode"]["r"][info["_episode"]].tolist()
-    row = {
-        "task": label(args, name),
-        "control steps": 64 * math.ceil(args.steps / 64),
-        "contained": int(bad),
-        "largest velocity": fastest.item(),
-    }
-    yield row | {"episodes": len(returns), "median return": float(np.median(returns)) if returns else math.nan}
+    row: Row = {"task": label(args, name), "control steps": 64 * math.ceil(args.steps / 64), "contained": int(bad)}
+    row = {**row, "largest velocity": fastest.item(), "episodes": len(returns)}
+    yield {**row, "median return": float(np.median(returns)) if returns else math.nan}
 
 
 def chain(links: int) -> Scene:
@@ -308,22 +298,20 @@ def energies(args: Args) -> list[Row]:
 def draw(args: Args, rows: list[dict[str, str]]) -> None:
     panels = list[Panel]()
     for name in dict.fromkeys(row["task"] for row in rows):
-        lines = list[Line]()
-        for k, kind in enumerate(INTEGRATORS):
-            found = [row for row in rows if row["task"] == name and row["integrator"] == kind]
-            x, y = ([float(row[column]) for row in found] for column in ("horizon", "gradient"))
-            lines.append(Line(x, y, f"C{k}o-", kind))
-        ends = [float(row["gradient"]) for row in rows if row["task"] == name]
-        lines.append(Line((32, 32), (min(ends), max(ends)), "k--", "SHAC's window", 0.8))
-        panels.append(Panel(lines, name, "control steps", "" if panels else "|gradient of the mean reward|", log="xy"))
+        own = [row for row in rows if row["task"] == name]
+        ends = [float(row["gradient"]) for row in own]
+        window = Line((32, 32), (min(ends), max(ends)), "k--", "SHAC's window", 0.8)
+        curves = [*lines(own, "horizon", "gradient", "integrator"), window]
+        panels.append(Panel(curves, name, "control steps", "" if panels else "|gradient of the mean reward|", log="xy"))
     plot(args.picture("stability"), [panels], (3.4, 3.2))
 
 
-MEASURES: dict[Part, tuple[Callable[[Args, TaskName], Iterator[Row]], tuple[str, ...]]] = {
-    "step": (measure_step, ("task", "integrator")),
-    "sweeps": (measure_sweeps, ("task", "integrator", "sweep", "value")),
-    "horizon": (measure_horizon, ("task", "integrator", "horizon")),
-    "long": (measure_long, ("task",)),
+PAGE = "stability.md"
+PARTS: dict[PartName, Part] = {
+    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE),
+    "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, summary),
+    "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon")),
+    "long": Part("stability_long", measure_long, ("task",), "long", PAGE),
 }
 
 
@@ -334,12 +322,10 @@ def main(args: Args) -> None:
         if part == "energy":
             args.publish(part, markdown(energies(args)), "stability.md")
             continue
-        rows = measured(args, f"stability_{part}", *MEASURES[part])
-        if part != "horizon":
-            args.publish(part, markdown(summary(rows) if part == "sweeps" else rows), "stability.md")
-        elif rows:
+        rows = measured(args, PARTS[part])
+        if part == "horizon" and rows:
             draw(args, rows)
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

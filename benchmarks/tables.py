@@ -35,15 +35,30 @@ def origin(device: str = "cpu") -> str:
     """The comment line of rows that this process measures on a device."""
     info = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
     found = re.search("model name.*: (.*)", info)
-    machine = f"{os.cpu_count()} cores of {found[1] if found else platform.processor()}"
+    machine = f"{os.cpu_count()} cores of {found[1] if found else platform.processor() or 'unknown'}"
     if device.startswith("cuda"):
         machine = torch.cuda.get_device_name(device)
     packages = {"torch": "torch", "warp": "warp-lang", "mujoco": "mujoco"}
     versions = ", ".join(f"{name} {metadata.version(package)}" for name, package in packages.items())
-    git = subprocess.run("git describe --always --dirty || echo unknown", shell=True, cwd=ROOT, capture_output=True)
     command = shlex.join(["python", os.path.relpath(sys.argv[0], ROOT), *sys.argv[1:]])
-    made = f"python {platform.python_version()}, {versions}; revision {git.stdout.decode().strip()}"
-    return f"# {machine}; {made}; {command}\n"
+    return f"# {machine}; python {platform.python_version()}, {versions}; revision {revision()}; {command}\n"
+
+
+def revision() -> str:
+    """The commit, "-dirty" with changes of tracked files. Results do not count: benchmarks write them one by one."""
+
+    def git(*words: str) -> str | None:
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    changes = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!results", ":!docs", ":!README.md")
+    return f"{git('rev-parse', '--short', 'HEAD') or 'unknown'}{'-dirty' if changes else ''}"
+
+
+def unknown(line: str) -> str:
+    """Which part of an origin does not say where rows come from; empty if all do."""
+    machine_versions_revision = line.removeprefix("# ").split("; ")[:3]
+    return next((part for part in machine_versions_revision if re.search("unknown|-dirty", part)), "")
 
 
 def origins(path: Path) -> list[str]:

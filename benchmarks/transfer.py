@@ -2,61 +2,129 @@
 
     python benchmarks/transfer.py runs/learning/shac/ant__1            a run, or a checkpoint of any learner's script
     python benchmarks/transfer.py runs/learning/*/* --friction 0.5 0.7 1 1.3 1.5
-    python benchmarks/transfer.py runs/learning/shac/ant__1 --episodes 8 --video both.mp4 --curves
+    python benchmarks/transfer.py runs/learning/shac/ant__1 --episodes 8 --video both.mp4
 
 A policy acts from the same start states in several worlds, of which each step changes one thing:
 
     here        this simulator, as in training
     finer       this simulator with finer, explicit steps: the integration
-    control     MuJoCo's dynamics, this simulator's contact and limits as external forces, steps of "finer": nothing, or
-                the comparison is wrong
     MuJoCo x1   MuJoCo with its own contact and limits on the same file: the model of contact and limits
     MuJoCo x0.5 and so on, with other friction
 
-Writes transfer.csv, a row for each policy and world, transfer.png with --curves, and with --update-results the table
-of docs/transfer.md. The video shows the same start here (left) and in MuJoCo (right).
+Writes transfer.csv, a row for each policy and world, and with --update-results the table of docs/transfer.md. The video
+shows the same start here (left) and in MuJoCo (right).
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
 
 import common
+import mujoco
 import numpy as np
 import torch
-import worlds
-from common import Case, Line, Panel, load_case, parse, plot
-from tables import Row, digits, markdown
+from common import ABOUT, Case, load_case, run
+from numpy.typing import NDArray
+from tables import Row, markdown
 from torch import Tensor
-from worlds import Array, Flags, World
 
 import diffsim
-from diffsim import DiffEnv, Integration, Scene, Simulator
+from diffsim import DiffEnv, Integration, Scene, Simulator, load_scene
+from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Task
 from diffsim.training import Count, Positive, fail
 from diffsim.training.evaluation import FINER, SEED, travels
-from diffsim.view import render
+from diffsim.view import gait, render
 
-KEY = ("checkpoint", "task", "learner", "contact", "seed", "condition")
-SHOWN = 5.0  # s of an episode in the picture
-STYLES = {"here": "C0-", "control": "C1--", "MuJoCo x1": "C2-"}
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+KEY = (*ABOUT[:-1], "condition")
+FASTEST = 1e5  # m/s or rad/s; beyond it a robot is lost, as in Simulator
+
+mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable, which World.step says
 
 
 @dataclass
 class Args(common.CheckpointFlags):
     episodes: Count = 64  # start states, the same in every world
     steps: Count = 1000  # control steps at most
-    friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # of MuJoCo, in multiples of the file's mu
-    control: bool = True  # run "finer" and "control" too, which check the comparison and take most of its time
-    finer: Count = FINER  # steps of "finer" and of the control in multiples of the task's substeps
+    friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # friction in MuJoCo, in multiples of the file's mu
+    finer: Count = FINER  # steps of "finer" in multiples of the task's substeps
     video: Path | None = None  # write the episode of median return, here and in MuJoCo side by side: .mp4 or .gif
-    curves: bool = False  # draw that episode's speed and penetration against time
+
+
+# Worlds ---------------------------------------------------------------------------------------------------------------
+
+
+class Here:
+    """N robots in this simulator."""
+
+    def __init__(self, sim: Simulator) -> None:
+        self.sim = sim
+
+    @torch.no_grad()
+    def step(self, qpos: Array, qvel: Array, action: Array, alive: Flags) -> tuple[Array, Array, Flags]:
+        """qpos (N, nq) and qvel (N, nv) after a control step, and which robots (N,) left the finite numbers.
+
+        Those, and all that are not alive, stay as they were.
+        """
+        tensors = (torch.as_tensor(x, dtype=self.sim.dtype, device=self.sim.device) for x in (qpos, qvel, action))
+        new = [x.double().numpy(force=True) for x in self.sim.step(*tensors)]
+        q, v = (np.where(alive[:, None], after, before) for after, before in zip(new, (qpos, qvel), strict=True))
+        return q, v, alive & self.sim.nonfinite.numpy(force=True)
+
+
+class MuJoCo:
+    """N robots in MuJoCo with its own contact and limits on a scene's file.
+
+    Args:
+        scene: its file is read again, whose mu is the friction of all geoms, whatever the scene's own is.
+        num_envs: number of robots N.
+        control_dt: s of a control step, which takes the fewest steps that are no longer than the file's.
+        friction: factor on that mu.
+    """
+
+    def __init__(self, scene: Scene, num_envs: int, control_dt: float, friction: float = 1.0) -> None:
+        self.model = mujoco.MjModel.from_xml_path(scene.path)
+        self.model.geom_friction[:, 0] = friction * load_scene(scene.path).mu
+        self.substeps = math.ceil(control_dt / self.model.opt.timestep - 1e-6)
+        self.model.opt.timestep = control_dt / self.substeps
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
+        low, high = self.model.actuator_ctrlrange.T
+        self._middle, self._reach = (low + high) / 2, (high - low) / 2
+        self._pool = ThreadPoolExecutor(available_cores())
+
+    def step(self, qpos: Array, qvel: Array, action: Array, alive: Flags) -> tuple[Array, Array, Flags]:
+        """As in Here."""
+        ctrl, qpos, qvel, lost = self._middle + self._reach * action, qpos.copy(), qvel.copy(), np.zeros_like(alive)
+
+        def run(rows: Sequence[int]) -> None:
+            for k in rows:
+                data = self.data[k]
+                data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], qvel[k], ctrl[k]
+                mujoco.mj_step(self.model, data, self.substeps)  # without Python's lock
+                if (np.abs(data.qvel) < FASTEST).all() and np.isfinite(data.qpos).all():
+                    qpos[k], qvel[k] = data.qpos, data.qvel
+                else:
+                    lost[k] = True
+
+        rows, count = np.flatnonzero(alive).tolist(), available_cores()
+        list(self._pool.map(run, (rows[k::count] for k in range(count))))
+        return qpos, qvel, lost
+
+
+World = Here | MuJoCo
+
+
+# Motions --------------------------------------------------------------------------------------------------------------
 
 
 def load(path: Path, args: Args) -> Case:
@@ -65,12 +133,9 @@ def load(path: Path, args: Args) -> Case:
     name = case.env.task.name
     if "muscle" in case.env.scene.features:
         fail(f"{case.path} was trained on {name}, whose muscles are not simulated in MuJoCo here")
-    if name not in worlds.OBSERVED:
-        fail(f"{case.path} was trained on {name}, whose observation worlds.py does not compute")
+    if case.env.task.timed:
+        fail(f"{case.path} was trained on {name}, which tracks a motion in time: choose a policy of another task")
     return case
-
-
-# Motions --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -78,7 +143,8 @@ class Motion:
     """The first episode of each of n robots in one world.
 
     Attributes:
-        qpos, qvel: (T + 1, n, nq), (T + 1, n, nv) from the start on; valid up to an episode's length.
+        qpos: (T + 1, n, nq) from the start on; valid up to an episode's length.
+        qvel: (T + 1, n, nv).
         returns: (n,).
         lengths: (n,) control steps.
         fallen: (n,) whether the episode ended with a fall.
@@ -98,22 +164,21 @@ def act(
     """Episodes of at most so many steps in a world, from qpos (n, nq) and qvel (n, nv).
 
     Args:
-        task: of float64, on the CPU; says what is rewarded, and who has fallen.
+        task: in float64, on the CPU; says what is observed and rewarded, and who has fallen.
         policy: observations (n, obs_dim) in float32 -> actions (n, nu).
     """
     n = len(qpos)
     alive, fallen, returns, lengths = np.ones(n, bool), np.zeros(n, bool), np.zeros(n), np.zeros(n, int)
-    obs = worlds.observe(task.name, qpos, qvel, np.zeros((n, nu)))
+    obs = task.observe(torch.from_numpy(qpos), torch.from_numpy(qvel), torch.zeros(n, nu, dtype=torch.float64))
     path = [(qpos, qvel)]
     for _ in range(steps):
-        action = policy(torch.from_numpy(obs).float()).clamp(-1.0, 1.0).double()
+        action = policy(obs.float()).clamp(-1.0, 1.0).double()
         qpos, qvel, lost = world.step(qpos, qvel, action.numpy(), alive)
         path.append((qpos, qvel))
-        obs = worlds.observe(task.name, qpos, qvel, action.numpy())
-        seen = torch.from_numpy(obs)
-        returns += np.where(alive & ~lost, task.reward(seen, action).numpy(), 0.0)
+        obs = task.observe(torch.from_numpy(qpos), torch.from_numpy(qvel), action)
+        returns += np.where(alive & ~lost, task.reward(obs, action).numpy(), 0.0)
         lengths += alive
-        fallen |= alive & (lost | task.terminated(seen).numpy())
+        fallen |= alive & (lost | task.terminated(obs).numpy())
         alive &= ~fallen
         if not alive.any():
             break
@@ -129,7 +194,7 @@ def speed(motion: Motion, control_dt: float) -> float:
 
 def feet(scene: Scene) -> list[Flags]:
     """Which of the contact spheres (nc,) are of each foot: a body at the end of a limb, which carries no other."""
-    body, parents = worlds.contact_bodies(scene), scene.mj_model.body_parentid
+    body, parents = gait.contact_bodies(scene), scene.mj_model.body_parentid
     return [body == k for k in np.unique(body) if k not in parents and parents[k]]
 
 
@@ -140,59 +205,53 @@ def measure(motion: Motion, scene: Scene, control_dt: float) -> dict[str, object
         "speed": speed(motion, control_dt) if travels(scene) else "",
         "whole": float((~motion.fallen).mean()),
     }
-    names = ("penetration", "penetration 95 %", "slip")
-    if "contact" not in scene.features:
-        return row | dict.fromkeys(names, "")
-    frames = np.arange(1, len(motion.qpos))[:, None] <= motion.lengths  # of the states after each step
-    depth, slip = worlds.contacts(scene, motion.qpos[1:][frames], motion.qvel[1:][frames])
-    limbs = feet(scene)
-    deepest = np.concatenate([depth[:, foot].max(1) for foot in limbs])
-    own = np.any(limbs, 0)
-    within = depth[:, own] > 0
-    if not within.any():
-        return row | dict.fromkeys(names, "")
-    middle, most = np.percentile(1e3 * deepest[deepest > 0], (50, 95))
-    return row | dict(zip(names, (float(middle), float(most), float(np.median(slip[:, own][within]))), strict=True))
+    deepest = np.zeros(0)
+    if "contact" in scene.features:
+        frames = np.arange(1, len(motion.qpos))[:, None] <= motion.lengths  # the states after each step
+        depth = gait.trace(scene, motion.qpos[1:][frames]).depth
+        deepest = np.concatenate([depth[:, foot].max(1) for foot in feet(scene)])
+    middle, most = np.percentile(1e3 * deepest[deepest > 0], (50, 95)) if (deepest > 0).any() else ("", "")
+    return row | {"penetration": middle, "penetration 95 %": most}
 
 
 def conditions(case: Case, args: Args) -> Iterator[tuple[str, World]]:
     """The worlds, by the names that the csv gives them."""
     env, scene, n = case.env, case.env.scene, case.env.num_envs
-    yield "here", worlds.Here(env.sim)
-    if args.control:
-        finer = Integration("semi_implicit", args.finer * env.task.substeps)
-        yield "finer", worlds.Here(Simulator(scene, n, finer, env.control_dt, device=env.device))
-        yield "control", worlds.Control(scene, n, env.control_dt, finer.substeps)
+    yield "here", Here(env.sim)
+    finer = Integration("semi_implicit", args.finer * env.task.substeps)
+    yield "finer", Here(Simulator(scene, n, finer, env.control_dt, device=env.device))
     for friction in args.friction if scene.ncontact else (1.0,):
-        yield f"MuJoCo x{friction:g}", worlds.MuJoCo(scene, n, env.control_dt, friction)
+        yield f"MuJoCo x{friction:g}", MuJoCo(scene, n, env.control_dt, friction)
 
 
 def compare(case: Case, args: Args) -> dict[str, Motion]:
     """The motions of one policy by their worlds; each is in the csv as soon as it is measured."""
-    env, saved = case.env, case.saved
+    env, how = case.env, case.env.sim.integration
     env.reset(seed=SEED)
     qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
     task, motions, own = type(env.task)(dtype=torch.float64), dict[str, Motion](), math.nan
-    integration = env.sim.integration
-    about = case.about | {"integrator": integration.integrator, "substeps": integration.substeps}
     for name, world in conditions(case, args):
-        began = time.perf_counter()
-        motions[name] = act(world, task, saved.network, qpos, qvel, env.scene.nu, args.steps)
-        found = measure(motions[name], env.scene, env.control_dt)
+        motion = motions[name] = act(world, task, case.saved.network, qpos, qvel, env.scene.nu, args.steps)
+        found = measure(motion, env.scene, env.control_dt)
         if isinstance(value := found["speed"], float):
             own = value if name == "here" else own
             found["kept"] = value / own
-        asked = {column: getattr(args, column) for column in ("episodes", "steps", "finer")}
-        row = about | {"condition": name, **found, **asked, "seconds": time.perf_counter() - began}
-        args.merge("transfer", [row], KEY)
-        print("  " + ", ".join(f"{k} {digits(v)}" for k, v in row.items() if k not in about), flush=True)
+        row = case.about | {"integrator": how.integrator, "substeps": how.substeps, "condition": name}
+        row |= found | {column: getattr(args, column) for column in ("episodes", "steps", "finer")}
+        args.keep("transfer", row, KEY)
     return motions
 
 
 # What is shown --------------------------------------------------------------------------------------------------------
 
 
-def table(rows: list[dict[str, str]]) -> str:
+def middle(rows: Sequence[dict[str, str]], column: str, form: str) -> str:
+    """The median of a column's numbers, or nothing."""
+    values = [float(row[column]) for row in rows if row[column]]
+    return format(median(values), form) if values else ""
+
+
+def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task, contact and learner, over its seeds: medians of the speed in each world in m/s, or of the
     return of a robot that does not travel, mean shares of whole episodes in MuJoCo, medians of the feet's penetration.
 
@@ -206,97 +265,53 @@ def table(rows: list[dict[str, str]]) -> str:
         key = row["task"], row["contact"], learner
         groups.setdefault(key, {}).setdefault(row["condition"], []).append(row)
     names = {name for group in groups.values() for name in group if name.startswith("MuJoCo")}
-    order = sorted(names, key=lambda name: float(name.partition("x")[2]))
-    lines = list[Row]()
-
-    def middle(found: list[dict[str, str]], column: str, form: str) -> str:
-        values = [float(row[column]) for row in found if row[column]]
-        return format(median(values), form) if values else ""
-
+    order, lines = sorted(names, key=lambda name: float(name.partition("x")[2])), list[Row]()
     for (task, contact, learner), group in groups.items():
-        seeds = len(group["here"])
-        line = {"task": task, "contact": contact, "learner": learner, "seeds": seeds}
-        unit = ("speed", ".2f") if group["here"][0]["speed"] else ("return", ".0f")
-        line |= {name: middle(group.get(name, []), *unit) for name in ("here", *order)}
-        there = group.get("MuJoCo x1", [])
+        here, there = group["here"], group.get("MuJoCo x1", [])
+        unit = ("speed", ".2f") if here[0]["speed"] else ("return", ".0f")
         kept = [float(row["kept"]) for row in there if row["kept"]]
-        line |= {"kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
-        own = {row["seed"]: float(row[unit[0]]) for row in group["here"]}
-        errors = [abs(float(row[unit[0]]) - own[row["seed"]]) for row in group.get("control", [])]
-        line["control off by"] = format(max(errors), unit[1]) if errors else ""
         shares = [mean(float(row["whole"]) for row in group[name]) for name in order if name in group]
-        line["whole"] = " / ".join(f"{share:.0%}" for share in shares)
-        line |= {f"depth {name}": middle(group.get(name, []), "penetration", ".1f") for name in ("here", "MuJoCo x1")}
-        lines.append(line)
-    return markdown(lines)
-
-
-def median_episode(motion: Motion) -> int:
-    return int(motion.returns.argsort()[(len(motion.returns) - 1) // 2])
+        line: Row = {"task": task, "contact": contact, "learner": learner, "seeds": len(here)}
+        line = {**line, **{name: middle(group.get(name, []), *unit) for name in ("here", *order)}}
+        line = {**line, "kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
+        line = {**line, "whole": " / ".join(f"{share:.0%}" for share in shares)}
+        depths = {"depth here": here, "depth MuJoCo x1": there}
+        lines.append({**line, **{name: middle(found, "penetration", ".1f") for name, found in depths.items()}})
+    return lines
 
 
 def film(path: Path, env: DiffEnv, here: Motion, there: Motion) -> None:
-    """The same start here (left) and there (right); who has fallen stays as it fell."""
-    episode, stride = median_episode(here), max(1, math.ceil(1 / (render.VIDEO_FPS * env.control_dt) - 1e-6))
+    """The episode of median return here (left), and its start there (right); who has fallen stays as it fell."""
+    episode = int(here.returns.argsort()[(len(here.returns) - 1) // 2])
+    stride = max(1, math.ceil(1 / (render.VIDEO_FPS * env.control_dt) - 1e-6))
     renderer = partial(render.Renderer, env.scene, *render.VIDEO_SIZE)
-    ends = [motion.lengths[episode] for motion in (here, there)]
-    count = min(max(ends), round(render.VIDEO_SECONDS / env.control_dt))
+    count = min(max(here.lengths[episode], there.lengths[episode]), round(render.VIDEO_SECONDS / env.control_dt))
     with renderer() as left, renderer() as right:
+        sides = (left, here), (right, there)
         frames = (
-            np.concatenate(
-                [
-                    side.draw(motion.qpos[min(k, end), episode])
-                    for side, motion, end in zip((left, right), (here, there), ends, strict=True)
-                ],
-                1,
-            )
+            np.concatenate([side.draw(m.qpos[min(k, m.lengths[episode]), episode]) for side, m in sides], 1)
             for k in range(0, count, stride)
         )
         print(render.save_video(path, frames, 1 / (stride * env.control_dt)))
 
 
-def panels(label: str, env: DiffEnv, motions: dict[str, Motion]) -> list[Panel]:
-    """Speed and penetration of the deepest foot against time, in the episode of median return here."""
-    episode, lines = median_episode(motions["here"]), (list[Line](), list[Line]())
-    own = np.any(feet(env.scene), 0)
-    for name, style in STYLES.items():
-        motion = motions[name]
-        end = min(int(motion.lengths[episode]), round(SHOWN / env.control_dt)) + 1
-        qpos, qvel = motion.qpos[:end, episode], motion.qvel[:end, episode]
-        depth, _ = worlds.contacts(env.scene, qpos, qvel)
-        seconds = env.control_dt * np.arange(end)
-        for side, y in zip(lines, (qvel[:, 0], 1e3 * depth[:, own].max(1).clip(0)), strict=True):
-            side.append(Line(seconds, y, style, name, 0.8))
-    return [
-        Panel(lines[0], label, "s", "forward velocity (m/s)"),
-        Panel(lines[1], label, "s", "deepest foot below ground (mm)", zero=True),
-    ]
-
-
 def main(args: Args) -> None:
     paths = args.measured
     if args.video:
-        if len(args.checkpoints) != 1:
-            fail("--video shows one checkpoint")
+        if len(paths) != 1 or 1.0 not in args.friction:
+            fail("--video shows one checkpoint, and MuJoCo at the file's friction (--friction 1)")
         try:
             render.check_video(args.video, (2 * render.VIDEO_SIZE[0], render.VIDEO_SIZE[1]))
             render.check_opengl()
         except (ValueError, RuntimeError) as error:
             fail(f"--video: {error}")
-    if (args.video or args.curves) and 1.0 not in args.friction:
-        fail("--video and --curves show MuJoCo at the file's friction: give --friction 1 as well")
-    grid = list[list[Panel]]()
     for case in [load(path, args) for path in paths]:
         print(f"{case.label}: {case.saved.args['env']}, {case.saved.script}.py", flush=True)
         motions = compare(case, args)
         if args.video:
             film(args.video, case.env, motions["here"], motions["MuJoCo x1"])
-        if args.curves and "contact" in case.env.scene.features:
-            grid.append(panels(case.label, case.env, motions))
-    if grid:
-        plot(args.picture("transfer"), grid, (5.0, 2.9))
-    args.publish("transfer", table(args.read("transfer")), "transfer.md")
+    args.publish("transfer", markdown(table(args.read("transfer"))), "transfer.md")
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

@@ -24,20 +24,19 @@ import warp as wp
 from diffsim import TASKS, load_scene, startup
 from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
-from diffsim.training.errors import command
+from diffsim.training import command, evaluate, export_policy, fail, load_policy, make_policy_env
 from diffsim.view import render
 
 POLICIES = files("diffsim") / "policies"
-DEMO_EPISODES = 8  # of which the one of median return is filmed
+DEMO_EPISODES = 8  # the one of median return is filmed
 DEMO_SECONDS = 4.0  # of it
 
 
 @command
 def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
-    parser = argparse.ArgumentParser(
-        prog="python -m diffsim", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="python -m diffsim", description=__doc__, formatter_class=raw)
     commands = parser.add_subparsers(dest="command", metavar="{demo,check,export}")
     film = commands.add_parser("demo", help="film a policy that comes with the package")
     film.add_argument("task", nargs="?", default="ant", help="which task (default: ant)")
@@ -48,48 +47,45 @@ def main(argv: Sequence[str] | None = None) -> None:
     copy.add_argument("checkpoint", type=Path)
     copy.add_argument("output", type=Path)
     args = parser.parse_args(argv)
-    if args.command == "demo":
-        demo(args.task, args.output)
-    elif args.command == "check":
-        text, fits = report_robot(args.robot)
-        print(text)
-        sys.exit(0 if fits else 1)
-    elif args.command == "export":
-        export(args.checkpoint, args.output)
-    else:
-        print(report())
+    try:
+        if args.command == "demo":
+            demo(args.task, args.output)
+        elif args.command == "check":
+            text, fits = report_robot(args.robot)
+            print(text)
+            sys.exit(0 if fits else 1)
+        elif args.command == "export":
+            export(args.checkpoint, args.output)
+        else:
+            print(report())
+        sys.stdout.flush()
+    except BrokenPipeError:  # head, for one, has read enough; Python would complain once more when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, RuntimeError, ValueError) as error:
+        fail(error)
 
 
 def demo(task: str, output: Path) -> None:
     """Film the task's policy; the kernel of the gradient is not compiled, for nothing is differentiated."""
-    from diffsim.training import evaluate, fail, load_policy, make_policy_env
-
     if task not in TASKS:
         fail(f"unknown task {task!r}: choose from {', '.join(TASKS)}")
     policy = POLICIES / f"{task}.pt"
     if not policy.is_file():
         there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
         fail(f"no policy of {task} comes with this version; there are: {', '.join(there) or 'none'}")
-    try:
-        render.check_video(output)
-        render.check_opengl()
-        torch.set_num_threads(1)
-        saved = load_policy(Path(str(policy)))
-        evaluation = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
-        print(f"{task}, {saved.script}.py, iteration {saved.iteration}, {DEMO_EPISODES} episodes: {evaluation}")
-        print(f"video: {evaluation.save_video(output, DEMO_SECONDS)}")
-    except (OSError, RuntimeError, ValueError) as error:
-        fail(error)
+    render.check_video(output)
+    render.check_opengl()
+    torch.set_num_threads(1)
+    saved = load_policy(Path(str(policy)))
+    evaluation = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
+    print(f"{task}, {saved.script}.py, iteration {saved.iteration}, {DEMO_EPISODES} episodes: {evaluation}")
+    print(f"video: {evaluation.save_video(output, DEMO_SECONDS)}")
 
 
 def export(checkpoint: Path, output: Path) -> None:
-    from diffsim.training import export_policy, fail, load_policy
-
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        export_policy(checkpoint, output)
-    except (OSError, RuntimeError) as error:
-        fail(error)
+    """Write the policy of a checkpoint alone; an existing file is replaced, anything else is refused."""
+    with render.whole_file(output) as part:
+        export_policy(checkpoint, part)
     saved = load_policy(output)
     size = output.stat().st_size / 1e3
     print(f"{output}: {saved.args['env']}, {saved.script}.py, iteration {saved.iteration}, {size:.0f} kB")
@@ -100,11 +96,9 @@ def export(checkpoint: Path, output: Path) -> None:
 
 def report() -> str:
     """All that a question about an installation needs, in some twenty lines."""
-    blocks = ["\n".join(describe_tasks()), "\n".join(f"{name:<10} {text}" for name, text in describe_machine().items())]
-    hints = find_troubles()
-    if hints:
-        blocks.append("\n".join(f"! {hint}" for hint in hints))
-    return "\n\n".join(blocks)
+    machine = [f"{name:<10} {text}" for name, text in describe_machine().items()]
+    blocks = describe_tasks(), machine, [f"! {hint}" for hint in find_troubles()]
+    return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
 def describe_tasks() -> list[str]:
@@ -124,7 +118,7 @@ def describe_machine() -> dict[str, str]:
         devices.append(f"cuda:{k}, {properties.name}, {properties.total_memory / 2**30:.0f} GiB")
     packages = ("torch", "warp-lang", "mujoco", "gymnasium", "numpy")
     try:
-        drawing = render.opengl_name()
+        drawing = render.check_opengl()
     except RuntimeError:
         drawing = "none"
     return {

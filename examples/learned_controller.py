@@ -27,8 +27,9 @@ def drive(sim: diffsim.Simulator, network: nn.Module, goal: Tensor) -> tuple[Ten
         x, angle = qpos.split(1, dim=1)
         ctrl = network(torch.cat((x - goal, angle.sin(), angle.cos() - 1, qvel), dim=1))
         qpos, qvel = sim.step(qpos, qvel, ctrl.tanh())
-        path.append((qpos, qvel))
-    return torch.stack([q for q, _ in path]), torch.stack([v for _, v in path])
+        path.append(torch.stack((qpos, qvel)))
+    qpos, qvel = torch.stack(path, dim=1)
+    return qpos, qvel
 
 
 def train(num_envs: int = 32, iterations: int = 150, seed: int = 0) -> list[float]:
@@ -51,10 +52,8 @@ def train(num_envs: int = 32, iterations: int = 150, seed: int = 0) -> list[floa
         adam.step()
         distances.append((x[-1] - goal[:, 0]).abs().mean().item())
         if iteration % 15 == 0:
-            print(
-                f"iteration {iteration}: loss {loss:.3f}, {distances[-1]:.3f} m from the goal, "
-                f"{(angle[-1].cos() < 0.9).float().mean():.0%} of the poles have fallen"
-            )
+            fallen = (angle[-1].cos() < 0.9).float().mean()
+            print(f"iteration {iteration}: {distances[-1]:.3f} m from the goal, {fallen:.0%} of the poles have fallen")
     print(f"after {iterations} iterations: {distances[-1]:.3f} m from the goal")
     return distances
 

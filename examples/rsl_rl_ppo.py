@@ -45,9 +45,7 @@ class RslRlVecEnv(VecEnv):
         return self.get_observations(), reward, terminated | truncated, {"time_outs": truncated}
 
 
-def train(
-    task: str = "ant", num_envs: int = 64, iterations: int = 1000, device: str = "cpu", seed: int = 1
-) -> OnPolicyRunner:
+def train(task: str = "ant", num_envs: int = 64, iterations: int = 1000, device: str = "cpu", seed: int = 1) -> Any:
     """Train a policy; prints its progress and writes it, with checkpoints, to runs/."""
     torch.set_num_threads(1)  # networks this small gain nothing from more, and idle threads disturb the simulator's
     torch.manual_seed(seed)

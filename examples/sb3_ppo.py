@@ -54,15 +54,12 @@ class DiffVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         return [getattr(self.env.unwrapped, attr_name)] * len([*self._get_indices(indices)])
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise NotImplementedError("the environments are one batch: set attributes of env")
+    def set_attr(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError("the environments are one batch: use env itself")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise NotImplementedError("the environments are one batch: call methods of env")
+    env_method = set_attr
 
-    def env_is_wrapped(
-        self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
-    ) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         return [False] * len([*self._get_indices(indices)])
 
 

@@ -48,12 +48,7 @@ def train(env_id: str = "diffsim/Ant-numpy-v0", num_envs: int = 64, timesteps: i
             "value_preprocessor_kwargs": {"size": 1},
             "experiment": {"directory": "runs", "experiment_name": "", "write_interval": "auto"},
         },
-        "trainer": {
-            "class": "SequentialTrainer",
-            "timesteps": timesteps,
-            "headless": True,
-            "close_environment_at_exit": True,
-        },
+        "trainer": {"class": "SequentialTrainer", "timesteps": timesteps, "headless": True},
     }
     runner = Runner(env, config)
     runner.run("train")

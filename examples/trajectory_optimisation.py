@@ -25,8 +25,9 @@ def simulate(sim: diffsim.Simulator, ctrl: Tensor) -> tuple[Tensor, Tensor]:
     path = []
     for u in ctrl.tanh():  # between -1 and 1
         qpos, qvel = sim.step(qpos, qvel, u)
-        path.append((qpos, qvel))
-    return torch.stack([q for q, _ in path]), torch.stack([v for _, v in path])
+        path.append(torch.stack((qpos, qvel)))
+    qpos, qvel = torch.stack(path, dim=1)
+    return qpos, qvel
 
 
 def cost(qpos: Tensor, qvel: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ README = ROOT / "README.md"
 LOG = ROOT / "results" / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", LOG, *sorted((ROOT / "docs").glob("*.md"))]
 # Tables of these pages use the column names of the csv file that the text below them names.
-LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo", "sac", "mbpo", "humanoid_mtu", "experiments")
+LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo", "sac", "mbpo", "pfpn", "humanoid_mtu", "experiments")
 CHECKED = [README, *(ROOT / "docs" / f"{name}.md" for name in (*LEARNERS, "robustness"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -33,6 +34,13 @@ def named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def trained(tiny_run: Path) -> Path:
     return tiny_run / "checkpoint.pt"
+
+
+def opengl() -> None:
+    try:
+        render.check_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
 
 
 # The report -----------------------------------------------------------------------------------------------------------
@@ -76,10 +84,7 @@ def test_troubles_come_with_their_remedy(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_demonstration_of_an_exported_policy(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    try:
-        render.check_opengl()
-    except RuntimeError as error:
-        pytest.skip(str(error))
+    opengl()
     policy, video = tmp_path / "policies" / "cartpole.pt", tmp_path / "new" / "demo.mp4"
     monkeypatch.setattr(command, "POLICIES", policy.parent)
     command.main(["export", str(trained), str(policy)])
@@ -106,6 +111,8 @@ def test_an_export_is_the_policy_alone(trained: Path, tmp_path: Path) -> None:
         ("demo hopper", "no policy of hopper comes with this version; there are: none"),
         ("export {tmp}/nothing.pt {tmp}/new/out.pt", "no such checkpoint: {tmp}/nothing.pt"),
         ("export {trained} {trained}/out.pt", "File exists"),
+        ("export {trained} /dev/null", "cannot write /dev/null: it is no regular file"),
+        ("export {trained} {tmp}", "cannot write {tmp}: it is no regular file"),
     ],
 )
 def test_mistakes_are_one_line(
@@ -122,6 +129,29 @@ def test_mistakes_are_one_line(
     error = capsys.readouterr().err
     assert exit.value.code == 2 and error.startswith("diffsim: ") and error.count("\n") == 1
     assert message.format(tmp=tmp_path) in error
+
+
+def test_a_full_disk_leaves_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    opengl()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, hard))
+        with pytest.raises(SystemExit) as exit:
+            command.main(["demo", "cartpole", "--output", str(tmp_path / "demo.mp4")])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    error = capsys.readouterr().err
+    assert exit.value.code == 2 and error.startswith(f"diffsim: cannot write {tmp_path}/demo.mp4: ffmpeg fails")
+    assert error.count("\n") == 1 and not [*tmp_path.iterdir()]
+
+
+def test_a_closed_pipe_is_no_error() -> None:
+    """As of `python -m diffsim | head -3`."""
+    command = [sys.executable, "-m", "diffsim"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | PATH) as process:
+        assert process.stdout and process.stderr
+        process.stdout.close()
+        assert process.stderr.read() == b"" and process.wait() == 0
 
 
 def test_a_policy_alone_cannot_be_resumed(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -176,8 +206,9 @@ import signal, sys, threading
 before = sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT)
 import diffsim, diffsim.training
 assert before == (sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT))
+assert "diffsim.view.gait" not in sys.modules  # no training needs it
 """
-    subprocess.run([sys.executable, "-c", program], check=True)
+    subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | PATH)
 
 
 def test_a_full_kernel_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -271,46 +271,6 @@ def test_modes_of_rendering() -> None:
         diffsim.make("hopper").render()
 
 
-def test_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("glfw.init", lambda: False)
-    with pytest.raises(RuntimeError, match="there is no display; take 'rgb_array'"):
-        gymnasium.make(HOPPER, render_mode="human").reset()
-
-
-def test_the_window_follows_the_first_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = []
-
-    class Window:
-        def __init__(self, model: Any, data: Any, **_: Any) -> None:
-            self.data, self.cam, self.closed = data, type("Camera", (), {})(), False
-
-        def __enter__(self) -> None: ...
-
-        def __exit__(self, *_: Any) -> None: ...
-
-        def lock(self) -> Window:
-            return self
-
-        def sync(self) -> None:
-            shown.append(self.data.qpos.copy())
-
-        def close(self) -> None:
-            self.closed = True
-
-    monkeypatch.setattr("glfw.init", lambda: True)
-    monkeypatch.setattr("mujoco.viewer.launch_passive", Window)
-    env = gymnasium.make_vec(HOPPERS, num_envs=2, render_mode="human")
-    assert not shown
-    env.reset(seed=0)
-    for _ in range(3):
-        env.step(np.zeros((2, 3)))
-    assert len(shown) == 4 and env.render() is None
-    np.testing.assert_allclose(shown[3], env.env.qpos[0])
-    window = env.env._screen._window
-    env.close()
-    assert window.closed
-
-
 def test_record_video(tmp_path: Any) -> None:
     pytest.importorskip("moviepy")
     env = wrappers.RecordVideo(gymnasium.make(HOPPER, render_mode="rgb_array", max_episode_steps=3), str(tmp_path))

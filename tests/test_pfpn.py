@@ -58,19 +58,19 @@ def test_draws_follow_the_density(estimator: pfpn.Estimator) -> None:
     """Kolmogorov and Smirnov's distance of 100,000 draws of each action, which do not depend on each other."""
     logits, loc, log_std = parameters()
     mixture = pfpn.Mixture(logits.expand(100_000, M, N), loc, log_std, False)
-    u = mixture.rsample(estimator)[0].detach().sort(0).values
+    u = pfpn.sample(mixture, estimator)[0].detach().sort(0).values
     z = (u.unsqueeze(-1) - loc) / log_std.exp()
     cumulative = (logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
     rank = (torch.arange(100_000) / 100_000).unsqueeze(-1)
     assert (cumulative - rank).abs().max() < 0.006
-    shuffled = mixture.sample() - u.mean(0)
+    shuffled = pfpn.sample(mixture)[0] - u.mean(0)
     assert (torch.corrcoef(shuffled.T) - torch.eye(M)).abs().max() < 0.02
 
 
 def test_bins_count_as_the_nearest() -> None:
     logits = parameters(BATCH)[0][:, :1]
     bins = pfpn.Bins(logits, torch.linspace(-1, 1, N).expand(1, N), torch.full((1, N), -math.inf), False)
-    u = bins.sample()
+    u, _ = pfpn.sample(bins)
     index = ((u + 1) / 2 * (N - 1)).round().long()
     torch.testing.assert_close(u, -1 + 2 * index.double() / (N - 1))
     expected = logits.log_softmax(-1).squeeze(1).gather(1, index).squeeze(1)
@@ -93,7 +93,7 @@ def test_implicit_gradient_keeps_the_cumulative_probability() -> None:
     """By definition; so it is that of the quantile, and unbiased. dF/du is the density, so the rest is determined."""
     inputs = parameters()
     torch.manual_seed(3)
-    u, _ = pfpn.Mixture(*inputs, True).rsample("implicit")
+    u, _ = pfpn.sample(pfpn.Mixture(*inputs, True), "implicit")
     logits, loc, log_std = inputs
     cumulative = (logits.softmax(-1) * torch.special.ndtr((u.unsqueeze(-1) - loc) / log_std.exp())).sum()
     for total, own in zip(torch.autograd.grad(cumulative, inputs, retain_graph=True), inputs, strict=True):
@@ -106,7 +106,7 @@ def test_straight_through_gradient() -> None:
     inputs = parameters()
     mixture = pfpn.Mixture(*inputs, True)
     torch.manual_seed(5)
-    u, _ = mixture.rsample("straight-through")
+    u, _ = pfpn.sample(mixture, "straight-through")
     torch.manual_seed(5)
     noise = torch.randn(M, dtype=torch.float64).unsqueeze(-1)
     scores = inputs[0].log_softmax(-1) - torch.empty(M, N, dtype=torch.float64).exponential_().log()
@@ -130,14 +130,14 @@ def test_straight_through_weights_are_biased() -> None:
     loc = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
     torch.manual_seed(0)
     mixture = pfpn.Mixture(logits, loc, torch.full_like(loc, -20), False)
-    u, _ = mixture.rsample("straight-through")
+    u, _ = pfpn.sample(mixture, "straight-through")
     (gradient,) = torch.autograd.grad(u.square().sum(), logits)
     y = torch.linspace(-40, 40, 400_001, dtype=torch.float64)
     both = y.sigmoid() * (-y).sigmoid()  # x1 x2 where the logistic noise puts their log odds at y
     expected = 4 * torch.trapezoid(both * y.sign() * (y - log_odds).sigmoid() * (log_odds - y).sigmoid(), y).item()
     mean, error = gradient[:, 0, 1].mean().item(), gradient[:, 0, 1].std().item() / math.sqrt(count)
     assert abs(mean - expected) < 4 * error and expected > 50 * error
-    u, chosen = mixture.rsample("mixed")  # which adds the score function
+    u, chosen = pfpn.sample(mixture, "mixed")  # which adds the score function
     (score,) = torch.autograd.grad((u.square().sum(-1).detach() * chosen).sum(), logits)
     assert abs(score[:, 0, 1].mean().item()) < 4 * score[:, 0, 1].std().item() / math.sqrt(count)
 
@@ -148,19 +148,19 @@ def test_the_density_floor_bounds_the_implicit_gradient() -> None:
     u, slopes = torch.zeros(1, dtype=torch.float64), []
     for floor in (0.0, 0.01):
         mixture = pfpn.Mixture(logits, torch.tensor([[-1.0, 1.0]]), torch.full((1, 2), -2.0), True)
-        slopes += torch.autograd.grad(torch.tanh(mixture.attach(u, floor)), logits)
+        slopes += torch.autograd.grad(torch.tanh(pfpn.implicit(mixture, u, floor)), logits)
     assert slopes[0].abs().max() > 1e6 and slopes[1].abs().max() == pytest.approx(0.25 / 0.01, rel=1e-3)
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
 
 
-def head(*arguments: str) -> tuple[pfpn.Particles, pfpn.Resampling, ClippedAdam, Tensor]:
+def head(*arguments: str) -> tuple[pfpn.Head, pfpn.Resampling, ClippedAdam, Tensor]:
     """A policy head in float64, its resampling, an optimizer that has moments, and features of states."""
     flags = "--env ant --device cpu --particles 6 --resampling-interval 1 --resampling-noise 0"
     args = parse(pfpn.Args, [*flags.split(), *arguments])
     torch.manual_seed(0)
-    own = pfpn.Particles(args, 4, M).double()
+    own = pfpn.Head(args, 4, M).double()
     with torch.no_grad():
         for parameter in own.parameters():
             parameter += 0.3 * torch.randn_like(parameter)
@@ -171,7 +171,7 @@ def head(*arguments: str) -> tuple[pfpn.Particles, pfpn.Resampling, ClippedAdam,
     return own, resampling, optimizer, features
 
 
-def kill(own: pfpn.Particles, places: list[tuple[int, int]], bias: float = -1e4) -> None:
+def kill(own: pfpn.Head, places: list[tuple[int, int]], bias: float = -1e4) -> None:
     for k, i in places:
         own.linear.weight.data.view(M, 6, 4)[k, i] = 0
         own.linear.bias.data.view(M, 6)[k, i] = bias
@@ -283,7 +283,6 @@ class Problem:
     device, episode_length = torch.device("cpu"), 10**9
     scene = SimpleNamespace(nu=1)
     task = SimpleNamespace(obs_dim=1)
-    sim = SimpleNamespace(nonfinite_gradients=torch.zeros(1))
 
     def __init__(self, num_envs: int, reward: Callable[[Tensor, Tensor], Tensor], steps: int = 1) -> None:
         self.num_envs, self.reward, self.steps, self.t = num_envs, reward, steps, 0
@@ -298,8 +297,7 @@ class Problem:
         reward, self.x = self.reward(self.x, action).squeeze(1), action
         no = torch.zeros(self.num_envs, dtype=torch.bool)
         terminated = ~no if self.t % self.steps == 0 else no
-        info = {"final_obs": action, "nonfinite": no, "episode": {"r": reward.detach(), "l": reward.detach()}}
-        return self.x, reward, terminated, no, info
+        return self.x, reward, terminated, no, {"final_obs": action}
 
 
 def build(flags: str, reward: Callable[[Tensor, Tensor], Tensor], envs: int = 256, steps: int = 1) -> Any:
@@ -311,8 +309,7 @@ def build(flags: str, reward: Callable[[Tensor, Tensor], Tensor], envs: int = 25
 
 def solve(learner: Any, iterations: int) -> Any:
     for iteration in range(1, iterations + 1):
-        if isinstance(learner, pfpn.SHAC):
-            learner.schedule(iteration)
+        learner.schedule(iteration)
         learner.interact()
         learner.learn()
     return learner
@@ -328,7 +325,7 @@ def distance(action: Tensor) -> Tensor:
 def masses(actor: pfpn.Actor) -> tuple[float, float]:
     """The shares of actions within 0.15 of each peak."""
     mixture = actor(torch.zeros(20_000, 1))
-    action = mixture.action(mixture.sample())
+    action = mixture.action(pfpn.sample(mixture)[0])
     left, right = (((action - peak).abs() < 0.15).double().mean().item() for peak in PEAKS)
     return left, right
 
@@ -390,7 +387,7 @@ def test_gradient_of_a_window_is_that_of_the_expectation(estimator: str) -> None
         for parameter in learner.target.parameters():
             parameter.zero_()
     parameters = dict(learner.actor.named_parameters())
-    window, others = pfpn.collect(learner.env, 2, learner.act)
+    window, others = learner.collect()
     estimate = torch.autograd.grad(learner.loss(window, *others), list(parameters.values()))
 
     u, du = torch.linspace(-6, 6, 801), 12 / 800
@@ -430,14 +427,22 @@ def test_sac_target_counts_the_entropy_of_what_follows() -> None:
     batch = Transition(obs, torch.rand(32, 1), torch.randn(32), next_obs, (torch.rand(32) < 0.3).float())
     state = torch.get_rng_state()
     mixture = learner.actor(next_obs)
-    u = mixture.sample()
-    values = torch.stack([learner.targets[k](torch.cat((next_obs, torch.tanh(u)), 1)).squeeze(1) for k in range(2)])
-    own = torch.stack([learner.critics[k](torch.cat((obs, batch.action), 1)).squeeze(1) for k in range(2)])
+    u, _ = pfpn.sample(mixture)
+    values = torch.stack([learner.target[k](torch.cat((next_obs, torch.tanh(u)), 1)).squeeze(1) for k in range(2)])
+    own = torch.stack([learner.critic[k](torch.cat((obs, batch.action), 1)).squeeze(1) for k in range(2)])
     following = values.amin(0) - math.exp(-1) * mixture.log_prob(u)
     target = batch.reward + 0.99 * (1 - batch.terminated) * following
     torch.set_rng_state(state)
     loss = learner.update_critics(batch, obs, next_obs)["losses/critic"]
     torch.testing.assert_close(loss, (own - target).square().mean().detach())
+
+
+def test_skipped_updates_are_those_of_all_optimizers() -> None:
+    flags = "--algorithm sac --num-envs 8 --critic-hidden 4 --minibatch-size 8 --buffer-size 64"
+    learner = build(flags, lambda _, action: action, 8, steps=3)
+    learner.temperature_optimizer.skip_norm = 0.0
+    learner.interact()
+    assert learner.learn()["grad/skipped"] == 3
 
 
 def test_locations_beyond_the_bounds_are_drawn_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -532,12 +537,14 @@ def test_settings_are_those_of_the_other_scripts(algorithm: str, script: ModuleT
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--particles 1", "--particles 1: --policy pfpn needs at least 2"),
+        ("--particles 1", "--particles must be from 2 to 1,000 with --policy pfpn, not 1"),
+        ("--particles 100000 --policy gmm", "--particles must be from 2 to 1,000 with --policy gmm, not 100000"),
+        (f"--hidden {2**62}", f"--hidden must be from 1 to 65,536, not {2**62}"),
         ("--dead 1", "--dead 1: with equal weights all particles would be dead"),
         ("--policy discrete --algorithm sac", "--policy discrete has no density"),
         ("--policy discrete --algorithm shac --estimator implicit", "choose --estimator straight-through or mixed"),
         ("--algorithm sac --estimator mixed", "--estimator mixed needs the rewards of a window"),
-        ("--algorithm sac --buffer-size 10", "--buffer-size 10 holds no window of 32 steps of 128"),
+        ("--algorithm sac --buffer-size 10", "--buffer-size 10 holds no window of 4096 steps"),
         ("--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),
     ],
 )

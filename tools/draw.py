@@ -12,22 +12,18 @@ loop. The gait is that of the first of a few random episodes that lasts long eno
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import imageio.v3 as imageio
 import numpy as np
 import torch
 import tyro
 from PIL import Image
-from torch import Tensor
+from tyro.conf import Positional
 
-import diffsim
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
-from diffsim.training import Count, NonNegative, Positive, evaluate, fail, load_policy, make_policy_env, parse_penalty
+from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import travels
-from diffsim.training.ranges import check_ranges
 from diffsim.view.render import VIDEO_FPS, Frame, render_frames
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
@@ -43,82 +39,89 @@ CLOSER = {
 COLOURS = 128
 
 
-@dataclass
-class Loops:
-    """A gif of each trained policy that comes with the package."""
+def loops(
+    tasks: tuple[str, ...] = tuple(CLOSER),
+    size: tuple[int, int] = (320, 240),
+    every: int = 3,
+    start: float = 2.0,
+    seconds: tuple[float, float] = (2.0, 3.0),
+) -> None:
+    """A gif of each trained policy that comes with the package.
 
-    tasks: tuple[str, ...] = tuple(CLOSER)
-    """of these tasks"""
-    size: tuple[int, int] = (320, 240)
-    """width and height in pixels"""
-    every: Count = 3
-    """control steps between frames"""
-    start: NonNegative = 2.0
-    """seconds into the episode before which no loop begins; a cart-pole is shown from its start"""
-    seconds: tuple[float, float] = (2.0, 3.0)
-    """of a loop, at least and at most; a cart-pole, which does not travel, is shown for 3.5 s"""
+    Args:
+        tasks: which ones.
+        size: width and height in pixels.
+        every: control steps between frames.
+        start: seconds into the episode before which no loop begins; a cart-pole is shown from its start.
+        seconds: least and most of a loop; a cart-pole, which does not travel, is shown for 3.5 s.
+    """
+    for task in tasks:
+        saved = load_policy(Path(str(POLICIES / f"{task}.pt")))
+        episodes = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
+        qpos, action = (rows[::every] for rows in episodes.median_episode())
+        (zoom, middle), (width, height) = CLOSER[task], size
+        wide, high = round(2 * zoom * width), round(2 * zoom * height)
+        left, top = wide // 2 - width, round(middle * high) - height
+        shown = slice(top, top + 2 * height), slice(left, left + 2 * width)
+        frames = [halve(frame[shown]) for frame in render_frames(episodes.scene, qpos, wide, high, ctrl=action)]
+        fps = 1 / (every * episodes.control_dt)
+        first, last = 0, round(3.5 * fps)
+        if travels(episodes.scene):
+            first, last = find_loop(frames, round(start * fps), *(round(length * fps) for length in seconds))
+        write_gif(FIGURES / f"{task}.gif", frames[first:last], fps)
 
 
-@dataclass
-class Gait:
-    """Frames of a policy at work."""
-
-    checkpoint: Annotated[Path, tyro.conf.Positional]
-    """of any script"""
-    start: NonNegative = 2.0
-    """seconds into the episode of the first frame"""
-    every: Positive = 0.1
-    """seconds between frames"""
-    frames: Count = 8
-    """number of frames"""
-    size: Count = 240
-    """width and height of a frame in pixels"""
+def find_loop(frames: Sequence[Frame], start: int, shortest: int, longest: int) -> tuple[int, int]:
+    """The range of frames whose end resembles its begin most: gait and floor, of which 8 x 8 pixels are compared."""
+    small = np.array([frame[::8, ::8] for frame in frames], dtype=np.float32)
+    lengths = range(shortest, longest + 1)
+    ranges = [(first, first + length) for length in lengths for first in range(start, len(frames) - length)]
+    return min(ranges, key=lambda ends: np.abs(small[ends[1]] - small[ends[0]]).mean())
 
 
-@dataclass
-class Stack:
-    """A gif of videos, below each other and half as large."""
+def gait(
+    checkpoint: Positional[Path], start: float = 2.0, every: float = 0.1, frames: int = 8, size: int = 240
+) -> None:
+    """Frames of a policy at work, beside each other.
 
-    videos: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """of one width, 30 frames/s and true speed"""
-    start: NonNegative = 2.0
-    """seconds into the videos at which the gif begins"""
-    seconds: Positive = 3.0
-    """of the gif"""
-    every: Count = 3
-    """frames of the videos between its frames"""
+    Args:
+        checkpoint: the policy's, of any script.
+        start: seconds into the episode of the first frame.
+        every: seconds between frames.
+        frames: how many.
+        size: width and height of a frame in pixels.
+    """
+    saved = load_policy(checkpoint)
+    episodes = evaluate(make_policy_env(saved, 16), saved.network)
+    wanted = [round((start + k * every) / episodes.control_dt) for k in range(frames)]
+    lasting = episodes.lengths > wanted[-1]
+    if not lasting.any():
+        fail(f"none of {len(lasting)} episodes lasts {start + (frames - 1) * every:.2f} s")
+    qpos, action = (rows[wanted] for rows in episodes.episode(int(lasting.int().argmax())))
+    path = FIGURES / f"{saved.args['env']}_gait.png"
+    pictures = render_frames(episodes.scene, qpos, 2 * size, 2 * size, ctrl=action)
+    imageio.imwrite(path, halve(np.concatenate(pictures, axis=1)))
+    print(path)
+
+
+def stack(videos: Positional[tuple[Path, ...]], start: float = 2.0, seconds: float = 3.0, every: int = 3) -> None:
+    """A gif of videos, below each other and half as large.
+
+    Args:
+        videos: of one width, 30 frames/s and true speed.
+        start: seconds into the videos at which the gif begins.
+        seconds: length of the gif.
+        every: frames of the videos between its frames.
+    """
+    chosen = slice(round(start * VIDEO_FPS), round((start + seconds) * VIDEO_FPS), every)
+    columns = zip(*([halve(frame) for frame in imageio.imread(path)[chosen]] for path in videos), strict=True)
+    write_gif(FIGURES / "transfer.gif", [np.concatenate(frames) for frames in columns], VIDEO_FPS / every)
 
 
 def halve(frame: Frame) -> Frame:
     """2 x 2 pixels into one: smooth edges."""
     height, width = frame.shape[0] // 2, frame.shape[1] // 2
     return frame.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).round().astype(np.uint8)
-
-
-def draw_loop(task: str, args: Loops) -> None:
-    saved = load_policy(Path(str(POLICIES / f"{task}.pt")))
-    episodes = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
-    qpos, action = (rows[:: args.every] for rows in episodes.median_episode())
-    (zoom, middle), (width, height) = CLOSER[task], args.size
-    wide, high = round(2 * zoom * width), round(2 * zoom * height)
-    left, top = wide // 2 - width, round(middle * high) - height
-    shown = slice(top, top + 2 * height), slice(left, left + 2 * width)
-    frames = [halve(frame[shown]) for frame in render_frames(episodes.scene, qpos, wide, high, ctrl=action)]
-    fps = 1 / (args.every * episodes.control_dt)
-    first, last = find_loop(frames, fps, args) if travels(episodes.scene) else (0, round(3.5 * fps))
-    write_gif(FIGURES / f"{task}.gif", frames[first:last], fps)
-
-
-def find_loop(frames: Sequence[Frame], fps: float, args: Loops) -> tuple[int, int]:
-    """The range of frames whose end resembles its begin most: gait and floor, of which 8 x 8 pixels are compared."""
-    small = np.array([frame[::8, ::8] for frame in frames], dtype=np.float32)
-    shortest, longest = (round(seconds * fps) for seconds in args.seconds)
-    ranges = [
-        (first, first + length)
-        for length in range(shortest, longest + 1)
-        for first in range(round(args.start * fps), len(frames) - length)
-    ]
-    return min(ranges, key=lambda ends: np.abs(small[ends[1]] - small[ends[0]]).mean())
 
 
 def write_gif(path: Path, frames: Sequence[Frame], fps: float) -> None:
@@ -129,48 +132,11 @@ def write_gif(path: Path, frames: Sequence[Frame], fps: float) -> None:
     print(f"{path}, {len(frames) / fps:.2f} s, {path.stat().st_size / 1000:.0f} kB")
 
 
-@torch.no_grad()
-def draw_gait(args: Gait) -> None:
-    saved, actions = load_policy(args.checkpoint), list[Tensor]()
-    trained = saved.args
-    how = {name: trained[name] for name in ("substeps", "integrator", "theta")}
-    env = diffsim.make(trained["env"], 16, horizon=1, penalty=parse_penalty(trained["penalty"]), **how)
-
-    def act(obs: Tensor) -> Tensor:
-        actions.append(saved.network(obs))
-        return actions[-1]
-
-    episodes = evaluate(env, act)
-    wanted = [round((args.start + k * args.every) / env.control_dt) for k in range(args.frames)]
-    lasting = episodes.lengths > wanted[-1]
-    if not lasting.any():
-        fail(f"none of {env.num_envs} episodes lasts {args.start + (args.frames - 1) * args.every:.2f} s")
-    first = int(lasting.int().argmax())
-    qpos, ctrl = episodes.qpos[wanted, first].numpy(), torch.stack(actions)[wanted, first].numpy()
-    frames = render_frames(env.scene, qpos, 2 * args.size, 2 * args.size, ctrl=ctrl)
-    path = FIGURES / f"{env.task.name}_gait.png"
-    imageio.imwrite(path, halve(np.concatenate(frames, axis=1)))
-    print(path)
-
-
-def stack(args: Stack) -> None:
-    chosen = slice(round(args.start * VIDEO_FPS), round((args.start + args.seconds) * VIDEO_FPS), args.every)
-    videos = [[halve(frame) for frame in imageio.imread(path)[chosen]] for path in args.videos]
-    write_gif(
-        FIGURES / "transfer.gif",
-        [np.concatenate(frames) for frames in zip(*videos, strict=True)],
-        VIDEO_FPS / args.every,
-    )
+@command
+def main() -> None:
+    torch.set_num_threads(1)
+    tyro.extras.subcommand_cli_from_dict({"loops": loops, "gait": gait, "stack": stack}, description=__doc__)
 
 
 if __name__ == "__main__":
-    args = tyro.cli(Loops | Gait | Stack, description=__doc__)
-    check_ranges(args)
-    torch.set_num_threads(1)
-    if isinstance(args, Gait):
-        draw_gait(args)
-    elif isinstance(args, Stack):
-        stack(args)
-    else:
-        for task in args.tasks:
-            draw_loop(task, args)
+    main()

@@ -6,32 +6,20 @@ python tools/record.py runs/<run>/checkpoint.pt walk.npz --seconds 2
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
 import tyro
 from torch import Tensor
+from tyro.conf import Positional
 
 from diffsim.tasks.imitation.clip import Clip, tangent
-from diffsim.training import evaluate, fail, load_policy, make_policy_env
+from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.view.render import whole_file
 
 SETTLING = 3.0  # s at the start of the episode that are left out
 SHORTEST = 0.3  # s
-
-
-@dataclass
-class Args:
-    policy: Annotated[Path, tyro.conf.Positional]
-    """checkpoint of any script, of a robot with a free root and hinges"""
-    output: Annotated[Path, tyro.conf.Positional]
-    """the .npz file"""
-    seconds: float = 1.0
-    """the longest cycle"""
-    episodes: int = 8
-    """of as many episodes, the one of median return"""
 
 
 def cycle(qpos: Tensor, shortest: int, longest: int) -> tuple[Tensor, float]:
@@ -57,26 +45,35 @@ def close(qpos: Tensor) -> Tensor:
     return closed
 
 
-def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
+def record(policy: Positional[Path], output: Positional[Path], seconds: float = 1.0, episodes: int = 8) -> None:
+    """Write a clip of the episode of median return.
+
+    Args:
+        policy: checkpoint of any script, of a robot with a free root and hinges.
+        output: the .npz file.
+        seconds: the longest cycle.
+        episodes: how many there are.
+    """
     torch.set_num_threads(1)
-    saved = load_policy(args.policy)
-    env = make_policy_env(saved, args.episodes)
+    saved = load_policy(policy)
+    env = make_policy_env(saved, episodes)
     seen = evaluate(env, saved.network)
-    motion = torch.tensor(seen.median_episode(env.episode_length * env.control_dt)[0], dtype=torch.float64)
-    first, shortest, longest = (round(t / env.control_dt) for t in (SETTLING, SHORTEST, args.seconds))
+    motion = torch.tensor(seen.episode(seen.median)[0], dtype=torch.float64)
+    first, shortest, longest = (round(t / env.control_dt) for t in (SETTLING, SHORTEST, seconds))
     if len(motion) < first + 2 * longest:
-        fail(f"the episode lasts {len(motion) * env.control_dt:.1f} s, too short for cycles of {args.seconds} s")
+        fail(f"the episode lasts {len(motion) * env.control_dt:.1f} s, too short for cycles of {seconds} s")
     qpos, seam = cycle(motion[first:], shortest, longest)
-    clip = Clip(args.output.stem, close(qpos), loop=True)
+    clip = Clip(output.stem, close(qpos), loop=True)
     clip.check(env.scene.mj_model)
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(args.output, qpos=clip.qpos.numpy().astype(np.float32), fps=round(1 / env.control_dt))
-    speed = clip.advance[0].item() / (len(clip) * env.control_dt)
-    size = args.output.stat().st_size / 1e3
-    print(
-        f"{args.output}: {len(clip)} frames, {speed:.2f} m/s, its ends {seam:.1e} apart (RMS, m and rad), {size:.1f} kB"
-    )
+    with whole_file(output) as part:
+        np.savez_compressed(part, qpos=clip.qpos.numpy().astype(np.float32), fps=round(1 / env.control_dt))
+    speed, size = clip.advance[0].item() / (len(clip) * env.control_dt), output.stat().st_size / 1e3
+    print(f"{output}: {len(clip)} frames, {speed:.2f} m/s, ends {seam:.1e} apart (RMS, m and rad), {size:.1f} kB")
+
+
+@command
+def main() -> None:
+    tyro.cli(record, description=__doc__)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,7 @@ from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, command, fail
 from diffsim.training.evaluation import Evaluation, evaluate
 from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
-from diffsim.training.likeliest import Likeliest
-from diffsim.training.normalizer import ObsNormalizer, moments
+from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import (
     Count,
@@ -29,7 +28,6 @@ from diffsim.training.ranges import (
 )
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run
-from diffsim.view.gait import Gait, describe
 
 __all__ = [
     "ClippedAdam",
@@ -41,7 +39,6 @@ __all__ = [
     "Finite",
     "Flags",
     "Fraction",
-    "Gait",
     "Learner",
     "Likeliest",
     "Natural",
@@ -58,7 +55,6 @@ __all__ = [
     "UsageError",
     "Widths",
     "command",
-    "describe",
     "distributed",
     "evaluate",
     "evaluate_checkpoint",

@@ -16,7 +16,6 @@ from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import ENOUGH, FINER, Evaluation, evaluate, kept
 from diffsim.training.flags import Args, Flags, parse_penalty
-from diffsim.view.gait import describe
 
 L = TypeVar("L", bound=Learner)
 
@@ -44,11 +43,11 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **opti
         fail(error)
 
 
-def make_policy_env(saved: SavedPolicy, num_envs: int, **changes: Any) -> DiffEnv:
+def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **changes: Any) -> DiffEnv:
     """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
     names = {field.name for field in dataclasses.fields(Flags)} & saved.args.keys()
     args = Flags(**{name: saved.args[name] for name in names} | {"device": "cpu", "threads": 0} | changes)
-    return make_env(args, num_envs)
+    return make_env(args, num_envs, forces=forces)
 
 
 def evaluate_checkpoint(
@@ -96,7 +95,7 @@ def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **foun
     assert args.run_dir
     names = "env integrator substeps theta contact penalty early_termination clip device eval_episodes".split()
     settings = {name: getattr(args, name) for name in names} | dict(script=args.script(), iteration=iteration)
-    if gait := describe(evaluation):
+    if gait := evaluation.gait():
         print(f"gait: {gait}")
         found["gait"] = dataclasses.asdict(gait) | {"verdict": gait.verdict}
     evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from diffsim.env import DiffEnv
 from diffsim.training.errors import fail
-from diffsim.training.likeliest import Likeliest
-from diffsim.training.normalizer import ObsNormalizer
+from diffsim.training.layers import Likeliest, ObsNormalizer
 
 FORMAT = 2
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,6 +16,9 @@ from torch import Tensor
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.view import render
+
+if TYPE_CHECKING:
+    from diffsim.view.gait import Gait
 
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
@@ -83,8 +86,20 @@ class Evaluation:
 
     def median_episode(self, seconds: float = render.VIDEO_SECONDS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """qpos (T, nq) and action (T, nu) of the first seconds of the episode of median return."""
-        steps = min(int(self.lengths[self.median]), max(1, round(seconds / self.control_dt)))
-        return self.qpos[:steps, self.median].cpu().numpy(), self.action[:steps, self.median].cpu().numpy()
+        qpos, action = self.episode(self.median)
+        steps = max(1, round(min(len(qpos), seconds / self.control_dt)))
+        return qpos[:steps], action[:steps]
+
+    def episode(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """qpos (T, nq) and action (T, nu) of all steps of an episode."""
+        steps = int(self.lengths[number])
+        return self.qpos[:steps, number].numpy(force=True), self.action[:steps, number].numpy(force=True)
+
+    def gait(self) -> Gait | None:
+        """How the robot moves over the ground, see diffsim.view.gait.describe."""
+        from diffsim.view import gait  # no training needs it
+
+        return gait.describe(self.scene, self.control_dt, map(self.episode, range(len(self.returns))))
 
     def save_video(self, path: Path, seconds: float = render.VIDEO_SECONDS) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.

@@ -9,21 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import islice
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.scene import Array, Index, Scene
-from diffsim.training.evaluation import Evaluation
 
 Flags = NDArray[np.bool_]
 Frames = NDArray[np.intp]
+Rows = NDArray[np.floating[Any]]
 
-EPISODES = 8  # that are looked at
+EPISODES = 8  # how many are looked at
 SETTLING = 1.0  # s at the start of an episode that are left out
-TOUCHING = 0.03  # share of the frames from which on a body counts as one that touches the ground
+TOUCHING = 0.03  # a body that touches the ground in a smaller share of the frames is no foot
 BOUNCE = 0.05  # s; a foot that leaves the ground for no longer has not made a step
 
 # Where the words of `Gait.verdict` change
@@ -39,7 +40,7 @@ NUMBERS = {2: "two", 3: "three", 4: "four", 6: "six", 8: "eight"}
 class Foot:
     """One foot: the bodies of one leg that touch the ground, toes and heel together.
 
-    Two bodies are of one foot if one hangs on the other, or both on the same body, unless that is the trunk.
+    Two bodies belong to one foot if one hangs on the other, or if both hang on the same body that is not the trunk.
 
     Attributes:
         name: the MJCF's, of the lowest body that touches; of several toes that of the body on which they hang.
@@ -90,20 +91,19 @@ class Gait:
     @property
     def verdict(self) -> str:
         """One phrase in words: "runs on two legs in turn, right foot and left foot (phase 0.49), 2.1 strides/s"."""
-        fallen = f", its trunk on the ground {self.trunk:.0%} of the time" if self.trunk >= TOUCHING else ""
         if not self.feet:
-            return f"touches the ground with no foot{fallen}"
-        if not any(foot.frequency for foot in self.feet):
-            return f"keeps {' and '.join(foot.words for foot in self.feet)} on the ground{fallen}"
-        return f"{self._steps()}, {max(foot.frequency for foot in self.feet):.1f} strides/s{fallen}"
+            text = "touches the ground with no foot"
+        elif strides := max(foot.frequency for foot in self.feet):
+            text = f"{self._steps()}, {strides:.1f} strides/s"
+        else:
+            text = f"keeps {' and '.join(foot.words for foot in self.feet)} on the ground"
+        return text + (f", its trunk on the ground {self.trunk:.0%} of the time" if self.trunk >= TOUCHING else "")
 
     def _steps(self) -> str:
         first, *others = self.feet
         main = max(self.feet, key=lambda foot: foot.share)
-        if not others:
-            return f"hops on its {main.words}"
         if main.share >= ONE_LEGGED:
-            return f"hops on its {main.words} ({main.share:.0%} of touch-downs)"
+            return f"hops on its {main.words}" + (f" ({main.share:.0%} of touch-downs)" if others else "")
         number = NUMBERS.get(len(self.feet), str(len(self.feet)))
         pace = "runs" if np.mean([foot.duty for foot in self.feet]) < 0.5 else "walks"
         phases = [foot.phase for foot in others if foot.phase is not None and (foot.steadiness or 0) >= STEADY]
@@ -115,51 +115,56 @@ class Gait:
         if len(phases) > 1:
             order = ", ".join(f"{foot.words} {foot.phase:.2f}" for foot in self.feet)
             return f"{pace} on {number} legs (phases: {order})"
-        if abs(phases[0] - 0.5) <= IN_TURN and main.share <= 1 - EVEN:
-            return f"{pace} on two legs in turn, {first.words} and {others[0].words} (phase {phases[0]:.2f})"
-        return f"{pace} unevenly on two legs, {others[0].words} {phases[0]:.2f} of a stride after {first.words}"
+        (phase,), (second,) = phases, others
+        if abs(phase - 0.5) <= IN_TURN and main.share <= 1 - EVEN:
+            return f"{pace} on two legs in turn, {first.words} and {second.words} (phase {phase:.2f})"
+        return f"{pace} unevenly on two legs, {second.words} {phase:.2f} of a stride after {first.words}"
 
     def __str__(self) -> str:
-        duty = ", ".join(f"{foot.words} {foot.duty:.2f}" for foot in self.feet)
+        duties = ", ".join(f"{foot.words} {foot.duty:.2f}" for foot in self.feet)
         cost = "" if self.cost_of_transport is None else f"cost of transport {self.cost_of_transport:.2f}, "
         depth = f"penetration {1e3 * self.stance_penetration:.0f} mm (at most {1e3 * self.max_penetration:.0f} mm)"
-        duties = f"duty factor {duty}; " if duty else ""
-        return f"{self.verdict}; {duties}{cost}peak joint speed {self.peak_joint_speed:.1f} rad/s, {depth}"
+        duty = f"duty factor {duties}; " if duties else ""
+        return f"{self.verdict}; {duty}{cost}peak joint speed {self.peak_joint_speed:.1f} rad/s, {depth}"
 
 
-def describe(evaluation: Evaluation) -> Gait | None:
-    """The gait of an evaluation's first episodes; None without contact with a plane, or if none lasts over a second."""
-    scene, dt, first = evaluation.scene, evaluation.control_dt, round(SETTLING / evaluation.control_dt)
-    lengths = evaluation.lengths[:EPISODES].tolist()
-    episodes = [k for k, length in enumerate(lengths) if length > first + 1]
-    if "contact" not in scene.features or scene.terrain is not None or not episodes:
+def describe(scene: Scene, control_dt: float, episodes: Iterable[tuple[Rows, Rows]]) -> Gait | None:
+    """The gait of the first EPISODES episodes; None without contact with a plane, or if none lasts over a second.
+
+    Args:
+        scene, control_dt: the robot, and s of a control step.
+        episodes: qpos (F, nq) and action (F, nu) of the control steps of each.
+    """
+    start = round(SETTLING / control_dt)
+    settled = [
+        (qpos[start:].astype(np.float64), action[start:].astype(np.float64))
+        for qpos, action in islice(episodes, EPISODES)
+        if len(qpos) > start + 1
+    ]
+    if "contact" not in scene.features or scene.terrain is not None or not settled:
         return None
-    model, bodies = scene.mj_model, contact_bodies(scene)
-    qpos = [evaluation.qpos[first : lengths[k], k].double().cpu().numpy() for k in episodes]
-    action = [evaluation.action[first : lengths[k], k].double().cpu().numpy() for k in episodes]
-    motions = [trace(scene, q) for q in qpos]
+    motions = [trace(scene, qpos) for qpos, _ in settled]
     depth = np.concatenate([motion.depth for motion in motions])
-
-    distance = float(sum(q[-1, 0] - q[0, 0] for q in qpos))
-    work = sum(_work(scene, a, motion.path) for a, motion in zip(action, motions, strict=True))
+    limbs = _limbs(scene, depth > 0)
+    stance = [np.array([motion.depth[:, limb].max(1) for limb in limbs.values()]) for motion in motions]
+    standing = np.concatenate([feet[feet > 0] for feet in stance])
+    distance = float(sum(qpos[-1, 0] - qpos[0, 0] for qpos, _ in settled))
+    work = 0.0  # J, |force times displacement|
+    for (_, action), motion in zip(settled, motions, strict=True):
+        force = scene.gear * action[:-1].clip(-1.0, 1.0) + scene.motor_bias
+        work += float(np.abs(force * np.diff(motion.path, axis=0)).sum())
     weight = float(scene.mass.sum() * np.linalg.norm(scene.gravity))
     priced = distance > 0 and weight > 0 and "hill" not in scene.features
-    limbs = _limbs(model, bodies, depth > 0)
-    feet = [_deepest(motion.depth, list(limbs.values())) for motion in motions]
-    stance = np.concatenate(feet)
-    trunk = np.isin(bodies, np.flatnonzero(_parents(model) == 0))
+    trunk = _parents(scene.mj_model)[contact_bodies(scene)] == 0
     return Gait(
-        feet=feet_of(list(limbs), [foot > 0 for foot in feet], dt),
+        feet=feet_of(list(limbs), [feet > 0 for feet in stance], control_dt),
         trunk=float((depth[:, trunk] > 0).any(1).mean()),
-        speed=distance / (dt * sum(len(q) - 1 for q in qpos)),
+        speed=distance / (control_dt * sum(len(qpos) - 1 for qpos, _ in settled)),
         cost_of_transport=work / (weight * distance) if priced else None,
-        peak_joint_speed=max(_joint_turns(model, motion.moved).max(initial=0.0) for motion in motions) / dt,
+        peak_joint_speed=max(motion.turned.max(initial=0.0) for motion in motions) / control_dt,
         max_penetration=max(float(depth.max()), 0.0),
-        stance_penetration=float(np.median(stance[stance > 0])) if (stance > 0).any() else 0.0,
+        stance_penetration=float(np.median(standing)) if len(standing) else 0.0,
     )
-
-
-# From positions to contacts -------------------------------------------------------------------------------------------
 
 
 class Trace(NamedTuple):
@@ -168,12 +173,12 @@ class Trace(NamedTuple):
     Attributes:
         depth: (F, ncontact) how far each contact sphere of the scene reaches below the ground, m; negative above it.
         path: (F, nu) joint angle [rad], slide [m] or length of the path [m] that each motor or muscle moves.
-        moved: (F - 1, nv) from each state to the next, in the units of qvel times s.
+        turned: (F - 1, joints) rad by which the hinge and ball joints that do not carry the trunk turned.
     """
 
     depth: Array
     path: Array
-    moved: Array
+    turned: Array
 
 
 def trace(scene: Scene, qpos: Array) -> Trace:
@@ -181,31 +186,29 @@ def trace(scene: Scene, qpos: Array) -> Trace:
     model, bodies = scene.mj_model, contact_bodies(scene)
     data = mujoco.MjData(model)
     # A link's frame has the axes of its body and sits at the anchor of its joint.
-    centre = model.jnt_pos[model.dof_jntid[_contact_dofs(scene)]] + scene.contact_position
-    moved = np.zeros((max(len(qpos) - 1, 0), scene.nv))
+    centre = model.jnt_pos[model.body_jntadr[bodies] + model.body_jntnum[bodies] - 1] + scene.contact_position
+    moved = np.zeros((len(qpos), scene.nv))  # from the state before, in the units of qvel times s
     height, path = np.zeros((len(qpos), scene.ncontact)), np.zeros((len(qpos), scene.nu))
     for k, q in enumerate(qpos):
         data.qpos[:] = q
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_tendon(model, data)
-        mujoco.mj_transmission(model, data)
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_transmission):
+            stage(model, data)
         height[k] = data.xpos[bodies, 2] + (data.xmat[bodies, 6:] * centre).sum(1)
         path[k] = data.actuator_length
         if k:
-            mujoco.mj_differentiatePos(model, moved[k - 1], 1.0, qpos[k - 1], q)
+            mujoco.mj_differentiatePos(model, moved[k], 1.0, qpos[k - 1], q)
     gear = np.take_along_axis(model.actuator_gear, np.abs(model.actuator_gear).argmax(1)[:, None], 1)[:, 0]
-    return Trace(scene.ground_height + scene.contact_radius - height, path / np.where(gear == 0, 1.0, gear), moved)
-
-
-def _contact_dofs(scene: Scene) -> Index:
-    """(ncontact,) the last degree of freedom that moves each contact sphere."""
-    return scene.contact_link + (5 if scene.floating else -1)
+    depth = scene.ground_height + scene.contact_radius - height
+    kind = mujoco.mjtJoint
+    turns = np.isin(model.jnt_type, (kind.mjJNT_HINGE, kind.mjJNT_BALL)) & (_parents(model)[model.jnt_bodyid] != 0)
+    turned = np.sqrt(np.square(moved[1:]) @ (model.dof_jntid[:, None] == np.flatnonzero(turns)))
+    return Trace(depth, path / np.where(gear == 0, 1.0, gear), turned)
 
 
 def contact_bodies(scene: Scene) -> Index:
     """(ncontact,) MuJoCo's number of the body of each contact sphere."""
-    return scene.mj_model.jnt_bodyid[scene.mj_model.dof_jntid[_contact_dofs(scene)]]
+    last_dof = scene.contact_link + (5 if scene.floating else -1)
+    return scene.mj_model.dof_bodyid[last_dof]
 
 
 def _parents(model: mujoco.MjModel) -> Index:
@@ -213,9 +216,9 @@ def _parents(model: mujoco.MjModel) -> Index:
     return model.body_weldid[model.body_parentid]
 
 
-def _limbs(model: mujoco.MjModel, bodies: Index, touching: Flags) -> dict[str, Flags]:
-    """Of each foot, by its name: which of the contact spheres (ncontact,) are its. touching (F, ncontact)."""
-    parent = _parents(model).tolist()
+def _limbs(scene: Scene, touching: Flags) -> dict[str, Flags]:
+    """For each foot, by its name: which of the contact spheres (ncontact,) are its. touching (F, ncontact)."""
+    bodies, parent = contact_bodies(scene), _parents(scene.mj_model).tolist()
 
     def path(body: int) -> tuple[int, ...]:
         """The bodies from the trunk, which is left out, to this one."""
@@ -231,21 +234,9 @@ def _limbs(model: mujoco.MjModel, bodies: Index, touching: Flags) -> dict[str, F
     names = dict[str, Flags]()
     for limb in limbs.values():
         tips = [path(body) for body in limb if not any(body in path(other)[:-1] for other in limb)]
-        (*_, common) = (set(level) for level in zip(*tips, strict=False) if len(set(level)) == 1)
-        names[_name(model, common.pop())] = np.isin(bodies, limb)  # of a foot with two toes the foot's
+        lowest = [level[0] for level in zip(*tips, strict=False) if len(set(level)) == 1][-1]  # that all tips share
+        names[scene.mj_model.body(lowest).name or f"body {lowest}"] = np.isin(bodies, limb)
     return names
-
-
-def _name(model: mujoco.MjModel, body: int) -> str:
-    return model.body(body).name or f"body {body}"
-
-
-def _deepest(depth: Array, limbs: Sequence[Flags]) -> Array:
-    """(F, feet) depth of each foot's deepest sphere."""
-    return np.array([depth[:, limb].max(1) for limb in limbs]).reshape(len(limbs), len(depth)).T
-
-
-# From contacts to steps -----------------------------------------------------------------------------------------------
 
 
 def feet_of(names: Sequence[str], contacts: Sequence[Flags], dt: float) -> tuple[Foot, ...]:
@@ -253,19 +244,17 @@ def feet_of(names: Sequence[str], contacts: Sequence[Flags], dt: float) -> tuple
 
     Args:
         names: of the feet.
-        contacts: of each episode (F, feet), in which frames a foot touches the ground.
+        contacts: of each episode (feet, F), in which frames a foot touches the ground.
         dt: s between two frames.
     """
-    landings = [[touch_downs(foot, dt) for foot in contact.T] for contact in contacts]
+    landings = [[touch_downs(foot, dt) for foot in contact] for contact in contacts]
     counts = np.array([[len(foot) for foot in episode] for episode in landings]).sum(0)
-    frames = sum(len(contact) for contact in contacts)
-    duty = sum(contact.sum(0) for contact in contacts) / frames
-    feet = []
+    frames, feet = sum(contact.shape[-1] for contact in contacts), []
     for k, name in enumerate(names):
-        mean = _mean_phase((episode[0], episode[k]) for episode in landings)
-        phase, steadiness = (None, None) if mean is None else mean
-        share = float(counts[k] / max(counts.sum(), 1))
-        feet.append(Foot(name, float(duty[k]), phase, steadiness, share, float(counts[k] / (frames * dt))))
+        duty = sum(contact[k].sum() for contact in contacts) / frames
+        phase, steadiness = _mean_phase([(episode[0], episode[k]) for episode in landings])
+        share, frequency = counts[k] / max(counts.sum(), 1), counts[k] / (frames * dt)
+        feet.append(Foot(name, float(duty), phase, steadiness, float(share), float(frequency)))
     return tuple(feet)
 
 
@@ -275,34 +264,16 @@ def touch_downs(contact: Flags, dt: float) -> Frames:
     return down[np.diff(down, prepend=-1) - 1 > BOUNCE / dt + 1e-6]
 
 
-def _mean_phase(pairs: Iterable[tuple[Frames, Frames]]) -> tuple[float, float] | None:
+def _mean_phase(pairs: Sequence[tuple[Frames, Frames]]) -> tuple[float, float] | tuple[None, None]:
     """Circular mean in [0, 1) and its resultant length, of landings within the strides between first landings."""
-    phases = []
+    phases = [np.zeros(0)]
     for first, landings in pairs:
-        if len(first) < 2:
-            continue
-        inside = landings[(landings >= first[0]) & (landings < first[-1])]
-        stride = np.searchsorted(first, inside, side="right") - 1
-        phases.append((inside - first[stride]) / np.diff(first)[stride])
-    all_phases = np.concatenate(phases) if phases else np.zeros(0)
-    if not len(all_phases):
-        return None
-    mean = np.exp(2j * np.pi * all_phases).mean()
+        stride = np.searchsorted(first, landings, side="right") - 1
+        inside = (stride >= 0) & (stride < len(first) - 1)
+        stride, landings = stride[inside], landings[inside]
+        phases.append((landings - first[stride]) / np.diff(first)[stride])
+    turns = np.concatenate(phases)
+    if not len(turns):
+        return None, None
+    mean = np.exp(2j * np.pi * turns).mean()
     return float(round(np.angle(mean) / (2 * np.pi), 9) % 1.0), float(abs(mean))
-
-
-# From positions to speed and work -------------------------------------------------------------------------------------
-
-
-def _work(scene: Scene, action: Array, path: Array) -> float:
-    """J, sum of |force times displacement| over motors, muscles and steps, of action (F, nu) and path (F, nu)."""
-    force = scene.gear * action[:-1].clip(-1.0, 1.0) + scene.motor_bias
-    return float(np.abs(force * np.diff(path, axis=0)).sum())
-
-
-def _joint_turns(model: mujoco.MjModel, moved: Array) -> Array:
-    """(F - 1, joints) rad by which the hinge and ball joints that hang on the trunk turned; moved as in Trace."""
-    kind = mujoco.mjtJoint
-    turning = np.isin(model.jnt_type, (kind.mjJNT_HINGE, kind.mjJNT_BALL)) & (_parents(model)[model.jnt_bodyid] != 0)
-    of_joint = model.dof_jntid[:, None] == np.flatnonzero(turning)
-    return np.sqrt(np.square(moved) @ of_joint)

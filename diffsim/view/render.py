@@ -6,11 +6,16 @@ import copy
 import itertools
 import math
 import os
+import subprocess
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from fractions import Fraction
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import mujoco
@@ -27,8 +32,10 @@ GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
 SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
 VIDEO_FPS = 30.0  # at most
-VIDEO_SECONDS = 10.0  # of an episode that is filmed
-BLOCK = 16
+VIDEO_SECONDS = 10.0  # how much of an episode is filmed
+LARGEST = 4096  # pixels of a side of a picture
+BLOCK = 16  # pixels; libx264 pads the sides of a picture to multiples of it
+REMEDY = "no OpenGL to draw with: apt install libegl1 libgl1 libgl1-mesa-dri (or your system's EGL and Mesa)"
 
 
 class Renderer:
@@ -42,7 +49,7 @@ class Renderer:
             ant takes 15 ms of one core instead of 300.
 
     Raises:
-        ValueError: the MJCF has no such camera.
+        ValueError: the MJCF has no such camera, or a side is not between 1 and 4096 pixels.
         RuntimeError: the machine has no OpenGL, with the remedy.
     """
 
@@ -57,12 +64,12 @@ class Renderer:
         loaded = scene.mj_model if isinstance(scene, Scene) else mujoco.MjModel.from_xml_path(os.fspath(scene))
         self.model = model = copy.copy(loaded)
         self._terrain = scene.terrain if isinstance(scene, Scene) else None
-        self._material = hide_planes(model) if self._terrain is not None else -1
-        self.width, self.height = width, height
+        self._material = -1 if self._terrain is None else hide_planes(model)
+        self.width, self.height = check_size(width, height)
         self._view = _camera(model, camera)
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._window = _gl_context(width, height)
-        self._fast = _is_software(_gl_renderer()) if fast is None else fast
+        self._fast = _is_software() if fast is None else fast
         if self._fast:
             lower_quality(model)
         self._data, self._option, self._perturb = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
@@ -163,11 +170,10 @@ def render_frames(
         Frames (T, height, width, 3).
 
     Raises:
-        ValueError: qpos or ctrl has another shape, or the MJCF has no such camera.
-        RuntimeError: the machine has no OpenGL.
+        ValueError, RuntimeError: as Renderer does; qpos or ctrl has another shape.
     """
     with Renderer(scene, width, height, camera, fast) as renderer:
-        return np.stack(list(_draw_all(renderer, qpos, ctrl)))
+        return np.stack([*_draw_all(renderer, qpos, ctrl)])
 
 
 def film(
@@ -207,85 +213,97 @@ def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float
     Raises:
         ValueError: no frames, another suffix, or an mp4 whose width or height is not a multiple of 16.
         OSError: the file cannot be written.
-        RuntimeError: the encoder is missing or fails.
+        RuntimeError: the encoder is missing.
     """
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise ValueError("a video needs at least one frame")
-    path, frames = check_video(path, (first.shape[1], first.shape[0])), itertools.chain([first], frames)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.open("ab").close()  # what forbids writing is said here, in Python's words, not in the encoder's
-    try:
-        if path.suffix == ".gif":
-            _write_gif(path, frames, fps)
-        else:
-            _write_mp4(path, frames, first.shape[1], first.shape[0], fps)
-    except BaseException:  # half a video helps nobody
-        path.unlink(missing_ok=True)
-        raise
+    path = check_video(path, first.shape[1::-1])
+    with whole_file(path) as part:
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(part, itertools.chain([first], frames), fps)
     return path
 
 
-def check_video(path: str | os.PathLike[str], size: tuple[int, int] = VIDEO_SIZE) -> Path:
-    """That a video of this name and size can be encoded here; raises what save_video does."""
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A file to write, which takes the place of path once it is complete. If writing fails, path stays as it was.
+
+    Raises:
+        OSError: path is no regular file, or cannot be written; its message names path.
+    """
+    path = Path(path).resolve()
+    part = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        if path.exists() and not path.is_file():
+            raise OSError("it is no regular file")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        os.replace(part, path)
+    except OSError as error:
+        raise OSError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink()
+
+
+def check_size(width: int, height: int) -> tuple[int, int]:
+    """The size of a picture; raises ValueError unless it can be drawn."""
+    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
+        raise ValueError(f"width and height of a picture are 1 to {LARGEST} pixels, not {width} x {height}")
+    return width, height
+
+
+def check_video(path: str | os.PathLike[str], size: Sequence[int] = VIDEO_SIZE) -> Path:
+    """The path, if a video of this name and size can be encoded here; raises what save_video does."""
     path = Path(path)
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"a video ends in .mp4 or .gif, not {path.suffix!r}")
-    package = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
-    if find_spec(package) is None:
-        name = {"PIL": "pillow"}.get(package, "imageio-ffmpeg")
-        raise RuntimeError(f"an {path.suffix} needs {name}: pip install {name}")
-    if path.suffix == ".mp4":
-        if size[0] % BLOCK or size[1] % BLOCK:
-            raise ValueError(f"width and height of an .mp4 are multiples of {BLOCK}; {size[0]} x {size[1]} are not")
-        from imageio_ffmpeg import get_ffmpeg_exe
+    width, height = check_size(*size)
+    if path.suffix == ".gif":
+        if find_spec("PIL") is None:
+            raise RuntimeError("a .gif needs pillow: pip install pillow")
+        return path
+    if find_spec("imageio_ffmpeg") is None:
+        raise RuntimeError("an .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg")
+    if width % BLOCK or height % BLOCK:
+        raise ValueError(f"width and height of an .mp4 are multiples of {BLOCK}; {width} x {height} are not")
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-        try:
-            get_ffmpeg_exe()
-        except RuntimeError as error:
-            raise RuntimeError("no ffmpeg to write an .mp4: pip install --force-reinstall imageio-ffmpeg") from error
+    try:
+        get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise RuntimeError("no ffmpeg to write an .mp4: pip install --force-reinstall imageio-ffmpeg") from error
     return path
 
 
-def check_opengl() -> None:
-    """That pictures can be drawn here; raises RuntimeError with the remedy in one line."""
-    _gl_context(16, 16).free()
+def _write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> None:
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    height, width, _ = (first := next(frames)).shape
+    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {Fraction(fps).limit_denominator()} -i -"
+    # faststart: browsers begin to play before they have loaded all of it.
+    target = "-vcodec libx264 -pix_fmt yuv420p -crf 15 -preset veryfast -movflags +faststart"
+    command = [get_ffmpeg_exe(), "-y", "-v", "error", *source.split(), *target.split(), os.fspath(path)]
+    with TemporaryFile() as log:
+        with suppress(BrokenPipeError), subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as ffmpeg:
+            assert ffmpeg.stdin
+            for frame in itertools.chain([first], frames):
+                ffmpeg.stdin.write(frame.tobytes())
+        if ffmpeg.returncode or not path.is_file() or path.stat().st_size == 0:
+            log.seek(0)
+            said = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+            raise OSError(f"ffmpeg fails: {said or f'exit status {ffmpeg.returncode}'}")
 
 
-def check_display() -> bool:
-    """That a window can be opened here; returns whether OpenGL runs on the CPU there.
+def _write_gif(path: Path, frames: Iterator[Frame], fps: float) -> None:
+    from PIL import Image
 
-    It leaves EGL alone: a process that has used both EGL and a window crashes at its end.
-
-    Raises:
-        RuntimeError: there is no display, or it knows no OpenGL.
-    """
-    import glfw
-
-    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    with warnings.catch_warnings():  # GLFW warns instead of raising
-        warnings.simplefilter("ignore")
-        if not glfw.init():
-            raise RuntimeError(f"display {display} does not answer" if display else "there is no display")
-        glfw.window_hint(glfw.VISIBLE, 0)
-        window = glfw.create_window(16, 16, "diffsim", None, None)
-        if not window:
-            raise RuntimeError(f"display {display} has no OpenGL")
-        glfw.make_context_current(window)
-        name = _gl_renderer()
-        glfw.destroy_window(window)
-        glfw.default_window_hints()
-    return _is_software(name)
-
-
-def opengl_name() -> str:
-    """What draws, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"; raises RuntimeError as check_opengl does."""
-    window = _gl_context(16, 16)
-    try:
-        return _gl_renderer()
-    finally:
-        window.free()
+    stride = math.ceil(fps / 50 - 1e-6)
+    images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
+    times = [round(100 * k * stride / fps) for k in range(len(images) + 1)]  # hundredths of a second
+    delays = [10 * (b - a) for a, b in itertools.pairwise(times)]  # ms
+    images[0].save(path, save_all=True, append_images=images[1:], duration=delays, loop=0)
 
 
 def _draw_all(renderer: Renderer, qpos: ArrayLike, ctrl: ArrayLike | None) -> Iterator[Frame]:
@@ -317,6 +335,17 @@ def _camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera:
     return view
 
 
+def orbit(model: mujoco.MjModel) -> dict[str, Any]:
+    """Where the MJCF's first camera stands relative to what it follows, as the orbit about a point that it looks at."""
+    if not model.ncam:
+        return {"yaw": -math.pi / 2, "pitch": 0.3, "distance": 3 * model.stat.extent, "aim": [0, 0, 0], "fovy": 0.8}
+    # mode="trackcom": the camera keeps its place relative to the centre of mass, and its direction.
+    place, back = model.cam_poscom0[0], model.cam_mat0[0].reshape(3, 3)[:, 2]
+    distance = float(place @ back)
+    yaw, pitch, fovy = math.atan2(back[1], back[0]), math.asin(back[2]), math.radians(float(model.cam_fovy[0]))
+    return {"yaw": yaw, "pitch": pitch, "distance": distance, "aim": (place - distance * back).tolist(), "fovy": fovy}
+
+
 def _add_shadows(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene) -> None:
     """Add flat dark copies of a scene's shapes, projected along the first light onto the floor.
 
@@ -338,84 +367,69 @@ def _add_shadows(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvSc
         scene.ngeom += 1
 
 
-# Files ----------------------------------------------------------------------------------------------------------------
-
-
-def _write_mp4(path: Path, frames: Iterable[Frame], width: int, height: int, fps: float) -> None:
-    from imageio_ffmpeg import write_frames
-
-    # faststart: browsers begin to play before they have loaded all of it.
-    options = ["-preset", "veryfast", "-movflags", "+faststart"]
-    writer = write_frames(
-        path, (width, height), fps=fps, codec="libx264", quality=7, ffmpeg_log_level="error", output_params=options
-    )
-
-    def send(data: Frame | None) -> None:
-        try:
-            writer.send(data)
-        except Exception as error:  # with all that ffmpeg has printed
-            raise RuntimeError(f"ffmpeg cannot write {path}") from error
-
-    send(None)
-    try:
-        for frame in frames:
-            send(np.ascontiguousarray(frame))
-    finally:
-        writer.close()
-    if path.stat().st_size == 0:
-        raise RuntimeError(f"ffmpeg has written nothing to {path}")
-
-
-def _write_gif(path: Path, frames: Iterable[Frame], fps: float) -> None:
-    from PIL import Image
-
-    stride = math.ceil(fps / 50 - 1e-6)
-    images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
-    times = [round(100 * k * stride / fps) for k in range(len(images) + 1)]  # hundredths of a second
-    delays = [10 * (b - a) for a, b in itertools.pairwise(times)]  # ms
-    images[0].save(path, save_all=True, append_images=images[1:], duration=delays, loop=0)
-
-
 # OpenGL ---------------------------------------------------------------------------------------------------------------
 
 
-def _gl_context(width: int, height: int) -> Any:
-    """A current OpenGL context of MuJoCo's.
+def check_opengl() -> str:
+    """What draws pictures here, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"; raises RuntimeError with the remedy."""
+    context = _gl_context(16, 16)
+    try:
+        return _gl_renderer()
+    finally:
+        context.free()
 
-    MuJoCo chooses one from MUJOCO_GL when it is first imported. Where that is not set, on Linux, it takes GLFW's, which
-    needs a display; EGL needs none.
+
+def check_display() -> bool:
+    """Whether OpenGL runs on the CPU in a window that can be opened here.
+
+    It leaves EGL alone: a process that has used both EGL and a window crashes at its end.
+
+    Raises:
+        RuntimeError: there is no display, or it knows no OpenGL.
+    """
+    import glfw
+
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    with warnings.catch_warnings():  # GLFW warns instead of raising
+        warnings.simplefilter("ignore")
+        if not glfw.init():
+            raise RuntimeError(f"display {display} does not answer" if display else "there is no display")
+        glfw.window_hint(glfw.VISIBLE, 0)
+        window = glfw.create_window(16, 16, "diffsim", None, None)
+        if not window:
+            raise RuntimeError(f"display {display} has no OpenGL")
+        glfw.make_context_current(window)
+        software = _is_software()
+        glfw.destroy_window(window)
+        glfw.default_window_hints()
+    return software
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """A current OpenGL context of MuJoCo's, from MUJOCO_GL or, on Linux, from EGL, which needs no display.
 
     Raises:
         RuntimeError: there is none, with the remedy.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    platform = os.environ.get("PYOPENGL_PLATFORM", "egl").lower()
     if wanted in ("disable", "disabled", "off", "false", "0"):
         raise RuntimeError(f"MUJOCO_GL={wanted} forbids to draw: unset it")
-    remedy = "no OpenGL to draw with"
+    if sys.platform != "linux":
+        module, remedy = "mujoco", "no OpenGL to draw with"
+    elif wanted == "osmesa":
+        module = "mujoco.osmesa"
+        remedy = "MUJOCO_GL=osmesa, but OSMesa is not there: unset MUJOCO_GL, or apt install libosmesa6"
+    elif wanted in ("glfw", "glx"):
+        module, remedy = "mujoco.glfw", f"MUJOCO_GL={wanted}, but no display is there: unset MUJOCO_GL"
+    else:
+        module = "mujoco.egl"
+        remedy = REMEDY if platform == "egl" else f"PYOPENGL_PLATFORM={platform} excludes EGL: unset it"
     os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # Mesa prints its search for drivers otherwise
     try:
-        if sys.platform != "linux":
-            context = mujoco.GLContext(width, height)
-        elif wanted == "osmesa":
-            remedy = "MUJOCO_GL=osmesa, but OSMesa is not there: unset MUJOCO_GL, or apt install libosmesa6"
-            from mujoco.osmesa import GLContext
-
-            context = GLContext(width, height)
-        elif wanted in ("glfw", "glx"):
-            remedy = f"MUJOCO_GL={wanted}, but no display is there: unset MUJOCO_GL"
+        if module == "mujoco.glfw":
             check_display()
-            from mujoco.glfw import GLContext
-
-            context = GLContext(width, height)
-        else:
-            remedy = (
-                "no OpenGL to draw with: apt install libegl1 libgl1 libgl1-mesa-dri (or your system's EGL and Mesa)"
-            )
-            if (platform := os.environ.get("PYOPENGL_PLATFORM", "egl").lower()) != "egl":
-                remedy = f"PYOPENGL_PLATFORM={platform} excludes EGL: unset it"
-            from mujoco.egl import GLContext
-
-            context = GLContext(width, height)
+        context = import_module(module).GLContext(width, height)
         context.make_current()
     except Exception as error:  # each of them fails in its own ways, AttributeError among them
         raise RuntimeError(remedy) from error
@@ -428,6 +442,6 @@ def _gl_renderer() -> str:
     return glGetString(GL_RENDERER).decode()
 
 
-def _is_software(name: str) -> bool:
-    """Whether OpenGL of this name runs on the CPU."""
-    return any(software in name for software in ("llvmpipe", "softpipe", "swrast"))
+def _is_software() -> bool:
+    """Whether the current OpenGL runs on the CPU."""
+    return any(software in _gl_renderer() for software in ("llvmpipe", "softpipe", "swrast"))

@@ -1,4 +1,4 @@
-"""Screen: what `render_mode` makes of the configurations of an environment, frames or a window."""
+"""Screen: what `render_mode` makes of an environment's configurations, frames or a window; and the window itself."""
 
 from __future__ import annotations
 
@@ -7,22 +7,28 @@ import os
 import sys
 import threading
 import time
-import warnings
+from collections import deque
 from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Scene
-from diffsim.view.render import Renderer, add_terrain, hide_planes
+from diffsim.view import render
 
 RenderMode = Literal["rgb_array", "human"]
-FRAME_SIZE = (480, 352)  # width and height in pixels; video encoders want multiples of 16
 Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
 # What works here, as tools try whatever an environment declares: a window needs a display.
 DISPLAY = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 RENDER_MODES = ["rgb_array", "human"] if DISPLAY else ["rgb_array"]
+
+SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
+PUSH = 1.0  # m/s that a key gives to the whole robot
+MAX_PULL = 2.0  # of the mouse, in weights of the robot
+GRAVITY = 9.81  # m/s^2
+ARROWS = {262: (1, 0, 0), 263: (-1, 0, 0), 264: (0, -1, 0), 265: (0, 1, 0)}  # keys of GLFW: right, left, down, up
+SPACE, ENTER, MINUS, EQUALS = 32, 257, 45, 61
 
 
 class Screen:
@@ -30,9 +36,8 @@ class Screen:
 
     Args:
         scene: what is shown.
-        mode: "rgb_array" returns frames; "human" shows the first configuration in MuJoCo's window, where the mouse
-            moves the camera.
-        fps: frames per second of the window, which waits for its time.
+        mode: "rgb_array" returns frames; "human" shows the first configuration in a Window.
+        fps: frames per second of the window at true speed.
 
     Raises:
         ValueError: another mode.
@@ -41,11 +46,8 @@ class Screen:
     def __init__(self, scene: Scene, mode: RenderMode, fps: float) -> None:
         if mode not in get_args(RenderMode):
             raise ValueError(f"unknown render_mode {mode!r}; choose from {', '.join(get_args(RenderMode))}")
-        self.mode = mode
-        self._scene, self._fps = scene, fps
-        self._renderer: Renderer | None = None
-        self._window: Any = None
-        self._due = 0.0  # when the window may show the next frame, on time.perf_counter's clock
+        self._scene, self._mode, self._fps = scene, mode, fps
+        self._drawer: render.Renderer | Window | None = None
 
     def show(self, qpos: NDArray[np.floating[Any]]) -> Frames | None:
         """Frames of the configurations qpos (N, nq), or None once the first one is in the window.
@@ -53,48 +55,122 @@ class Screen:
         Raises:
             RuntimeError: the machine has no OpenGL, or no display for a window.
         """
-        if self.mode == "rgb_array":
-            if self._renderer is None:
-                self._renderer = Renderer(self._scene, *FRAME_SIZE)
-            return tuple(self._renderer.draw(row, profile=k) for k, row in enumerate(qpos))
-        if self._window is None:
-            self._open()
-        with self._window.lock():
-            self._data.qpos[:] = qpos[0]
-            mujoco.mj_forward(self._model, self._data)
-        time.sleep(max(0.0, self._due - time.perf_counter()))
-        self._due = time.perf_counter() + 1 / self._fps
-        self._window.sync()  # does nothing once the user has closed it
-        return None
+        if self._mode == "rgb_array":
+            self._drawer = self._drawer or render.Renderer(self._scene, *render.VIDEO_SIZE)
+        elif self._drawer is None:
+            try:
+                self._drawer = Window(self._scene, 1 / self._fps)
+            except RuntimeError as error:
+                raise RuntimeError(f"render_mode 'human' opens a window, but {error}; take 'rgb_array'") from error
+        if isinstance(self._drawer, Window):
+            self._drawer.show(qpos[0])
+            return None
+        return tuple(self._drawer.draw(row, profile=k) for k, row in enumerate(qpos))
 
     def close(self) -> None:
         """Free what draws, and close the window, if there is one."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-        if self._window is not None:
-            self._window.close()
-            for thread in self._threads:  # which still draw, and would crash a program that ends meanwhile
-                thread.join()
-            self._window = None
+        if self._drawer is not None:
+            self._drawer.close()
+            self._drawer = None
 
-    def _open(self) -> None:
-        import glfw
+
+class Window:
+    """MuJoCo's window on a scene, which shows pictures at true speed and knows how keys and the mouse push the robot.
+
+    Args:
+        scene: what is shown.
+        control_dt: s of simulation from one picture to the next.
+
+    Attributes:
+        speed, paused: of the pictures; keys change them.
+        restart: whether enter asked for a new episode; to be set to False once it has begun.
+
+    Raises:
+        RuntimeError: there is no display, or it knows no OpenGL.
+    """
+
+    def __init__(self, scene: Scene, control_dt: float) -> None:
+        software = render.check_display()
         import mujoco.viewer
 
-        with warnings.catch_warnings():  # GLFW warns where it should raise
-            warnings.simplefilter("ignore")
-            ready = glfw.init()
-        if not ready:
-            raise RuntimeError("render_mode 'human' opens a window, but there is no display; take 'rgb_array'")
-        self._model = copy.copy(self._scene.mj_model)
-        material = hide_planes(self._model) if self._scene.terrain is not None else -1
-        self._data = mujoco.MjData(self._model)
+        self.model = model = copy.copy(scene.mj_model)
+        if software:
+            render.lower_quality(model)
+        material = -1 if scene.terrain is None else render.hide_planes(model)
+        self.data = mujoco.MjData(model)
+        self.speed, self.paused, self.restart = 1.0, False, False
+        self._control_dt, self._due = control_dt, time.perf_counter()
+        self._keys: deque[int] = deque()  # pressed, not yet heeded
+        self._push = np.zeros(3)  # N s on each kg, of the keys
         others = {*threading.enumerate()}
-        self._window = mujoco.viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        self._handle = mujoco.viewer.launch_passive(
+            model, self.data, key_callback=self._keys.append, show_left_ui=False, show_right_ui=False
+        )
         self._threads = {*threading.enumerate()} - others
-        with self._window.lock():
-            self._window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-            self._window.cam.trackbodyid = min(1, self._model.nbody - 1)
-            if self._scene.terrain is not None:
-                add_terrain(self._window.user_scn, self._scene.terrain[0], material)
+        with self._handle.lock():
+            camera, orbit = self._handle.cam, render.orbit(model)
+            camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
+            camera.azimuth, camera.elevation = np.degrees((orbit["yaw"] + np.pi, -orbit["pitch"]))
+            camera.distance = orbit["distance"]
+            if scene.terrain is not None:
+                render.add_terrain(self._handle.user_scn, scene.terrain[0], material)
+
+    @property
+    def is_open(self) -> bool:
+        return self._handle.is_running()
+
+    def show(self, qpos: ArrayLike, qvel: ArrayLike = 0.0, ctrl: ArrayLike | None = None) -> None:
+        """Show a state, qpos (nq,) and qvel (nv,), until the next one is due; while paused, until space is pressed.
+
+        Muscles are coloured by ctrl (nu,) in [-1, 1].
+        """
+        with self._handle.lock():
+            self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+            self.data.time += self._control_dt
+            if ctrl is not None:
+                render.colour_muscles(self.model, ctrl)
+            mujoco.mj_forward(self.model, self.data)
+        waiting = True
+        while waiting and self.is_open:
+            self._handle.sync()
+            self._heed_keys()
+            now = time.perf_counter()
+            self._due = max(self._due + self._control_dt / self.speed, now - 0.1)  # late: go on from here
+            time.sleep(max(0.0, self._due - now))
+            waiting = self.paused
+
+    def forces(self) -> NDArray[np.float64]:
+        """(nbody, 6) by which keys and mouse push in the next control step, as Simulator.forces has them."""
+        model, data, mouse = self.model, self.data, self._handle.perturb
+        with self._handle.lock():
+            data.xfrc_applied[:] = 0
+            if mouse.select > 0 and mouse.active:
+                mujoco.mjv_applyPerturbForce(model, data, mouse)
+                pull, most = (
+                    np.linalg.norm(data.xfrc_applied[mouse.select, :3]),
+                    MAX_PULL * GRAVITY * model.body_mass.sum(),
+                )
+                data.xfrc_applied *= min(1.0, most / max(pull, 1e-9))  # else a robot that runs away is torn back
+            forces = data.xfrc_applied.copy()
+        forces[:, :3] += np.outer(model.body_mass, self._push / self._control_dt)
+        self._push = np.zeros(3)
+        return forces
+
+    def close(self) -> None:
+        self._handle.close()
+        for thread in self._threads:
+            thread.join(5)  # the viewer's own crashes if the process ends before it does
+
+    def _heed_keys(self) -> None:
+        while self._keys:
+            key = self._keys.popleft()
+            if key in ARROWS:
+                self._push = self._push + np.multiply(PUSH, ARROWS[key])
+            elif key == SPACE:
+                self.paused = not self.paused
+            elif key == ENTER:
+                self.restart = True
+            elif key in (MINUS, EQUALS):
+                place = SPEEDS.index(self.speed) + (1 if key == EQUALS else -1)
+                self.speed = SPEEDS[min(max(place, 0), len(SPEEDS) - 1)]
+                print(f"speed {self.speed:g}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import json
-import math
 import os
 from importlib.resources import files
 from pathlib import Path
@@ -17,10 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Scene
 from diffsim.terrain import slabs
-from diffsim.view.render import GROUND
+from diffsim.view.render import GROUND, orbit, whole_file
 
-MAX_BYTES = 700_000  # of poses; what is longer keeps every second control step, or fewer
+MAX_BYTES = 700_000  # of poses; a longer motion keeps every second control step, or fewer
 HIDDEN_GROUP = 3  # geoms from this group on are not drawn, as in MuJoCo
+SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder")  # whatever else there is, is drawn as a box
 
 
 def write_page(
@@ -51,8 +51,8 @@ def write_page(
     page = (files("diffsim") / "assets" / "web.html").read_text(encoding="utf-8")
     for name, text in (("$title", html.escape(title)), ("$caption", html.escape(caption)), ("$motion", motion)):
         page = page.replace(name, text)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page, encoding="utf-8")
+    with whole_file(path) as part:
+        part.write_text(page, encoding="utf-8")
     return path
 
 
@@ -63,21 +63,39 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
     stride = 1 + qpos.shape[0] * model.nbody * 28 // MAX_BYTES
     poses, track = _poses(model, qpos[::stride])
     muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
-    force = np.zeros((len(poses), len(muscles)))
+    activation = np.zeros((len(poses), len(muscles)))
     if ctrl is not None:
-        force = (np.asarray(ctrl, dtype=np.float64)[::stride, muscles].clip(-1, 1) + 1) / 2
-    planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+        activation = (np.asarray(ctrl, dtype=np.float64)[::stride, muscles].clip(-1, 1) + 1) / 2
+    planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    rgba = np.where(
+        model.geom_matid[:, None] < 0, model.geom_rgba, model.mat_rgba[model.geom_matid] if model.nmat else 0
+    )
+    shown = np.flatnonzero(~planes & (model.geom_group < HIDDEN_GROUP) & (rgba[:, 3] > 0))
+    geoms = [
+        _shape(
+            mujoco.mjtGeom(model.geom_type[k]).name.removeprefix("mjGEOM_").lower(),
+            int(model.geom_bodyid[k]),
+            model.geom_size[k],
+            model.geom_pos[k],
+            model.geom_quat[k],
+            rgba[k],
+        )
+        for k in shown
+    ]
+    for size, centre, rotation in [] if scene.terrain is None else slabs(scene.terrain[0]):  # the first profile
+        mujoco.mju_mat2Quat(quat := np.empty(4), rotation.ravel())
+        geoms.append(_shape("box", 0, size, centre, quat, GROUND))
     return {
         "dt": stride * control_dt,
         "frames": len(poses),
         "bodies": model.nbody,
-        "floor": float(model.geom_pos[planes[0], 2]) if len(planes) and scene.terrain is None else None,
-        "geoms": [_geom(model, k) for k in range(model.ngeom) if _is_drawn(model, k)] + _terrain(scene),
+        "floor": float(model.geom_pos[planes][0, 2]) if planes.any() and scene.terrain is None else None,
+        "geoms": geoms,
         "muscles": [_muscle(model, model.actuator_trnid[k, 0]) for k in muscles],
         "camera": orbit(model),
         "poses": _base64(poses.astype("<f4")),
         "track": _base64(track.astype("<f4")),
-        "activation": _base64((force * 255).round().astype(np.uint8)),
+        "activation": _base64((activation * 255).round().astype(np.uint8)),
     }
 
 
@@ -97,37 +115,11 @@ def _poses(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> tuple[NDArray[np
     return poses, track
 
 
-def _is_drawn(model: mujoco.MjModel, geom: int) -> bool:
-    plane = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
-    return not plane and model.geom_group[geom] < HIDDEN_GROUP and _rgba(model, geom)[3] > 0
-
-
-def _rgba(model: mujoco.MjModel, geom: int) -> NDArray[np.float32]:
-    material = model.geom_matid[geom]
-    return model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-
-
-def _geom(model: mujoco.MjModel, geom: int) -> dict[str, Any]:
-    kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-    return {
-        "type": kind if kind in ("sphere", "capsule", "ellipsoid", "cylinder") else "box",
-        "body": int(model.geom_bodyid[geom]),
-        "size": _rounded(model.geom_size[geom]),
-        "pos": _rounded(model.geom_pos[geom]),
-        "quat": _rounded(model.geom_quat[geom]),
-        "rgba": _rounded(_rgba(model, geom)),
-    }
-
-
-def _terrain(scene: Scene) -> list[dict[str, Any]]:
-    """The first profile, of boxes on the world."""
-    boxes = []
-    for size, centre, rotation in [] if scene.terrain is None else slabs(scene.terrain[0]):
-        quat = np.empty(4)
-        mujoco.mju_mat2Quat(quat, rotation.ravel())
-        places = {"size": _rounded(size), "pos": _rounded(centre), "quat": _rounded(quat)}
-        boxes.append({"type": "box", "body": 0, **places, "rgba": _rounded(GROUND)})
-    return boxes
+def _shape(kind: str, body: int, *places: ArrayLike) -> dict[str, Any]:
+    """A shape on a body, with its size, pos, quat and rgba."""
+    names = ("size", "pos", "quat", "rgba")
+    numbers = {name: _rounded(values) for name, values in zip(names, places, strict=True)}
+    return {"type": kind if kind in SHAPES else "box", "body": body, **numbers}
 
 
 def _muscle(model: mujoco.MjModel, tendon: int) -> dict[str, Any]:
@@ -137,22 +129,6 @@ def _muscle(model: mujoco.MjModel, tendon: int) -> dict[str, Any]:
     sites = [model.wrap_objid[k] for k in steps if model.wrap_type[k] == mujoco.mjtWrap.mjWRAP_SITE]
     points = [[int(model.site_bodyid[k]), *_rounded(model.site_pos[k])] for k in sites]
     return {"width": float(model.tendon_width[tendon]), "points": points}
-
-
-def orbit(model: mujoco.MjModel) -> dict[str, Any]:
-    """Where the MJCF's first camera stands relative to what it follows, as the orbit about a point that it looks at."""
-    if not model.ncam:
-        return {"yaw": -math.pi / 2, "pitch": 0.3, "distance": 3 * model.stat.extent, "aim": [0, 0, 0], "fovy": 0.8}
-    # mode="trackcom": the camera keeps its place relative to the centre of mass, and its direction.
-    place, back = model.cam_poscom0[0], model.cam_mat0[0].reshape(3, 3)[:, 2]
-    distance = float(place @ back)
-    return {
-        "yaw": math.atan2(back[1], back[0]),
-        "pitch": math.asin(back[2]),
-        "distance": distance,
-        "aim": _rounded(place - distance * back),
-        "fovy": math.radians(float(model.cam_fovy[0])),
-    }
 
 
 def _rounded(values: ArrayLike) -> list[float]:

@@ -68,7 +68,7 @@ def test_a_policy_that_tracks_covers_the_reference(tmp_path: Path, monkeypatch: 
     assert all((row["first"], row["second"]) == at[row["frame"]] for row in own)
     spread = np.array([[float(x) for x in place] for place in at.values()]).std(0)
     assert spread[0] >= spread[1] > 0.01  # principal components
-    assert "| pfpn ppo pfpn | 48 48 | 0.0 0.0 |" in feet.table(rows)
+    assert "| pfpn ppo pfpn | 48 48 | 0.0 0.0 |" in feet.report(args)
 
 
 def test_other_tasks_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

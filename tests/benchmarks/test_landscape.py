@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import landscape
 import numpy as np
 import pytest
 import torch
-from runner import parse
+from common import parse
 from tables import read_csv
 
 import diffsim
@@ -73,8 +72,7 @@ def test_the_command_trains_measures_and_draws(
     monkeypatch.setattr(landscape, "WARMUP", 2)
     flags = "--env cartpole --iterations 2 --trajectories 2 --points 5 --side 3 --horizon 40 --device cpu".split()
     places = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", [landscape.__file__, *flags, *places])
-    landscape.main(parse(landscape.Args, None))
+    landscape.main(parse(landscape.Args, None, [*flags, *places]))
     for name, count in (("gradients", 1), ("weight", 5), ("surface", 9)):
         assert len(read_csv(tmp_path / f"landscape_cartpole_{name}.csv")) == count
         assert (tmp_path / f"landscape_cartpole_{name}.png").stat().st_size > 5_000

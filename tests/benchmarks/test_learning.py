@@ -63,8 +63,9 @@ def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.Mon
     write_run(runs / "bptt" / "ant__1", np.arange(300.0), 4096, 0.5, finished=False)
     args = learning.Args(experiment="comparison", env=("ant",), runs=runs, update_results=True, draw_only=True)
     learning.main(args)
-    _, learners, tasks = learning.EXPERIMENTS["comparison"]
-    rows = {row["learner"]: {k: str(v) for k, v in row.items()} for row in learning.table(args, learners, tasks)}
+    case = learning.EXPERIMENTS["comparison"]
+    found = learning.table(args, case.learners, case.tasks)
+    rows = {str(row["learner"]): {k: str(v) for k, v in row.items()} for row in found}
     shac, ppo, bptt = (rows[learner] for learner in ("shac", "ppo_baseline", "bptt"))
     assert shac["s to target"] == "250" and float(shac["steps to target"][:-2]) == pytest.approx(
         501 * 2048e-6, rel=1e-2

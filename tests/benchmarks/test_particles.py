@@ -7,10 +7,7 @@ from pathlib import Path
 import particles
 import pytest
 import torch
-from learners import refusal, run
 from tables import read_csv, write_csv
-
-import pfpn
 
 
 def test_the_reward_has_two_equal_peaks() -> None:
@@ -19,7 +16,7 @@ def test_the_reward_has_two_equal_peaks() -> None:
 
 
 def test_each_policy_is_a_line_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(particles, "CASES", (("0", 1), ("0.2", 2)))
+    monkeypatch.setattr(particles, "CASES", {"0": (1,), "0.2": (2,)})
     monkeypatch.setattr(particles, "POLICIES", ("pfpn", "discrete"))
     particles.main(particles.Args(output=tmp_path, seeds=(1, 2)))
     rows = read_csv(tmp_path / "bandit.csv")
@@ -50,18 +47,3 @@ def test_the_particles_of_a_run_are_read_from_its_log(tmp_path: Path) -> None:
         "iteration": "199", "particle": "1", "location": "200", "weight": "200"
     }  # fmt: skip
     assert not (tmp_path / "bandit.csv").exists() and (tmp_path / "particles.png").stat().st_size > 0
-
-
-def test_a_policy_is_resampled_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With a threshold just below equal weights about half of the particles are dead, and the policy changes."""
-    flags = "--env cartpole --algorithm shac --device cpu --num-envs 4 --horizon 4 --iterations 1 --hidden 8"
-    flags += " --critic-hidden 8 --eval-episodes 1 --particles 8 --quiet"
-    run(pfpn, tmp_path / "run", *flags.split())
-    particles.main(particles.Args(output=tmp_path, resample=(tmp_path / "run",), dead=(0.001, 0.999), episodes=8))
-    for row in read_csv(tmp_path / "resampling.csv"):
-        moved, before, after = (float(row[key]) for key in ("moved", "before", "after"))
-        assert row["of"] == "8" and (2 <= moved <= 6 if row["threshold"] == "0.999" else moved == 0)
-        assert (before != after) == (moved > 0) and 0 < float(row["standard error of the difference"]) < -before
-    run(pfpn, tmp_path / "gaussian", *flags.split(), "--policy", "gaussian")
-    args = particles.Args(output=tmp_path, resample=(tmp_path / "gaussian",), episodes=8)
-    assert "without particles to resample: --policy gaussian" in refusal(lambda: particles.main(args), capsys)

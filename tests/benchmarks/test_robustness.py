@@ -169,8 +169,9 @@ def test_the_command_writes_pushes_and_curves(tmp_path: Path, capsys: pytest.Cap
     line = f"| hopper | shac | soft | 15.8 | 1 | {row['forward N']} |  | {row['forward m/s']} |  |"
     assert line in capsys.readouterr().out
     other = row | {"checkpoint": "policies/hopper__2", "seed": "2", "forward N": "7", "learner": "shac"}
-    assert f"| hopper | shac | soft | 15.8 | 1, 2 | {row['forward N']}, 7 |" in robustness.table([other, row])
-    assert robustness.table([row | {"learner": "sapo"}, row]).count("| hopper |") == 2
+    (joined,) = robustness.table([other, row])
+    assert (joined["seed"], joined["forward N"]) == ("1, 2", f"{row['forward N']}, 7")
+    assert len(robustness.table([row | {"learner": "sapo"}, row])) == 2
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,7 @@ def test_the_repository_is_changed_on_demand_alone(
 ) -> None:
     for name in ("RESULTS", "DOCS", "OUTPUT"):
         monkeypatch.setattr(common, name, tmp_path / name)
+    monkeypatch.setattr(tables, "unknown", lambda _: "")
     (tmp_path / "DOCS").mkdir()
     page = tmp_path / "DOCS" / "page.md"
     page.write_text("<!-- a -->\n<!-- /a -->\n")
@@ -74,6 +75,24 @@ def test_the_repository_is_changed_on_demand_alone(
     argv = ["--update-results", "--output", str(tmp_path)]
     error = refusal(lambda: common.parse(common.CommonFlags, None, argv), capsys)
     assert error.endswith("--output and --update-results exclude each other")
+
+
+def test_results_of_unknown_origin_are_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = "# 2 cores of a CPU; python 3.11, torch 2.13; revision 1dd159e; python speed.py --runs unknown-dirty\n"
+    assert tables.unknown(known) == ""
+    for old, new, found in (
+        ("a CPU", "unknown", "2 cores of unknown"),
+        ("torch 2.13", "torch unknown", "python 3.11, torch unknown"),
+        ("1dd159e", "1dd159e-dirty", "revision 1dd159e-dirty"),
+    ):
+        line = known.replace(old, new)
+        monkeypatch.setattr(tables, "origin", lambda _, line=line: line)
+        error = refusal(lambda: common.parse(common.CommonFlags, None, ["--update-results"]), capsys)
+        assert "--update-results needs a known machine, known versions and a committed" in error
+        assert error.endswith(f"not {found}")
+        common.parse(common.CommonFlags, None, [])  # elsewhere any will do
 
 
 def test_every_result_says_where_it_comes_from() -> None:

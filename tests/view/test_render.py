@@ -18,7 +18,7 @@ from diffsim.training.evaluation import Evaluation
 from diffsim.view import render
 from diffsim.view.render import Renderer, film, render_frames, save_video
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
 HOPPER, MUSCLES = ASSETS / "hopper.xml", ASSETS / "humanoid_mtu.xml"
 
@@ -210,8 +210,8 @@ def test_an_mp4_asked_for_is_written_or_refused(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(OSError, match="folder.mp4"):
         save_video(tmp_path / "folder.mp4", grey(1), 30)
     for program in ("/bin/false", "/nowhere/ffmpeg"):
-        monkeypatch.setattr("imageio_ffmpeg._io.get_ffmpeg_exe", lambda program=program: program)
-        with pytest.raises(RuntimeError, match="ffmpeg .* .*b.mp4"):
+        monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda program=program: program)
+        with pytest.raises(OSError, match="cannot write .*b.mp4"):
             save_video(tmp_path / "b.mp4", grey(1), 30)
     monkeypatch.setattr(render, "find_spec", lambda name: None)
     with pytest.raises(RuntimeError, match="pip install imageio-ffmpeg"):

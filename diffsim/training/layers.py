@@ -1,4 +1,4 @@
-"""Running mean and variance."""
+"""Layers of policies that torch lacks: a checkpoint's policy is loaded with them, without its script."""
 
 from __future__ import annotations
 
@@ -48,6 +48,34 @@ class ObsNormalizer(nn.Module):
         self.mean.add_(delta * new / total)
         self.count.copy_(total)
         self.std.copy_((self.var + 1e-5).sqrt())
+
+
+class Likeliest(nn.Module):
+    """Of each action, the location of the component with the largest weight.
+
+    Not the mixture's mean, which lies between two peaks, where neither is.
+
+    Args:
+        actions, components: how many, m and n.
+        shared: the locations are parameters, the same in all states: the input (..., m n) holds the logits of the
+            weights. Otherwise it holds the logits and then the locations (..., 2 m n).
+
+    Attributes:
+        loc: (m, n) the locations, if shared.
+    """
+
+    loc: nn.Parameter | None
+
+    def __init__(self, actions: int, components: int, shared: bool = True) -> None:
+        super().__init__()
+        self.actions, self.components, self.shared = actions, components, shared
+        self.register_parameter("loc", nn.Parameter(torch.zeros(actions, components)) if shared else None)
+
+    def forward(self, x: Tensor) -> Tensor:
+        parts = x.unflatten(-1, (-1, self.actions, self.components))
+        index = parts[..., 0, :, :].argmax(-1, keepdim=True)
+        loc = parts[..., 1, :, :] if self.loc is None else self.loc.expand(parts.shape[:-3] + self.loc.shape)
+        return loc.gather(-1, index).squeeze(-1)
 
 
 def moments(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 import diffsim
 from diffsim import Scene, Simulator, load_scene
-from diffsim.training import Evaluation, Gait, describe, evaluate, evaluation, gait, load_policy
+from diffsim.training import Evaluation, evaluate, evaluation, load_policy
+from diffsim.view import gait
+from diffsim.view.gait import Gait
 
 Array = NDArray[np.float64]
 PACKAGE = Path(diffsim.__file__).parent
@@ -70,7 +72,7 @@ def steps_of(scene: Scene, duty: tuple[float, float], phase: tuple[float, float]
 
 
 def described(scene: Scene, qpos: Array, **others: Any) -> Gait:
-    found = describe(episodes(scene, qpos, **others))
+    found = episodes(scene, qpos, **others).gait()
     assert found is not None
     return found
 
@@ -151,12 +153,12 @@ def test_only_what_lies_between_the_first_second_and_the_end_counts(biped: Scene
     found = described(biped, qpos, lengths=lengths)
     assert found.max_penetration == pytest.approx(0.02) and found.trunk == 0
     assert [foot.duty for foot in found.feet] == pytest.approx([0.4, 0.4])
-    assert describe(episodes(biped, qpos, lengths=[5, SETTLED, SETTLED + 1])) is None
+    assert episodes(biped, qpos, lengths=[5, SETTLED, SETTLED + 1]).gait() is None
 
 
 def test_a_robot_without_ground_has_no_gait() -> None:
     scene = load_scene(PACKAGE / "assets" / "cartpole.xml")
-    assert describe(episodes(scene, standing(scene, 300))) is None
+    assert episodes(scene, standing(scene, 300)).gait() is None
 
 
 # Cost and speed -------------------------------------------------------------------------------------------------------
@@ -253,7 +255,7 @@ FEET = {
 @pytest.mark.parametrize("name", FEET)
 def test_gait_of_the_shipped_policies(name: str) -> None:
     env = diffsim.make(name, num_envs=2, horizon=1, max_episode_steps=180)
-    found = describe(evaluate(env, load_policy(PACKAGE / "policies" / f"{name}.pt").network))
+    found = evaluate(env, load_policy(PACKAGE / "policies" / f"{name}.pt").network).gait()
     assert found is not None and [foot.name for foot in found.feet] == FEET[name]
     assert all(0.1 < foot.duty < 0.5 and 1.5 < foot.frequency < 5 for foot in found.feet)
     assert all(foot.share == pytest.approx(1 / len(found.feet), abs=0.1) for foot in found.feet)
