@@ -53,7 +53,7 @@ def noisy(act: Act, noise: Tensor) -> Act:
 
 def measure(path: Path) -> Iterator[Row]:
     """One row for each case, size and controller."""
-    run, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
+    about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
     level, policy, guide = System(env, 1), search.network, search.guides[0]
     T = min(round(SECONDS / level.control_dt), search.args.horizon)
     rng = torch.Generator().manual_seed(gps.SEED)
@@ -71,7 +71,7 @@ def measure(path: Path) -> Iterator[Row]:
             steps, speed = until_fall(system, x, finite)
             numbers = dict(whole=steps == T, seconds=steps * level.control_dt, speed=speed)
             means = {key: value.double().mean().item() for key, value in numbers.items()}
-            yield run | dict(case=case, size=size, controller=name, trajectories=len(x)) | means
+            yield about | dict(case=case, size=size, controller=name, trajectories=len(x)) | means
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:

@@ -66,7 +66,7 @@ def until_fall(x: Tensor, height: int) -> tuple[Tensor, Tensor]:
 
 def measure(path: Path) -> Iterator[Row]:
     """One row for each terrain, size and controller."""
-    run, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
+    about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
     steps, height, guides = search.args.horizon, 2 if search.system.scene.floating else 1, search.guide_return[0]
     way = mean((guide.x[-1, 0] - guide.x[0, 0]).item() for guide in search.guides)
     start = search.guides[0].x[:1].expand(len(PLACES), -1)
@@ -79,7 +79,7 @@ def measure(path: Path) -> Iterator[Row]:
             kept, walked = returns >= guides - 0.25 * abs(guides), distance >= FAR * way
             shares = dict(kept=kept & standing, walked=walked & standing, standing=standing, distance=distance)
             means = {key: value.double().mean().item() for key, value in shares.items()}
-            row = run | dict(T=steps, terrain=terrain, size=size, controller=name) | means
+            row = about | dict(T=steps, terrain=terrain, size=size, controller=name) | means
             yield row | dict(median_return=returns.median().item(), guides=guides)
 
 
