@@ -31,8 +31,8 @@ from diffsim.planning.lbfgs import maximise
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.samples import Samples, SampleSet, log_weights, phi
 from diffsim.planning.system import System
+from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import TASKS
-from diffsim.terrain import named_terrains, random_terrain
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.errors import command, fail
@@ -159,9 +159,7 @@ class Args(Flags):
             fail("--demonstration is one trajectory: --guides must be 1")
         if self.adaptive and len(self.terrain) > 1:
             fail("--adaptive takes one --terrain")
-        for kind in self.practice:
-            random_terrain(kind, torch.Generator())  # refuses what is no kind
-        named_terrains(*self.terrain, *self.practice)  # a kind is the name of its largest terrain
+        named_terrains(*self.terrain, *(random_terrain(kind, torch.Generator()) for kind in self.practice))
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------

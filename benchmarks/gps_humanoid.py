@@ -22,7 +22,7 @@ from torch import Tensor
 
 import gps
 from diffsim.planning import REAL, System
-from diffsim.terrain import named_terrains
+from diffsim.planning.terrains import named_terrains
 
 SECONDS, COUNT = 8.0, 20  # of a trajectory; trajectories from noisy and perturbed starts
 SEEDS = range(1000, 1004)

@@ -23,7 +23,7 @@ from tables import Row, digits, markdown
 from torch import Tensor
 
 from diffsim.planning import System
-from diffsim.terrain import named_terrains
+from diffsim.planning.terrains import named_terrains
 
 PLACES = [0.5 + 0.1 * i for i in range(10)]  # m, where a slope or a step begins
 SEEDS = range(1000, 1010)
@@ -47,7 +47,7 @@ KEY = (*RUN, "T", "terrain", "size", "controller")
 
 
 def names(terrain: str, size: float) -> list[str]:
-    """As diffsim.terrain.named_terrains takes them."""
+    """As diffsim.planning.terrains.named_terrains takes them."""
     kind, segment = terrain.split()[0], "1" if "1 m" in terrain else "2"
     if kind.startswith("rough"):
         return [f"rough:{size:g}:{segment}:{seed}:{PLACES[0]}" for seed in SEEDS]

@@ -13,6 +13,7 @@ import os
 import platform
 import shutil
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
@@ -21,7 +22,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from diffsim import TASKS, load_scene, startup
+from diffsim import TASKS, SceneError, load_scene, startup
 from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
 from diffsim.training import command, evaluate, export_policy, fail, load_policy, make_policy_env
@@ -51,9 +52,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if args.command == "demo":
             demo(args.task, args.output)
         elif args.command == "check":
-            text, fits = report_robot(args.robot)
-            print(text)
-            sys.exit(0 if fits else 1)
+            check(args.robot)
         elif args.command == "export":
             export(args.checkpoint, args.output)
         else:
@@ -80,6 +79,17 @@ def demo(task: str, output: Path) -> None:
     evaluation = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
     print(f"{task}, {saved.script}.py, iteration {saved.iteration}, {DEMO_EPISODES} episodes: {evaluation}")
     print(f"video: {evaluation.save_video(output, DEMO_SECONDS)}")
+
+
+def check(robot: Path) -> None:
+    """Print what the simulator makes of an MJCF file; exit code 1 if it refuses the file."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the report has them all
+            print(report_robot(load_scene(robot)))
+    except SceneError as error:
+        print(f"Cannot be simulated.\n\n{error}")
+        sys.exit(1)
 
 
 def export(checkpoint: Path, output: Path) -> None:

@@ -206,7 +206,7 @@ class DiffEnv(VectorEnv):
         with torch.no_grad():
             self.episode_step += 1
             self._episode_return += reward
-            terminated = self.task.terminated(obs) | nonfinite if self.early_termination else nonfinite
+            terminated = (self.task.terminated(obs) if self.early_termination else self.task.over(obs)) | nonfinite
             truncated = (self.episode_step >= self.episode_length) & ~terminated
             done = terminated | truncated
             length = self.episode_step.clone()

@@ -22,7 +22,7 @@ import gps
 from diffsim.planning import LinearGaussian, gaussian_log_prob, load_demonstration, save_demonstration
 from diffsim.planning.lbfgs import maximise
 from diffsim.planning.samples import log_mixture, log_weights, phi
-from diffsim.terrain import named_terrains
+from diffsim.planning.terrains import named_terrains
 from diffsim.training import evaluate, load_policy
 from diffsim.training.checkpoint import load, restore
 from diffsim.view import render
@@ -561,6 +561,7 @@ def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None
         ("--env hopper --terrain hill", "terrain 'hill' must be level, incline:DEGREES"),
         ("--env hopper --terrain level step:0", "terrain 'step:0': height is 0.0"),
         ("--env hopper --terrain", "--terrain needs at least one name: level, incline:DEGREES"),
+        ("--env hopper --terrain rough:10:1:inf", "terrain 'rough:10:1:inf'"),
         ("--env hopper --practice incline:100", "terrain 'incline:100': degrees is 100.0"),
         ("--env hopper --practice rough:10 step:nan", "terrain 'step:nan': height is nan"),
         ("--env cartpole --horizon 4611686018427387904", "--horizon must be from 1 to 10,000, not 46"),

@@ -15,7 +15,7 @@ from learners import run
 from tables import markdown, read_csv
 
 import gps
-from diffsim.terrain import named_terrains
+from diffsim.planning.terrains import named_terrains
 
 SMALL = (
     "--env hopper --horizon 3 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 --samples 2 "
