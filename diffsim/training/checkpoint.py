@@ -148,13 +148,10 @@ def _is_count(number: int) -> bool:
 
 
 def _is_policy(policy: dict[str, Any]) -> bool:
-    layers, weights = policy.get("layers"), policy.get("weights")
-    return (
-        fits(dict[str, Tensor], weights)
-        and fits(list[list[Any]], layers)
-        and all(layer and layer[0] in LAYERS for layer in layers)
-        and all(weight.layout == torch.strided and weight.device.type == "cpu" for weight in weights.values())
-    )
+    if not fits(list[list[Any]], policy.get("layers")) or not fits(dict[str, Tensor], policy.get("weights")):
+        return False
+    known = all(layer and layer[0] in LAYERS for layer in policy["layers"])
+    return known and all(w.layout == torch.strided and w.device.type == "cpu" for w in policy["weights"].values())
 
 
 def _is_rank(rank: dict[str, Any]) -> bool:
