@@ -539,7 +539,7 @@ def test_settings_are_those_of_the_other_scripts(algorithm: str, script: ModuleT
     [
         ("--particles 1", "--particles must be from 2 to 1,000 with --policy pfpn, not 1"),
         ("--particles 100000 --policy gmm", "--particles must be from 2 to 1,000 with --policy gmm, not 100000"),
-        (f"--hidden {2**62}", f"--hidden must be from 1 to 65,536, not {2**62}"),
+        (f"--hidden {2**62}", f"--hidden must be from 1 to 16,384, not {2**62}"),
         ("--dead 1", "--dead 1: with equal weights all particles would be dead"),
         ("--policy discrete --algorithm sac", "--policy discrete has no density"),
         ("--policy discrete --algorithm shac --estimator implicit", "choose --estimator straight-through or mixed"),

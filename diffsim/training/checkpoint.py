@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim.env import DiffEnv
+from diffsim.tasks import TASKS
 from diffsim.training.errors import fail
 from diffsim.training.layers import Likeliest, ObsNormalizer
 from diffsim.training.ranges import fits
@@ -193,12 +194,14 @@ def load_policy(path: Path) -> SavedPolicy:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
             network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
             kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
+            if task := TASKS.get(state["args"]["env"]):
+                network(torch.empty(1, task.obs_dim))
         weights = state["policy"]["weights"]
         if any(weights[name].dtype != kind for name, kind in kinds.items()):
             raise TypeError
         network.load_state_dict(weights, assign=True)
-    except (KeyError, RuntimeError, TypeError, ValueError):
-        fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers")
+    except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
+        fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers or its task")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"])
 
 

@@ -35,7 +35,7 @@ def _whole(least: int, most: int) -> Range:
 Count = Annotated[int, _whole(1, 10**9)]
 Natural = Annotated[int, _whole(0, 10**9)]
 Repeats = Annotated[int, _whole(1, 10_000)]  # passes, networks: what takes time or memory one after the other
-Width = Annotated[int, _whole(1, 65_536)]
+Width = Annotated[int, _whole(1, 16_384)]
 Finite = Annotated[float, Range("finite", math.isfinite)]
 Positive = Annotated[float, Range("positive", lambda value: value > 0)]
 NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]

@@ -176,6 +176,15 @@ def test_what_a_run_cannot_resume_is_one_line(
     refusal(lambda: shac.main(["--resume", str(damaged), "--iterations", "3", "--quiet"]), capsys)
 
 
+def test_the_policy_of_another_robot_is_one_line(
+    tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state, path = torch.load(tiny_run / "checkpoint.pt"), tmp_path / "checkpoint.pt"
+    torch.save(state | {"args": state["args"] | {"env": "hopper"}}, path)
+    for call in (lambda: load_policy(path), lambda: shac.main(["--evaluate", str(path)])):
+        assert "its policy's weights do not fit its layers or its task" in refusal(call, capsys)
+
+
 def test_a_damaged_clip_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, qpos = tmp_path / "checkpoint.pt", torch.zeros(9, 30, dtype=torch.float64)
     for wrong in (dict(qpos=None), dict(loop=1.0), dict(qpos=qpos.float()), dict(qpos=qpos / 0), dict(name="\x1b")):
