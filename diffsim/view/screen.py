@@ -93,10 +93,9 @@ class Window:
         software = render.check_display()
         import mujoco.viewer
 
-        self.model = model = copy.copy(scene.mj_model)
+        self.model, material = model, _ = render.drawable(scene)
         if software:
             render.lower_quality(model)
-        material = -1 if scene.terrain is None else render.hide_planes(model)
         self.data = mujoco.MjData(model)
         self.speed, self.paused, self.restart = 1.0, False, False
         self._control_dt, self._due = control_dt, time.perf_counter()
