@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from diffsim.robot.scene import Array, Index, Scene
 
 Flags = NDArray[np.bool_]
+Frames = NDArray[np.intp]
 Rows = NDArray[np.floating[Any]]
 
 EPISODES = 8  # how many are looked at
@@ -212,13 +213,13 @@ def _feet(names: Sequence[str], contacts: Sequence[Flags], dt: float) -> tuple[F
     return tuple(feet)
 
 
-def touch_downs(contact: Flags, dt: float) -> Index:
+def touch_downs(contact: Flags, dt: float) -> Frames:
     """Frames in which a foot lands after more than BOUNCE seconds in the air; contact (F,), dt in s."""
     down = np.flatnonzero(contact)
     return down[np.diff(down, prepend=-1) - 1 > BOUNCE / dt + 1e-6]
 
 
-def _phases(first: Index, landings: Index) -> Array:
+def _phases(first: Frames, landings: Frames) -> Array:
     """In [0, 1), of the landings within the strides between two landings of the first foot."""
     stride = np.searchsorted(first, landings, side="right") - 1
     inside = (stride >= 0) & (stride < len(first) - 1)
