@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -99,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def show(args: Args) -> None:
     path = args.paths[0]
     saved = load_policy(path / "checkpoint.pt" if path.is_dir() else path)
-    changes = {} if args.substeps is None else {"substeps": args.substeps}
+    changes: dict[str, Any] = {} if args.substeps is None else {"substeps": args.substeps}
     task, name = saved.args["env"], f"{saved.script}.py, iteration {saved.iteration}"
     if args.viewer:
         print(f"{task}, {name}", (__doc__ or "").rstrip().rpartition("\n\n")[2], sep="\n")

@@ -6,7 +6,7 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
@@ -31,7 +31,7 @@ DEMO_SECONDS = 4.0  # of it
 def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
     argv = sys.argv[1:] if argv is None else argv
-    commands = {"demo": demo, "check": check, "export": export}
+    commands: dict[str, Callable[..., object]] = {"demo": demo, "check": check, "export": export}
     try:
         if argv:
             tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="python -m diffsim", description=__doc__)

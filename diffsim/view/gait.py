@@ -144,8 +144,7 @@ class Trace(NamedTuple):
 
 def trace(scene: Scene, qpos: Array) -> Trace:
     """The trace of qpos (F, nq)."""
-    model, bodies = scene.mj_model, contact_bodies(scene)
-    data = mujoco.MjData(model)
+    model, data, bodies = scene.mj_model, mujoco.MjData(scene.mj_model), contact_bodies(scene)
     # A link's frame has the axes of its body and sits at the anchor of its joint.
     centre = model.jnt_pos[model.body_jntadr[bodies] + model.body_jntnum[bodies] - 1] + scene.contact_position
     moved = np.zeros((len(qpos), scene.nv))  # from the state before, in the units of qvel times s
@@ -185,13 +184,12 @@ def _limbs(scene: Scene, touching: Flags) -> dict[str, Flags]:
     for body in range(len(parent)):
         above.append((*above[parent[body]], body) if parent[body] else ())
     down = [b for b in np.unique(bodies).tolist() if above[b] and touching[:, bodies == b].any(1).mean() >= TOUCHING]
-    limbs = dict[int, list[int]]()
+    limbs, names = dict[int, list[int]](), dict[str, Flags]()
     for body in down:
         top = next(other for other in above[body] if other in down)
         if above[parent[top]] and sum(parent[other] == parent[top] for other in down) > 1:
             top = parent[top]  # toes of a foot that itself does not touch
         limbs.setdefault(top, []).append(body)
-    names = dict[str, Flags]()
     for limb in limbs.values():
         tips = [set(above[body]) for body in limb if not any(body in above[other][:-1] for other in limb)]
         lowest = max(set.intersection(*tips))  # numbers grow from the trunk down
@@ -202,14 +200,15 @@ def _limbs(scene: Scene, touching: Flags) -> dict[str, Flags]:
 def _feet(names: Sequence[str], contacts: Sequence[Flags], dt: float) -> tuple[Foot, ...]:
     """The feet that touched the ground in contacts (feet, F) of each episode; dt s between frames."""
     landings = [[touch_downs(foot, dt) for foot in contact] for contact in contacts]
-    counts = np.array([[len(foot) for foot in episode] for episode in landings]).sum(0).tolist()
+    counts = [sum(map(len, foot)) for foot in zip(*landings, strict=True)]
     frames, feet = sum(contact.shape[-1] for contact in contacts), []
-    for k, name in enumerate(names):
+    for k, (name, count) in enumerate(zip(names, counts, strict=True)):
         duty = float(sum(contact[k].sum() for contact in contacts) / frames)
         turns = np.exp(2j * np.pi * np.concatenate([_phases(episode[0], episode[k]) for episode in landings]))
-        phase = float(round(np.angle(turns.mean()) / (2 * np.pi), 9) % 1.0) if len(turns) else None
-        steadiness = float(abs(turns.mean())) if len(turns) else None
-        feet.append(Foot(name, duty, phase, steadiness, counts[k] / max(sum(counts), 1), counts[k] / (frames * dt)))
+        mean = turns.mean() if len(turns) else None
+        phase = None if mean is None else float(round(np.angle(mean) / (2 * np.pi), 9) % 1.0)
+        steadiness = None if mean is None else float(abs(mean))
+        feet.append(Foot(name, duty, phase, steadiness, count / max(sum(counts), 1), count / (frames * dt)))
     return tuple(feet)
 
 

@@ -68,8 +68,8 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
     geoms = []
     for k in np.flatnonzero(~planes & (model.geom_group < HIDDEN_GROUP) & (rgba[:, 3] > 0)):
         kind = mujoco.mjtGeom(model.geom_type[k]).name.removeprefix("mjGEOM_").lower()
-        body, *place = model.geom_bodyid[k], model.geom_size[k], model.geom_pos[k], model.geom_quat[k]
-        geoms.append(_shape(kind if kind in SHAPES else "box", body, *place, rgba[k]))
+        kind, body = kind if kind in SHAPES else "box", model.geom_bodyid[k]
+        geoms.append(_shape(kind, body, model.geom_size[k], model.geom_pos[k], model.geom_quat[k], rgba[k]))
     for size, centre, rotation in [] if scene.terrain is None else slabs(scene.terrain[0]):  # the first profile
         mujoco.mju_mat2Quat(quat := np.empty(4), rotation.ravel())
         geoms.append(_shape("box", 0, size, centre, quat, GROUND))
