@@ -6,6 +6,7 @@ import os
 import platform
 import shutil
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
@@ -16,7 +17,7 @@ import tyro
 import warp as wp
 from tyro.conf import Positional
 
-from diffsim import TASKS, load_scene, startup
+from diffsim import TASKS, SceneError, load_scene, startup
 from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
 from diffsim.training import command, evaluate, export_policy, fail, load_policy, make_policy_env
@@ -62,10 +63,14 @@ def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None
 
 
 def check(robot: Positional[Path]) -> None:
-    """Say what of an MJCF file is used, approximated and refused."""
-    text, fits = report_robot(robot)
-    print(text)
-    sys.exit(0 if fits else 1)
+    """Say what of an MJCF file is used, approximated and refused; exit code 1 if it is refused."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the report has them all
+            print(report_robot(load_scene(robot)))
+    except SceneError as error:
+        print(f"Cannot be simulated.\n\n{error}")
+        sys.exit(1)
 
 
 def export(checkpoint: Positional[Path], output: Positional[Path]) -> None:

@@ -1,30 +1,147 @@
-"""Constants of contact and limits where a file names none, from the robot's inertia and the file's own solref.
+"""What a compiled MJCF says beyond its arrays: names, flags, which geoms touch the ground, and constants of contact.
 
-MuJoCo's solref (timeconst, dampratio) asks for a constraint that recovers like a damped spring of 1 / (timeconst
-dampratio)^2 and 2 / timeconst per unit of inertia, under a load that the solver has mostly cancelled. A real spring
-carries the load itself; FIRMNESS makes up for that as well as one number can (measured over gymnasium's robots).
+Where a file names no constants, they follow from the robot's inertia and the file's own solref. MuJoCo's solref
+(timeconst, dampratio) asks for a constraint that recovers like a damped spring of 1 / (timeconst dampratio)^2 and
+2 / timeconst per unit of inertia, under a load that the solver has mostly cancelled. A real spring carries the load
+itself; FIRMNESS makes up for that as well as one number can (measured over gymnasium's robots).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from diffsim.robot.scene import Array
+
+Kind = mujoco.mjtObj
 
 STEP = 1 / 960  # s, 16 substeps of 1/60 s: explicit steps up to this one are stable with these constants
 CARRIERS = 4  # contact points that share the weight of a robot that has more
 FIRMNESS = 2.0  # times what solref asks for
 REBOUND = 2.0  # s/m, k_d / k_n at a dampratio of 1: the ground stops pushing what leaves at half a metre a second
 LIMIT_REBOUND = 4.0  # s/m or s/rad, d_limit / k_limit likewise
+# Contact points of a geom, by its type
+POINTS = {
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")): n for shape, n in (("SPHERE", 1), ("CAPSULE", 2), ("BOX", 8))
+}
+
+
+# Names, flags and kinds -----------------------------------------------------------------------------------------------
+
+
+def label(m: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+    """The quoted name of an element, or its number and its body's name."""
+    if name := mujoco.mj_id2name(m, kind, index):
+        return repr(name)
+    bodies = {Kind.mjOBJ_GEOM: m.geom_bodyid, Kind.mjOBJ_JOINT: m.jnt_bodyid, Kind.mjOBJ_SITE: m.site_bodyid}
+    body = mujoco.mj_id2name(m, Kind.mjOBJ_BODY, bodies[kind][index]) if kind in bodies else ""
+    return f"number {index}" + (f" of body {body!r}" if body else "")
+
+
+def text(m: mujoco.MjModel, name: str, default: str) -> str:
+    """The <custom><text> of that name."""
+    index = mujoco.mj_name2id(m, Kind.mjOBJ_TEXT, name)
+    return m.text_data[m.text_adr[index] :].partition(b"\0")[0].decode() if index >= 0 else default
+
+
+def numeric(m: mujoco.MjModel, name: str) -> Array:
+    """The numbers of the <custom><numeric> of that name; none if the file has no such element."""
+    index = mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, name)
+    values: Array = m.numeric_data[m.numeric_adr[index] :][: m.numeric_size[index]] if index >= 0 else np.zeros(0)
+    return values
+
+
+def floating(m: mujoco.MjModel) -> bool:
+    """Whether the robot has a free joint."""
+    return bool((m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+
+
+def is_motor(m: mujoco.MjModel, a: int) -> bool:
+    """Whether an actuator's force is its control times a constant."""
+    return bool(
+        m.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_NONE
+        and m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
+        and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
+    )
+
+
+def disabled_flags(m: mujoco.MjModel) -> set[str]:
+    """Names of <flag> that the file disables."""
+    return _set_bits(mujoco.mjtDisableBit.__members__, "mjDSBL_", m.opt.disableflags)
+
+
+def enabled_flags(m: mujoco.MjModel) -> set[str]:
+    """Names of <flag> that the file enables and that are not so by default."""
+    return _set_bits(mujoco.mjtEnableBit.__members__, "mjENBL_", m.opt.enableflags)
+
+
+def _set_bits(bits: Mapping[str, int], prefix: str, flags: int) -> set[str]:
+    names = [name for name, bit in bits.items() if name.startswith(prefix) and flags & int(bit)]
+    return {name.removeprefix(prefix).lower() for name in names}
+
+
+# Which geoms touch ----------------------------------------------------------------------------------------------------
+
+
+class PairLaw(NamedTuple):
+    """A contact between two geoms, by MuJoCo's rules for what the two ask for."""
+
+    condim: int
+    friction: float
+    solref: tuple[float, float]
+
+
+def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
+    """(fixed geom, moving geom) that may touch."""
+    weld = m.body_weldid[m.geom_bodyid]
+    moving = np.flatnonzero(weld)
+    return [(s, g) for s in np.flatnonzero(weld == 0).tolist() for g in moving[_collide(m, s, moving)].tolist()]
+
+
+def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Moving geoms, each with the later ones of other bodies that it may touch."""
+    weld = m.body_weldid[m.geom_bodyid]
+    parent = m.body_weldid[m.body_parentid[weld]]
+    filters = "filterparent" not in disabled_flags(m)
+    moving = np.flatnonzero(weld)
+    for k, a in enumerate(moving.tolist()):
+        b = moving[k + 1 :]
+        related = (parent[a] == weld[b]) | (parent[b] == weld[a])
+        if len(b := b[(weld[a] != weld[b]) & ~(filters & related) & _collide(m, a, b)]):
+            yield a, b
+
+
+def _collide(m: mujoco.MjModel, a: int, b: NDArray[np.int64]) -> NDArray[np.bool_]:
+    masks = (m.geom_contype[a] & m.geom_conaffinity[b]) | (m.geom_contype[b] & m.geom_conaffinity[a])
+    bodies = m.geom_bodyid[a], m.geom_bodyid[b]
+    excluded = np.isin((np.minimum(*bodies) << 16) + np.maximum(*bodies), m.exclude_signature)
+    touch: NDArray[np.bool_] = (masks != 0) & ~excluded
+    return touch
+
+
+def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
+    """The geom of higher priority decides; of equals friction and condim are the larger, solref is the mean."""
+    geoms = [a, b]
+    if m.geom_priority[a] != m.geom_priority[b]:
+        geoms = [a if m.geom_priority[a] > m.geom_priority[b] else b] * 2
+    solref, weight = m.geom_solref[geoms], m.geom_solmix[geoms]
+    if geoms[0] == geoms[1] or not (solref[:, 0] > 0).all():
+        mixed = solref.min(0)
+    else:
+        mixed = np.average(solref, axis=0, weights=weight if weight.min() >= 0 and 0 < weight.sum() < np.inf else None)
+    friction = float(m.geom_friction[geoms, 0].max())
+    return PairLaw(int(m.geom_condim[geoms].max()), friction, (float(mixed[0]), float(mixed[1])))
+
+
+# Constants ------------------------------------------------------------------------------------------------------------
 
 
 class Recovery(NamedTuple):
-    """Of a constraint, per unit of inertia."""
+    """A constraint's return to zero, per unit of inertia."""
 
     stiffness: float  # 1/s^2
     damping: float  # 1/s
@@ -35,10 +152,11 @@ class Recovery(NamedTuple):
 
 
 def asked(solref: Sequence[float] | Array) -> Recovery:
-    """FIRMNESS times what solref asks for."""
+    """FIRMNESS times what solref asks for; infinite beyond what a number holds."""
     first, second = map(float, solref)
     if first > 0:
-        return Recovery(FIRMNESS / (first * second) ** 2, FIRMNESS * 2 / first)
+        square = (first * second) ** 2
+        return Recovery(FIRMNESS / square if square > 0 else np.inf, FIRMNESS * 2 / first)
     return Recovery(-FIRMNESS * first, -FIRMNESS * second)  # MuJoCo's direct format
 
 
@@ -65,10 +183,20 @@ def contact_constants(mass: float, mobility: Array, solref: Sequence[float]) -> 
     return {"k_n": float(k_n), "k_d": float(REBOUND * rates.damping_ratio * k_n), "k_t": lightest / (2 * STEP)}
 
 
+def limit_constants(m: mujoco.MjModel) -> tuple[Array, Array]:
+    """k_limit, d_limit (nv,): what solreflimit asks for, times the inertia that the joint moves."""
+    inertia = 1 / np.diag(np.linalg.inv(mass_matrix(m)))
+    rates = [recovery(m.jnt_solref[joint]) for joint in m.dof_jntid]
+    k_limit: Array = inertia * np.array([rate.stiffness for rate in rates])
+    return k_limit, LIMIT_REBOUND * k_limit * np.array([rate.damping_ratio for rate in rates])
+
+
 def mass_matrix(m: mujoco.MjModel) -> Array:
     """(nv, nv) in the reference pose, as all inertias here; armature included."""
     data = mujoco.MjData(m)
-    mujoco.mj_forward(m, data)
+    mujoco.mj_kinematics(m, data)
+    mujoco.mj_comPos(m, data)
+    mujoco.mj_makeM(m, data)
     matrix = np.eye(m.nv)
     for row, unit in zip(matrix, np.eye(m.nv), strict=True):
         mujoco.mj_mulM(m, data, row, unit)
@@ -90,11 +218,3 @@ def mobilities(m: mujoco.MjModel, points: Sequence[tuple[int, Array]]) -> Array:
     response = jacobians @ np.linalg.inv(mass_matrix(m)) @ jacobians.transpose(0, 2, 1)
     mobility: Array = np.linalg.eigvalsh(response)[:, -1]
     return mobility
-
-
-def limit_constants(m: mujoco.MjModel) -> tuple[Array, Array]:
-    """k_limit, d_limit (nv,): what solreflimit asks for, times the inertia that the joint moves."""
-    inertia = 1 / np.diag(np.linalg.inv(mass_matrix(m)))
-    rates = [recovery(m.jnt_solref[joint]) for joint in m.dof_jntid]
-    k_limit: Array = inertia * np.array([rate.stiffness for rate in rates])
-    return k_limit, LIMIT_REBOUND * k_limit * np.array([rate.damping_ratio for rate in rates])

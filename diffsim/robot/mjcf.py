@@ -1,24 +1,39 @@
-"""MJCF -> Scene, by way of MuJoCo's compiler; obstacles.py refuses what is not simulated."""
+"""MJCF -> Scene, by way of MuJoCo's compiler; refuse.py names what is not simulated."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from diffsim.robot.approximations import approximations
-from diffsim.robot.constants import contact_constants, limit_constants, mobilities
-from diffsim.robot.ground import PairLaw, disabled_flags, ground_pairs, pair_law
-from diffsim.robot.refuse import floating, is_motor, obstacles, text
+from diffsim.robot.constants import (
+    PairLaw,
+    contact_constants,
+    disabled_flags,
+    floating,
+    ground_pairs,
+    is_motor,
+    limit_constants,
+    mobilities,
+    numeric,
+    pair_law,
+    text,
+)
+from diffsim.robot.refuse import check_actuators, obstacles
+from diffsim.robot.report import approximations, troubles
 from diffsim.robot.scene import Array, Scene, SceneError
+
+MOST_BYTES = 2e6  # of an MJCF without its meshes; MuJoCo takes half a minute for them
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read an MJCF file.
+    """Read an MJCF file; a warning tells of a robot that leaves the finite numbers at once or is slow to simulate.
 
     Raises:
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
@@ -26,6 +41,10 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     file = Path(path)
     if not file.is_file():
         raise SceneError(f"robot file {str(path)!r} does not exist")
+    if file.stat().st_size > MOST_BYTES:
+        raise SceneError(
+            f"robot file {str(path)!r} has {file.stat().st_size / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:g}"
+        )
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
@@ -35,6 +54,9 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         lines = found if len(found) == 1 else [f"{len(found)} things keep it from being simulated:", *found]
         raise SceneError(f"{file.name}: " + "\n  ".join(lines))
     scene = _Reader(model, file).scene()
+    check_actuators(scene)
+    for sentence in troubles(scene):
+        warnings.warn(f"{file.name}: {sentence}", stacklevel=2)
     return dataclasses.replace(scene, approximations=approximations(scene))
 
 
@@ -71,31 +93,31 @@ class Sphere(NamedTuple):
     geom: int
 
 
+class Segment(NamedTuple):
+    """A straight piece of a muscle's path between two links, the lower one first; ends in their frames."""
+
+    links: tuple[int, int]
+    ends: Array
+    actuator: int
+
+
 class _Reader:
-    """Walks a compiled MjModel once, body by body."""
+    """Walks a compiled MjModel once, body by body. The links after the base are its degrees of freedom, in order."""
 
     def __init__(self, model: mujoco.MjModel, file: Path) -> None:
-        self.m = model
-        self.file = file
-        self.links: list[dict[str, Any]] = []
-        self.joint_link: dict[int, int] = {}
-        self.k_limit, self.d_limit = self._limits()
+        self.m, self.file = model, file
+        self.first = 6 if floating(model) else 0  # degrees of freedom of the base
+        self.nlink = 1 + model.nv - self.first
+        self.parent = np.zeros(self.nlink, np.int32)
+        self.rotation, self.position = np.tile(np.eye(3), (self.nlink, 1, 1)), np.zeros((self.nlink, 3))
         # Of each body: its link (-1: fixed to the world of a floating scene) and its pose in the link's frame.
-        self.body: list[tuple[int, Array, Array]] = [(-1, np.eye(3), np.zeros(3))]
+        self.body: list[tuple[int, Array, Array]] = [(-1 if self.first else 0, np.eye(3), np.zeros(3))]
 
     def scene(self) -> Scene:
         m = self.m
-        if not floating(m):
-            self._add_link(parent=0)
-            self.body[0] = (0, np.eye(3), np.zeros(3))
         for body in range(1, m.nbody):
             self._read_body(body)
-        columns: dict[str, Any] = {key: np.array([link[key] for link in self.links]) for key in self.links[0]}
-        mass = columns.pop("mass")
-        com = columns.pop("moment") / np.where(mass > 0, mass, 1.0)[:, None]
-        about_origin = columns.pop("inertia")
-        inertia = about_origin + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
-        columns |= {key: columns[key].astype(np.int32) for key in ("parent", "ball")}
+        joints, inertias = self._joints(), self._inertias()
         return Scene(
             name=self.file.stem,
             path=str(self.file),
@@ -103,48 +125,23 @@ class _Reader:
             floating=floating(m),
             nq=m.nq,
             nv=m.nv,
-            mass=mass,
-            com=com,
-            inertia=inertia,
+            parent=self.parent,
+            rotation=self.rotation,
+            position=self.position,
+            **joints,
+            **inertias,
+            **self._actuators(),
+            **self._contacts(float(inertias["mass"].sum()), joints["slide"]),
+            body_link=np.array([link for link, _, _ in self.body], np.int32),
+            body_com=np.array([p + r @ com for (_, r, p), com in zip(self.body, m.body_ipos, strict=True)]),
             gravity=np.array(m.opt.gravity),
             density=float(m.opt.density),
             viscosity=float(m.opt.viscosity),
-            **columns,
-            **self._actuators(),
-            **self._contacts(float(mass.sum())),
-            body_link=np.array([link for link, _, _ in self.body], np.int32),
-            body_com=np.array([p + r @ com for (_, r, p), com in zip(self.body, m.body_ipos, strict=True)]),
         )
 
-    def _add_link(self, parent: int, joint: int = -1, ball: int = -1, **values: Any) -> int:
-        m = self.m
-        dof, adr = (m.jnt_dofadr[joint], m.jnt_qposadr[joint]) if joint >= 0 else (-1, -1)
-        moving = joint >= 0 and m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE
-        limited, scalar = moving and m.jnt_limited[joint], moving and ball < 0
-        axis = np.array(m.jnt_axis[joint]) if scalar else np.zeros(3)
-        link = {
-            "parent": parent,
-            "slide": moving and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE,
-            "ball": ball,
-            "rotation": np.eye(3),
-            "position": np.zeros(3),
-            "axis": np.eye(3)[ball] if ball >= 0 else axis,
-            "joint_ref": m.qpos0[adr] if scalar else 0.0,
-            "armature": m.dof_armature[dof] if moving else 0.0,
-            "damping": m.dof_damping[dof] if moving else 0.0,
-            "stiffness": m.jnt_stiffness[joint] if moving else 0.0,
-            "spring_ref": m.qpos_spring[adr] if scalar else 0.0,  # a ball's is the identity in every MJCF
-            "lower": m.jnt_range[joint, 0] if limited else -np.inf,
-            "upper": m.jnt_range[joint, 1] if limited else np.inf,
-            "k_limit": self.k_limit[dof] if limited else 0.0,
-            "d_limit": self.d_limit[dof] if limited else 0.0,
-            "mass": 0.0,
-            "moment": np.zeros(3),
-            "inertia": np.zeros((3, 3)),
-        }
-        self.links.append(link | values)
-        self.joint_link[joint] = len(self.links) - 1
-        return len(self.links) - 1
+    def _link(self, joint: int) -> int:
+        """The first link of a joint."""
+        return int(self.m.jnt_dofadr[joint]) - self.first + 1
 
     def _read_body(self, body: int) -> None:
         m = self.m
@@ -153,96 +150,128 @@ class _Reader:
         position = parent_position + parent_rotation @ m.body_pos[body]
         joints = range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])
         if joints and m.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_FREE:
-            link = self._add_link(parent=0, joint=joints[0])
-            rotation, position = np.eye(3), np.zeros(3)
+            link, rotation, position = 0, np.eye(3), np.zeros(3)
         else:
             for joint in joints:
                 anchor = np.array(m.jnt_pos[joint])
                 position = position + rotation @ anchor
-                for ball in range(3) if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else (-1,):
-                    link = self._add_link(link, joint, ball, rotation=rotation, position=position)
+                for k in range(3 if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL else 1):
+                    parent, link = link, self._link(joint) + k
+                    self.parent[link], self.rotation[link], self.position[link] = parent, rotation, position
                     rotation, position = np.eye(3), np.zeros(3)
                 position = -anchor
         self.body.append((link, rotation, position))
-        if link >= 0:
-            self._add_inertia(self.links[link], body, rotation, position)
 
-    def _add_inertia(self, link: dict[str, Any], body: int, rotation: Array, position: Array) -> None:
+    def _joints(self) -> dict[str, Any]:
+        """Columns (nlink, ...) of the joints; zeros of the base."""
+        m, kind = self.m, mujoco.mjtJoint
+        dof = np.arange(self.first, m.nv)
+        joint = m.dof_jntid[dof]
+        ball, limited = m.jnt_type[joint] == kind.mjJNT_BALL, m.jnt_limited[joint] != 0
+        nth, at = dof - m.jnt_dofadr[joint], m.jnt_qposadr[joint]
+        k_limit, d_limit = self._limits()
+
+        def column(values: Array, base: float = 0.0) -> Array:
+            return np.concatenate((np.full((1, *values.shape[1:]), base), values))
+
+        return {
+            "slide": np.concatenate(([False], m.jnt_type[joint] == kind.mjJNT_SLIDE)),
+            "ball": np.concatenate(([-1], np.where(ball, nth, -1))).astype(np.int32),
+            "axis": column(np.where(ball[:, None], np.eye(3)[nth], m.jnt_axis[joint])),
+            "joint_ref": column(np.where(ball, 0.0, m.qpos0[at])),
+            "armature": column(m.dof_armature[dof]),
+            "damping": column(m.dof_damping[dof]),
+            "stiffness": column(m.jnt_stiffness[joint]),
+            "spring_ref": column(np.where(ball, 0.0, m.qpos_spring[at])),  # a ball's is the identity in every MJCF
+            "lower": column(np.where(limited, m.jnt_range[joint, 0], -np.inf), -np.inf),
+            "upper": column(np.where(limited, m.jnt_range[joint, 1], np.inf), np.inf),
+            "k_limit": column(np.where(limited, k_limit[dof], 0.0)),
+            "d_limit": column(np.where(limited, d_limit[dof], 0.0)),
+        }
+
+    def _inertias(self) -> dict[str, Any]:
+        """mass, com and inertia (nlink, ...) of the bodies that are welded together."""
         m = self.m
-        mass = m.body_mass[body]
-        principal = rotation @ _matrix(m.body_iquat[body])
-        com = position + rotation @ m.body_ipos[body]
-        link["mass"] += mass
-        link["moment"] = link["moment"] + mass * com
-        about_com = principal @ np.diag(m.body_inertia[body]) @ principal.T
-        link["inertia"] = link["inertia"] + about_com - mass * _skew(com) @ _skew(com)
+        mass, moment, inertia = np.zeros(self.nlink), np.zeros((self.nlink, 3)), np.zeros((self.nlink, 3, 3))
+        for body, (link, rotation, position) in enumerate(self.body):
+            if body == 0 or link < 0:
+                continue
+            principal = rotation @ _matrix(m.body_iquat[body])
+            com = position + rotation @ m.body_ipos[body]
+            mass[link] += m.body_mass[body]
+            moment[link] += m.body_mass[body] * com
+            about_com = principal @ np.diag(m.body_inertia[body]) @ principal.T
+            inertia[link] = inertia[link] + about_com - m.body_mass[body] * _skew(com) @ _skew(com)
+        com = moment / np.where(mass > 0, mass, 1.0)[:, None]
+        about_com = inertia + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
+        return {"mass": mass, "com": com, "inertia": about_com}
 
     def _actuators(self) -> dict[str, Any]:
         m = self.m
-        rows = [
-            self._muscle(a) if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON else self._motor(a)
-            for a in range(m.nu)
-        ]
-        segments = sorted((s for row in rows for s in row["segments"]), key=lambda s: (s[0], s[2]))
+        tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
+        low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
+        high = np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
+        link, scale, hill = np.zeros(m.nu, np.int32), np.zeros(m.nu), np.full((m.nu, 9), np.nan)
+        segments: list[Segment] = []
+        for a in range(m.nu):
+            if tendon[a]:
+                constant, pieces = self._path(m.actuator_trnid[a, 0], a)
+                segments += pieces
+                scale[a], hill[a] = self._muscle(a, constant)
+            else:
+                link[a], scale[a] = self._motor(a)
+        segments.sort(key=lambda segment: (segment.links, segment.actuator))
         return {
-            "motor_link": np.array([row["link"] for row in rows], np.int32),
-            "gear": np.array([row["scale"] * (row["high"] - row["low"]) / 2 for row in rows]),
-            "motor_bias": np.array([row["scale"] * (row["high"] + row["low"]) / 2 for row in rows]),
-            "segment_link": np.array([links for links, _, _ in segments], np.int32).reshape(-1, 2),
-            "segment_position": np.array([ends for _, ends, _ in segments]).reshape(-1, 2, 3),
-            "segment_muscle": np.array([muscle for _, _, muscle in segments], np.int32),
-            "hill": np.array([row["hill"] for row in rows]).reshape(-1, 9),
+            "motor_link": link,
+            "gear": scale * (high - low) / 2,
+            "motor_bias": scale * (high + low) / 2,
+            "segment_link": np.array([s.links for s in segments], np.int32).reshape(-1, 2),
+            "segment_position": np.array([s.ends for s in segments]).reshape(-1, 2, 3),
+            "segment_muscle": np.array([s.actuator for s in segments], np.int32),
+            "hill": hill,
             "muscle_model": text(m, "muscle_model", "linear"),
         }
 
-    def _motor(self, a: int) -> dict[str, Any]:
+    def _motor(self, a: int) -> tuple[int, float]:
+        """Link, and force per control."""
         m = self.m
         joint, axis = m.actuator_trnid[a, 0], 0
-        ball = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
-        if ball:  # a torque about one axis of the turned body's frame
+        if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
             axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
-        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (-1.0, 1.0)
-        link = self.joint_link[joint] + (axis - 2 if ball else 0)
-        scale = m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
-        return {"link": link, "scale": scale, "low": low, "high": high, "segments": [], "hill": [np.nan] * 9}
+        return self._link(joint) + axis, m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
 
-    def _muscle(self, a: int) -> dict[str, Any]:
-        m = self.m
-        strength = self._numeric("muscle_strength", 1.0)
-        low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (0.0, 1.0)
-        gain = m.actuator_gainprm[a, :9]
-        scale = -strength * m.actuator_gear[a, 0] * gain[0]
-        constant, segments = self._path(m.actuator_trnid[a, 0], a)
-        hill = [np.nan] * 9
-        if not is_motor(m, a):
-            start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
-            scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
-            near, far = m.actuator_lengthrange[a]
-            fibre = (far - near) / (end - start)  # m, where the muscle is strongest
-            hill = [constant, 1 / fibre, start - near / fibre, 1 / (fibre * vmax), lmin, lmax, fpmax, fvmax, scale]
-        return {"link": 0, "scale": scale, "low": low, "high": high, "segments": segments, "hill": hill}
+    def _muscle(self, a: int, constant: float) -> tuple[float, list[float]]:
+        """Force per activation, and the numbers of the Hill-type model; constant: length of the path within links."""
+        m, strength, gain = self.m, self._numeric("muscle_strength", 1.0), self.m.actuator_gainprm[a, :9]
+        if is_motor(m, a):
+            return -strength * m.actuator_gear[a, 0] * gain[0], [np.nan] * 9
+        start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
+        scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
+        near, far = m.actuator_lengthrange[a]
+        fibre = (far - near) / (end - start)  # m, where the muscle is strongest
+        return scale, [constant, 1 / fibre, start - near / fibre, 1 / (fibre * vmax), lmin, lmax, fpmax, fvmax, scale]
 
-    def _path(self, tendon: int, actuator: int) -> tuple[float, list[tuple[tuple[int, int], Array, int]]]:
-        """Of a tendon the length within links, and the segments between two: (links, end points, actuator)."""
-        m = self.m
-        points: list[tuple[int, Array]] = []
+    def _path(self, tendon: int, actuator: int) -> tuple[float, list[Segment]]:
+        """The length of a tendon within links, and its segments between two."""
+        m, points = self.m, list[tuple[int, Array]]()
         for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
             link, rotation, position = self.body[m.site_bodyid[site]]
             points.append((link, position + rotation @ m.site_pos[site]))
-        constant, segments = 0.0, []
+        constant, segments = 0.0, list[Segment]()
         for (i, a), (j, b) in zip(points, points[1:], strict=False):
             if i == j:
                 constant += float(np.linalg.norm(b - a))
             else:
-                segments.append(((i, j) if i < j else (j, i), np.array([a, b] if i < j else [b, a]), actuator))
+                ends = [a, b] if i < j else [b, a]
+                segments.append(Segment((min(i, j), max(i, j)), np.array(ends), actuator))
         return constant, segments
 
-    def _contacts(self, mass: float) -> dict[str, Any]:
+    def _contacts(self, mass: float, slide: NDArray[np.bool_]) -> dict[str, Any]:
         m = self.m
         data = mujoco.MjData(m)
         mujoco.mj_kinematics(m, data)
         pairs = ground_pairs(m)
-        spheres = self._outer_spheres([sphere for _, geom in pairs for sphere in self._spheres(geom)])
+        spheres = self._outer_spheres([sphere for _, geom in pairs for sphere in self._spheres(geom)], slide)
         points = []  # the lowest one of each sphere in the reference pose
         for sphere in spheres:
             body = m.geom_bodyid[sphere.geom]
@@ -272,11 +301,9 @@ class _Reader:
         }
 
     def _spheres(self, geom: int) -> list[Sphere]:
-        m, kind = self.m, mujoco.mjtGeom
+        m, kind, size = self.m, mujoco.mjtGeom, self.m.geom_size[geom]
         link, rotation, position = self.body[m.geom_bodyid[geom]]
-        axes = rotation @ _matrix(m.geom_quat[geom])
-        centre = position + rotation @ m.geom_pos[geom]
-        size = m.geom_size[geom]
+        axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
         if m.geom_type[geom] == kind.mjGEOM_SPHERE:
             return [Sphere(link, centre, size[0], geom)]
         if m.geom_type[geom] == kind.mjGEOM_CAPSULE:
@@ -284,23 +311,23 @@ class _Reader:
         signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
         return [Sphere(link, centre + axes @ (s * size), 0.0, geom) for s in signs]
 
-    def _outer_spheres(self, spheres: list[Sphere]) -> list[Sphere]:
+    def _outer_spheres(self, spheres: list[Sphere], slide: NDArray[np.bool_]) -> list[Sphere]:
         """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""
-
-        def seen_from_parent(sphere: Sphere) -> Sphere:
-            # A centre on the hinge's anchor does not move in the parent's frame.
-            link, centre = sphere.link, sphere.centre
-            while link > 0 and not self.links[link]["slide"] and np.linalg.norm(centre) < 1e-6:
-                centre, link = self.links[link]["position"], self.links[link]["parent"]
-            return Sphere(link, centre, sphere.radius, sphere.geom)
-
-        kept: list[Sphere] = []
-        for sphere in sorted(spheres, key=lambda sphere: -sphere.radius):
-            seen = seen_from_parent(sphere)
-            others = [other for other in map(seen_from_parent, kept) if other.link == seen.link]
-            if not any(np.linalg.norm(o.centre - seen.centre) + seen.radius <= o.radius + 1e-6 for o in others):
-                kept.append(sphere)
-        return sorted(kept, key=lambda sphere: sphere.link)
+        spheres = sorted(spheres, key=lambda sphere: -sphere.radius)
+        # Where each is in the frame of the first link that sees it at rest: a centre on a hinge's anchor stays there.
+        links, centres = [], np.zeros((len(spheres), 3))
+        for k, (link, centre, _, _) in enumerate(spheres):
+            while link > 0 and not slide[link] and np.linalg.norm(centre) < 1e-6:
+                centre, link = self.position[link], int(self.parent[link])
+            centres[k] = centre
+            links.append(link)
+        at, radii = np.array(links, int), np.array([sphere.radius for sphere in spheres])
+        kept = np.zeros(len(spheres), bool)
+        for k in range(len(spheres)):
+            others = np.flatnonzero(kept[:k] & (at[:k] == at[k]))
+            apart = np.linalg.norm(centres[others] - centres[k], axis=1)
+            kept[k] = not (apart + radii[k] <= radii[others] + 1e-6).any()
+        return sorted((spheres[k] for k in np.flatnonzero(kept)), key=lambda sphere: sphere.link)
 
     def _limits(self) -> tuple[Array, Array]:
         """k_limit, d_limit (nv,); a file that names k_limit alone keeps the damping ratio."""
@@ -310,8 +337,8 @@ class _Reader:
         return k_limit, np.array([self._numeric("d_limit", x) for x in d * ratio])
 
     def _numeric(self, name: str, default: float) -> float:
-        index = mujoco.mj_name2id(self.m, mujoco.mjtObj.mjOBJ_NUMERIC, name)
-        return float(self.m.numeric_data[self.m.numeric_adr[index]]) if index >= 0 else default
+        values = numeric(self.m, name)
+        return float(values[0]) if len(values) else default
 
 
 def _matrix(quaternion: Array) -> Array:

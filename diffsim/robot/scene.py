@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.sim.integration import is_real
-from diffsim.terrain import TerrainError, check_terrain
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -34,6 +33,10 @@ MUSCLE_MODELS = ("linear", "hill")
 
 class SceneError(ValueError):
     """An MJCF file that is missing, broken, or holds something that is not simulated; names the element."""
+
+
+class TerrainError(ValueError):
+    """A terrain that cannot be made of its name, or not for a robot."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -252,7 +255,7 @@ class Scene:
         """
         if not self.ncontact:
             raise TerrainError(f"{self.name} touches no ground, so it has no terrain")
-        return dataclasses.replace(self, terrain=check_terrain(vertices), ground_height=0.0)
+        return dataclasses.replace(self, terrain=_check_terrain(vertices), ground_height=0.0)
 
     def without(self, *features: str) -> Scene:
         """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping", "muscle", "drag".
@@ -261,20 +264,14 @@ class Scene:
             ValueError: a feature that cannot be left out.
         """
         n = self.nlink
+        points = "contact_link", "contact_position", "contact_radius"
+        segments = "segment_link", "segment_position", "segment_muscle"
         gone: dict[str, dict[str, Any]] = {
-            "contact": {
-                "contact_link": np.zeros(0, np.int32),
-                "contact_position": np.zeros((0, 3)),
-                "contact_radius": np.zeros(0),
-            },
+            "contact": {name: getattr(self, name)[:0] for name in points},
             "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
             "stiffness": {"stiffness": np.zeros(n)},
             "damping": {"damping": np.zeros(n)},
-            "muscle": {
-                "segment_link": np.zeros((0, 2), np.int32),
-                "segment_position": np.zeros((0, 2, 3)),
-                "segment_muscle": np.zeros(0, np.int32),
-            },
+            "muscle": {name: getattr(self, name)[:0] for name in segments},
             "drag": {"density": 0.0, "viscosity": 0.0},
         }
         changes: dict[str, Any] = {}
@@ -283,3 +280,33 @@ class Scene:
                 raise ValueError(f"cannot leave out {feature!r}; choose from {', '.join(gone)}")
             changes |= gone[feature]
         return dataclasses.replace(self, **changes)
+
+
+def _check_terrain(vertices: ArrayLike) -> Array:
+    """(M, K, 2) float64, M = 1 of a single profile; raises ValueError as Scene.with_terrain does."""
+    try:
+        profiles = np.array(vertices, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError("terrain must be numbers in an array (K, 2) or (environments, K, 2)") from error
+    shape = profiles.shape
+    if profiles.ndim == 2:
+        profiles = profiles[None]
+    if profiles.ndim != 3 or profiles.shape[2] != 2 or profiles.shape[1] < 2 or not len(profiles):
+        raise ValueError(f"terrain has shape {shape}, must be (K, 2) or (environments, K, 2) with K of 2 or more")
+    x, z = profiles[..., 0], profiles[..., 1]
+    run, flat = np.diff(x), np.diff(x) == 0
+    ends = np.zeros_like(flat)
+    ends[:, [0, -1]] = True
+    twice = flat & np.pad(flat, ((0, 0), (1, 0)))[:, :-1]
+    for wrong, why in (
+        (~(np.abs(profiles) <= np.finfo(np.float32).max).all(2), "is not finite"),
+        (run < 0, "has a larger x than the next one; x must ascend"),
+        (flat & (np.diff(z) == 0), "equals the next one"),
+        (flat & ends, "begins a wall at an end of the terrain, where it would go on for ever"),
+        (twice, "ends one wall and begins another; two vertices may share an x, not three"),
+    ):
+        if wrong.any():
+            row, vertex = np.argwhere(wrong)[0]
+            where = f" of environment {row}" if len(profiles) > 1 else ""
+            raise ValueError(f"terrain: vertex {vertex}{where} ({x[row, vertex]:g}, {z[row, vertex]:g}) {why}")
+    return profiles

@@ -141,10 +141,12 @@ class Task:
         raise NotImplementedError
 
     def terminated(self, obs: Tensor) -> Tensor:
-        """Whether the robot has fallen: bool (...)."""
-        if self.min_height is None:
-            return torch.zeros_like(obs[..., 0], dtype=torch.bool)
-        return obs[..., 0] < self.min_height
+        """Whether an episode ends, as the robot has fallen or the task is over: bool (...)."""
+        return self.over(obs) if self.min_height is None else obs[..., 0] < self.min_height
+
+    def over(self, obs: Tensor) -> Tensor:
+        """Whether there is nothing more to do, so that an episode ends without early termination, too: bool (...)."""
+        return torch.zeros_like(obs[..., 0], dtype=torch.bool)
 
 
 def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:

@@ -12,10 +12,9 @@ from typing import NoReturn, ParamSpec
 import torch
 
 from diffsim.env import ActionError
-from diffsim.robot.scene import SceneError
+from diffsim.robot.scene import SceneError, TerrainError
 from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError
-from diffsim.terrain import TerrainError
 from diffsim.training import distributed
 
 P = ParamSpec("P")

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Scene
-from diffsim.terrain import slabs
+from diffsim.view.slabs import slabs
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
 

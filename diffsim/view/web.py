@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Scene
-from diffsim.terrain import slabs
 from diffsim.view.render import GROUND, orbit, whole_file
+from diffsim.view.slabs import slabs
 
 MAX_BYTES = 700_000  # of poses; a longer motion keeps every second control step, or fewer
 HIDDEN_GROUP = 3  # geoms from this group on are not drawn, as in MuJoCo

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
+import zlib
 from importlib.resources import files
 from pathlib import Path
 
@@ -15,7 +16,10 @@ from torch import Tensor
 from diffsim.tasks.imitation.kinematics import difference
 
 CONTROL_DT = 1 / 60  # s
-SHORTEST = 6  # frames
+SHORTEST, LONGEST = 6, 216_000  # frames: 0.1 s and an hour
+MOST_BYTES = 100e6  # of a file, unpacked
+UNREADABLE = OSError, ValueError, TypeError, EOFError, MemoryError, OverflowError, RuntimeError
+FARTHEST, FASTEST = 1e4, 1e3  # m from the origin; m/s or rad/s, and no joint turns by more rad
 BEYOND = math.radians(30)  # joint limits are springs, so that recorded motions pass them a little
 SEAM = 3.0  # the ends of a loop may be this many times as far apart as any two successive frames
 
@@ -100,42 +104,50 @@ def read_clip(source: str | Path) -> Clip:
             the name of a shipped clip.
 
     Raises:
-        ValueError: no such file, or something in it is missing, of the wrong shape, not finite or too short; a loop
-            that does not end as it begins.
+        ValueError: no such file, or something in it is missing, no real number, of the wrong shape, not finite, too
+            short or too long; a motion that no robot can follow; a loop that does not end as it begins.
     """
     path = Path(source)
     if not path.is_file():
         if str(source) not in shipped():
             raise ValueError(f"no such clip: {source}; give an .npz file or one of {', '.join(shipped())}")
         path = shipped()[str(source)]
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            content = dict(archive)
-    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"clip {path} is no .npz file of numbers") from error
+    content = _load(path)
     if "qpos" not in content:
         raise ValueError(f"clip {path} has no qpos (frames, nq)")
     if ("fps" in content) == ("dt" in content):
         raise ValueError(f"clip {path} needs its rate: either fps [1/s] or dt [s]")
-    try:
-        qpos = torch.tensor(content["qpos"].astype(np.float64))
-        dt = float(content["dt"]) if "dt" in content else 1.0 / float(content["fps"])
-        loop = bool(content.get("loop", True))
-    except (TypeError, ValueError, ZeroDivisionError) as error:
-        raise ValueError(f"clip {path}: qpos, fps, dt and loop must be numbers") from error
+    for key, value in content.items():
+        if value.dtype.kind not in "biuf" or (key != "qpos" and value.size != 1):
+            wanted = "real numbers" if key == "qpos" else "one real number"
+            raise ValueError(f"clip {path}: {key} is {value.dtype} {value.shape}, must be {wanted}")
+    qpos = torch.tensor(content["qpos"].astype(np.float64))
+    numbers = {key: float(value.item()) for key, value in content.items() if key != "qpos"}
+    loop = numbers.get("loop", 1.0)
+    if loop not in (0.0, 1.0):
+        raise ValueError(f"clip {path}: loop is {loop:g}, must be true or false")
+    dt = numbers["dt"] if "dt" in numbers else 1.0 / (numbers["fps"] or np.nan)
     if not 0 < dt < math.inf:
         raise ValueError(f"clip {path}: a frame takes {dt:g} s; the rate must be positive and finite")
     if qpos.ndim != 2 or qpos.shape[1] < 8:
         raise ValueError(f"clip {path}: qpos is {tuple(qpos.shape)}, must be (frames, nq)")
-    if not bool(qpos.isfinite().all()):
-        raise ValueError(f"clip {path}: qpos is not finite in frame {int((~qpos.isfinite()).any(1).nonzero()[0])}")
+    far = ~((qpos[:, :3].abs() <= FARTHEST).all(1) & (qpos[:, 3:].abs() <= FASTEST).all(1))
+    if bool(far.any()):
+        why = (
+            f"qpos is not finite or too large in frame {int(far.nonzero()[0])}; at most {FARTHEST:g} m from the origin"
+        )
+        raise ValueError(f"clip {path}: {why}")
     norm = qpos[:, 3:7].norm(dim=1, keepdim=True)
     if bool((norm < 0.5).any()):
         raise ValueError(f"clip {path}: columns 3 to 6 of qpos must be the root's quaternion wxyz, and one is near 0")
-    frames = round((len(qpos) - 1) * dt / CONTROL_DT) + 1
-    if frames < SHORTEST:
-        raise ValueError(f"clip {path} is too short: {frames} frames at 60 Hz, needs {SHORTEST}")
-    clip = Clip(path.stem, _resample(torch.cat((qpos[:, :3], qpos[:, 3:7] / norm, qpos[:, 7:]), 1), frames), loop)
+    frames = (len(qpos) - 1) * dt / CONTROL_DT
+    if not SHORTEST - 1.5 <= frames <= LONGEST:
+        why = f"too {'long' if frames > LONGEST else 'short'}: {frames + 1:.0f} frames at 60 Hz, must be"
+        raise ValueError(f"clip {path} is {why} {SHORTEST} to {LONGEST}")
+    qpos[:, 3:7] /= norm
+    clip = Clip(path.stem, _resample(qpos, round(frames) + 1), bool(loop))
+    if (speed := float(clip.velocity().abs().max())) > FASTEST:
+        raise ValueError(f"clip {path} moves at up to {speed:.2g} m/s or rad/s, must be at most {FASTEST:g}")
     gap, step = (tangent(a, b)[..., 2:].abs().max() for a, b in (clip.qpos[[0, -1]], (clip.qpos[:-1], clip.qpos[1:])))
     if loop and gap > SEAM * step:
         raise ValueError(
@@ -143,6 +155,18 @@ def read_clip(source: str | Path) -> Clip:
             "end it where the next round begins, or add loop=False"
         )
     return clip
+
+
+def _load(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file that a clip has."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > MOST_BYTES:
+                raise MemoryError
+        with np.load(path, allow_pickle=False) as arrays:
+            return {key: arrays[key] for key in ("qpos", "fps", "dt", "loop") if key in arrays}
+    except (*UNREADABLE, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"clip {path} is no .npz file of numbers, or one beyond {MOST_BYTES / 1e6:g} MB") from error
 
 
 def _resample(qpos: Tensor, frames: int) -> Tensor:

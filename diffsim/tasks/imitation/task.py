@@ -116,8 +116,11 @@ class HumanoidImitation(Task):
         frame = self.frame(obs)
         height = obs[..., :1] + (matrix(obs[..., 1:5])[..., 2:, :] * self._trunk).sum(-1) - self._radii
         away = torch.cat((qpos[..., :2], qpos[..., 2:3] - self._qpos[frame, 2:3]), dim=-1)
-        over = frame == self.period - 1 if not self.clip.loop else torch.zeros_like(frame, dtype=torch.bool)
-        return (height < 0).any(-1) | (away.square().sum(-1) > STRAY**2) | over
+        return (height < 0).any(-1) | (away.square().sum(-1) > STRAY**2) | self.over(obs)
+
+    def over(self, obs: Tensor) -> Tensor:
+        """The last frame of a clip that does not loop."""
+        return super().over(obs) if self.clip.loop else self.frame(obs) == self.period - 1
 
     def _state(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """qpos, with x and y from the reference's, and qvel."""

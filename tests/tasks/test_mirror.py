@@ -47,8 +47,7 @@ def errors(env: DiffEnv, scene: Scene, steps: int = 5) -> tuple[float, float, fl
     return worst[0], worst[1], worst[2]
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("name", ["ant", "humanoid"])
+@pytest.mark.parametrize("name, dtype", [("ant", torch.float32), ("humanoid", torch.float64)])
 def test_the_image_moves_like_the_robot(name: str, dtype: torch.dtype) -> None:
     env = diffsim.make(name, num_envs=8, horizon=1, dtype=dtype)
     observation, reward, back = errors(env, env.scene)

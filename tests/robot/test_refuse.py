@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from scenes import MUSCLE, parse, pendulum, robot, tendon
 
+from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import SceneError
 
 FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
@@ -255,6 +258,62 @@ REFUSED = {
         robot('<body name="b"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 9"/></body>'),
         "inertia.*'b'",
     ),
+    **{
+        f"solmix {value}": (
+            pendulum(world=f'<geom name="floor" type="plane" size="1 1 1" solmix="{value}"/>'),
+            f"geom 'floor': solmix is {message}",
+        )
+        for value, message in (("-1", "-1, must not be negative"), ("nan", "not finite"), ("inf", "not finite"))
+    },
+    "solref of nearly 0": (
+        robot('<body><freejoint/><geom name="foot" size="0.1" solref="1e-200 1" priority="1"/></body>'),
+        "geom 'foot': solref is beyond single precision",
+    ),
+    "solreflimit of nearly 0": (
+        pendulum('range="-1 1" solreflimit="1e-200 1"'),
+        "joint 'hinge': solreflimit is beyond",
+    ),
+    "ctrlrange beyond single precision": (
+        pendulum(rest='<actuator><motor name="m" joint="hinge" ctrlrange="-1e39 1e39"/></actuator>'),
+        "actuator 'm': ctrlrange is not finite",
+    ),
+    "force beyond single precision": (
+        pendulum(rest='<actuator><motor name="m" joint="hinge" gear="1e9" ctrlrange="-1e30 1e30"/></actuator>'),
+        "actuator 'm': its force is beyond single precision",
+    ),
+    **{
+        f"{name} beyond single precision": (
+            pendulum(rest=f'<custom><numeric name="{name}" data="1e300"/></custom>'),
+            f"numeric '{name}': 1e\\+300, must be one number, finite",
+        )
+        for name in ("k_n", "muscle_strength")
+    },
+    "muscle whose force follows from nothing": (
+        tendon(actuator='<muscle name="biceps" tendon="string" force="-5" lengthrange="1 2"/>'),
+        "actuator 'biceps': its force follows from what it moves, and it moves nothing; give force",
+    ),
+    "two slides on one axis": (
+        robot(
+            '<body><joint name="a" type="slide" axis="1 0 0"/><joint name="b" type="slide" axis="1 0 0"/>'
+            '<geom size="0.1"/></body>'
+        ),
+        "joint 'a', 'b': these joints together have a motion without inertia",
+    ),
+    "parallel slides of next to no mass": (
+        robot(
+            "".join(
+                f'<body><joint name="{j}" type="slide"/><geom size=".1" mass="{m}"/>'
+                for j, m in (("a", 1e-8), ("b", 1))
+            )
+            + "</body></body>"
+        ),
+        "joint 'a', 'b': these joints together have a motion without inertia",
+    ),
+    "more contact points than are simulated": (
+        robot("<body><freejoint/>" + '<geom type="box" size="1 1 1" mass="1"/>' * 1251 + "</body>"),
+        "contact 10008 points: at most 10000 are simulated",
+    ),
+    "a file that takes minutes": (robot("<!--" + 3_000_000 * "-" + "-->"), "robot.xml' has 3 MB, at most 2"),
 }
 
 
@@ -264,6 +323,23 @@ def test_what_is_not_simulated_is_named(what):
     with pytest.raises(SceneError, match=culprit) as error:
         parse(mjcf)
     assert "\n" not in str(error.value) and "robot.xml" in str(error.value)
+
+
+@pytest.mark.parametrize("mjcf", [pendulum('frictionloss="1"'), pendulum()])
+def test_names_in_another_encoding_are_refused(mjcf, tmp_path):
+    file = tmp_path / "robot.xml"
+    file.write_bytes(mjcf.replace('"hinge"', '"h\xfcfte"').encode("latin-1"))
+    with pytest.raises(SceneError, match="robot.xml: names must be in UTF-8, and 'hüfte' is not") as error:
+        load_scene(file)
+    assert "\n" not in str(error.value)
+
+
+def test_thousands_of_contact_points_are_read_in_seconds():
+    body = "<body><freejoint/>" + "".join(f'<geom pos="{x} 0 0" size="0.1"/>' for x in range(2000)) + "</body>"
+    start = time.perf_counter()
+    with pytest.warns(UserWarning, match="2000 contact points are slow"):
+        assert parse(robot(body)).ncontact == 2000
+    assert time.perf_counter() - start < 30  # all pairs one by one took minutes
 
 
 def test_all_obstacles_in_one_message():
