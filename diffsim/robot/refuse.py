@@ -154,11 +154,10 @@ def _not_finite(m: mujoco.MjModel) -> Iterator[Obstacle]:
 
 def _negative(m: mujoco.MjModel) -> Iterator[Obstacle]:
     signed = {Kind.mjOBJ_JOINT: ("armature", "damping", "stiffness"), Kind.mjOBJ_GEOM: ("friction", "solmix")}
-    for kind, fields in signed.items():
-        for field in fields:
-            values = _numbers(m)[kind][field]
-            least = values.min(tuple(range(1, values.ndim)))
-            yield from _where(m, kind, {field + " is {least:g}, must not be negative": least < 0}, least=least)
+    for kind, field in ((kind, field) for kind, fields in signed.items() for field in fields):
+        values = _numbers(m)[kind][field]
+        least = values.reshape(len(values), -1).min(1)
+        yield from _where(m, kind, {field + " is {least:g}, must not be negative": least < 0}, least=least)
     for field in ("density", "viscosity"):
         if getattr(m.opt, field) < 0:
             yield Obstacle("option", field, f"{getattr(m.opt, field):g}, must not be negative")
@@ -220,13 +219,7 @@ def _options(m: mujoco.MjModel) -> Iterator[Obstacle]:
     yield from _where(m, Kind.mjOBJ_ACTUATOR, {"its group is in actuatorgroupdisable; remove the actuator": off})
 
 
-def _attributes(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    for kind, attributes in UNSIMULATED.items():
-        rules = {f"{attribute} is not simulated": _any(m, fields) for attribute, fields in attributes.items()}
-        yield from _where(m, kind, rules)
-
-
-def _whole_elements(m: mujoco.MjModel) -> Iterator[Obstacle]:
+def _unsimulated(m: mujoco.MjModel) -> Iterator[Obstacle]:
     touch = not disabled_flags(m) & {"constraint", "contact"}
     for kind, present, what in (
         (Kind.mjOBJ_EQUALITY, m.eq_active0, "equality constraints"),
@@ -235,6 +228,9 @@ def _whole_elements(m: mujoco.MjModel) -> Iterator[Obstacle]:
         (Kind.mjOBJ_PLUGIN, np.ones(m.nplugin), "plugins"),
     ):
         yield from _where(m, kind, {f"{what} are not simulated": present})
+    for kind, attributes in UNSIMULATED.items():
+        rules = {f"{attribute} is not simulated": _any(m, fields) for attribute, fields in attributes.items()}
+        yield from _where(m, kind, rules)
 
 
 def _bodies(m: mujoco.MjModel) -> Iterator[Obstacle]:
@@ -375,4 +371,4 @@ def _wrong(solref: ArrayLike) -> str:
 
 
 NUMBERS = _not_finite, _negative, _masses, _names
-ELEMENTS = _options, _whole_elements, _bodies, _joints, _tendons, _attributes, _actuators, _contacts
+ELEMENTS = _options, _unsimulated, _bodies, _joints, _tendons, _actuators, _contacts
