@@ -156,7 +156,7 @@ def _negative(m: mujoco.MjModel) -> Iterator[Obstacle]:
     signed = {Kind.mjOBJ_JOINT: ("armature", "damping", "stiffness"), Kind.mjOBJ_GEOM: ("friction", "solmix")}
     for kind, field in ((kind, field) for kind, fields in signed.items() for field in fields):
         values = _numbers(m)[kind][field]
-        least = values.reshape(len(values), -1).min(1)
+        least = values.min(tuple(range(1, values.ndim)))
         yield from _where(m, kind, {field + " is {least:g}, must not be negative": least < 0}, least=least)
     for field in ("density", "viscosity"):
         if getattr(m.opt, field) < 0:
