@@ -64,8 +64,8 @@ def floating(m: mujoco.MjModel) -> bool:
 
 def motors(m: mujoco.MjModel) -> NDArray[np.bool_]:
     """(actuators,) whose force is their control times a constant."""
-    still, biased = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE
-    found: NDArray[np.bool_] = still & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED) & ~biased
+    still, unbiased = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
+    found: NDArray[np.bool_] = still & unbiased & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
     return found
 
 

@@ -100,16 +100,16 @@ def start(scene: Scene) -> np.ndarray:
 
 
 def motion(scene: Scene, seconds: float) -> np.ndarray:
-    """(control steps + 1, nq) from the start without control, at the default substeps in float32."""
-    sim = Simulator(scene, 1)
-    qpos, qvel = torch.tensor(start(scene)[None], dtype=torch.float32), torch.zeros(1, scene.nv)
-    ctrl = torch.tensor(-scene.motor_bias / np.where(scene.gear, scene.gear, 1))[None].float()
-    rows = [qpos[0].double().numpy()]
+    """(control steps + 1, nq) from the start without control, at the default substeps."""
+    sim = Simulator(scene, 1, dtype=torch.float64)
+    qpos, qvel = torch.tensor(start(scene)[None]), torch.zeros(1, scene.nv, dtype=torch.float64)
+    ctrl = torch.tensor(-scene.motor_bias / np.where(scene.gear, scene.gear, 1))[None]
+    rows = [qpos[0].numpy()]
     with torch.no_grad():
         for _ in range(round(60 * seconds)):
             qpos, qvel = sim.step(qpos, qvel, ctrl)
             assert not sim.nonfinite.any()
-            rows.append(qpos[0].double().numpy())
+            rows.append(qpos[0].numpy())
     return np.array(rows)
 
 
@@ -121,7 +121,7 @@ def centre_of_mass(model: mujoco.MjModel, qpos: np.ndarray) -> float:
     return float(data.subtree_com[0, 2])
 
 
-@pytest.mark.parametrize("name", ["ant", "walker2d_v5", "humanoidstandup", "reacher"])
+@pytest.mark.parametrize("name", ["ant", "walker2d_v5", "humanoidstandup"])
 def test_gymnasium_robots_fall_as_in_mujoco(name):
     """Two seconds without control: the centre of mass is as high, nothing bounces, and the ground carries."""
     scene = load_scene(ASSETS / f"{name}.xml")
@@ -137,6 +137,5 @@ def test_gymnasium_robots_fall_as_in_mujoco(name):
     assert abs(ours - heights)[:31].max() < 0.04  # m, in the first half second, until what balances tips over
     assert abs(ours - heights)[-1] < 0.05
     assert ours.max() < heights[0] + 5e-3
-    if scene.ncontact:
-        depths = np.array([reference.contacts(scene, row, np.zeros(scene.nv))[0].min() for row in rows])
-        assert depths.min() > -0.04 and -0.006 < depths[-1] < 0  # m
+    depths = np.array([reference.contacts(scene, row, np.zeros(scene.nv))[0].min() for row in rows])
+    assert depths.min() > -0.04 and -0.006 < depths[-1] < 0  # m
