@@ -1,7 +1,7 @@
 """Guided policy search (Levine and Koltun 2013, https://proceedings.mlr.press/v28/levine13.html).
 
-Trajectory optimisation finds where reward is and becomes a distribution, whose samples guide an importance-sampled
-policy search (Algorithm 1). Its dynamic programming takes exact Jacobians from the simulator's backward pass.
+Trajectory optimisation finds a good trajectory and feedback around it: a guide. Samples of guides lead an
+importance-sampled policy search (Algorithm 1). The planner takes exact Jacobians from the simulator's backward pass.
 
     python gps.py --env cartpole --seed 1                   train; writes runs/cartpole__gps__1__<time>/
     python gps.py --env hopper --demonstration hop.npz      plan from a recorded trajectory
@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -29,24 +29,20 @@ from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.lbfgs import maximise
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
+from diffsim.planning.samples import Samples, SampleSet, log_weights, phi
 from diffsim.planning.system import System
 from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import TASKS
 from diffsim.training import distributed
 from diffsim.training.assess import evaluate_checkpoint
 from diffsim.training.errors import command, fail
-from diffsim.training.evaluation import SEED as EVALUATION_SEED
-from diffsim.training.evaluation import Evaluation, travels
+from diffsim.training.evaluation import SEED, Evaluation, travels
 from diffsim.training.flags import Flags, parse
 from diffsim.training.layers import ObsNormalizer
-from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive
+from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive, Repeats
 from diffsim.training.run import Run
 
-Variant = Literal[
-    "full", "feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
-]
-LESSONS, REACH, BLEND = 20_000, 0.5, 0.1  # of feedback: states of a fit; how far a guide teaches; over which guides mix
-GUIDED = "full", "feedback", "unregularized"  # those with guides in S
+LESSONS, REACH, BLEND = 20_000, 0.5, 0.1  # feedback: states of a fit; how far a guide teaches; over which guides mix
 # fmt: off
 COLUMNS = ("variant", "horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight",
            "attitude_weight", "window", "tracking", "spread", "hidden", "noise", "perturb")
@@ -66,11 +62,13 @@ PER_TASK = {
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    variant: Variant = "feedback"
-    """the algorithm (full), after imitation of the guides' feedback (ours), or one of Figure 2's others (per task)"""
+    MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "imitation", "lbfgs_iterations", "perturb", "practice")
+
+    variant: Literal["full", "feedback"] = "feedback"
+    """full: the paper's algorithm; feedback: its first iterations imitate the guides' feedback (ours; per task)"""
     iterations: Count = 80
     """iterations K of the policy search"""
-    horizon: Count = 500
+    horizon: Repeats = 500
     """control steps T of a trajectory (per task)"""
     reward: Literal["native", "target"] = "native"
     """the task's own reward, or the paper's: squared errors of velocity and height (per task)"""
@@ -86,61 +84,58 @@ class Args(Flags):
     """weight of the trunk's squared rotation, beside the paper's three terms (per task)"""
     demonstration: Path | None = None
     """start from this trajectory instead of --restarts: an .npz with qpos (T+1, nq), qvel (T+1, nv), action (T, nu)"""
-    restarts: Count = 16
+    restarts: Repeats = 16
     """random action sequences from which trajectory optimisation starts; the best are kept"""
     window: Natural = 0
     """plan by windows of so many control steps, each a fifth of it later than the last (0: at once; per task)"""
-    guides: Count = 1
+    guides: Repeats = 1
     """guiding distributions n, from as many of the best trajectories"""
-    screening: Count = 40
+    screening: Repeats = 40
     """iLQR iterations of all restarts"""
-    ilqr_iterations: Count = 300
+    ilqr_iterations: Repeats = 300
     """further iLQR iterations of the best"""
     tracking: NonNegative = 5e-4
     """weight of the squared deviation from the example in the initial guiding distributions (Section 6; per task)"""
     spread: Positive = 3.0
     """standard deviation of the guiding actions relative to the policy's: the temperature of exp(reward) (per task)"""
-    guiding_samples: Count = 40
+    guiding_samples: Repeats = 40
     """trajectories drawn from the guiding distributions"""
     terrain: tuple[str, ...] = ("level",)
-    """train on these, with guides on each: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
+    """train on each, with its own guides: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
     practice: tuple[str, ...] = ()
-    """the policy's trajectories go each over a random terrain of these kinds, up to that size, not over --terrain"""
+    """the policy's trajectories each go over a random terrain of these kinds, up to that size, not over --terrain"""
     adaptive: Natural = 0
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
-    adaptive_iterations: Count = 50
+    adaptive_iterations: Repeats = 50
     """iLQR iterations of an adaptation"""
     perturb: NonNegative = 0.1
     """the policy's samples start away from the guides', by a normal part of the plan's deviations (per task)"""
-    hidden: Count = 50
+    hidden: Repeats = 50
     """units of the policy's hidden layer (per task)"""
     noise: Positive = 0.1
     """the policy's standard deviation, relative to that of the planned actions over time (per task)"""
-    pretraining: Count = 1500
+    pretraining: Repeats = 1500
     """L-BFGS iterations of the fit to the guiding samples; a tenth of them for feedback's later fits"""
-    samples: Count = 10
+    samples: Repeats = 10
     """trajectories of the policy per iteration"""
-    active: Count = 100
+    active: Repeats = 100
     """trajectories in the active set S_k"""
-    stored: Count = 300
+    stored: Repeats = 300
     """trajectories kept to choose from"""
-    lbfgs_iterations: Count = 60
+    lbfgs_iterations: Repeats = 60
     """L-BFGS iterations of each of an iteration's two optimisations"""
-    regularizer_bounds: tuple[Positive, Positive] = (1e-4, 1.0)
-    """w_r starts at their geometric mean and is changed by factors of ten between them"""
+    regularizer_bounds: tuple[NonNegative, NonNegative] = (1e-4, 1.0)
+    """w_r starts at their geometric mean and is changed by factors of ten between them; 0 0: no regularizer"""
     imitation: Natural = 20
     """feedback: the first so many iterations imitate the guides, the others search"""
     tail: Natural = 20
     """feedback: the last so many steps of a guide teach nothing, as what comes after them costs nothing"""
     bound: Positive = 2.0
     """feedback: actions before tanh that are taught are within this"""
-    eval_every: Natural = 10
-    """evaluate the best policy every this many iterations (0: only at the end)"""
-    eval_episodes: Count = 50
-    """trajectories of an evaluation"""
 
     def task_defaults(self) -> dict[str, Any]:
-        return dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
+        own = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
+        return own | {"eval_every": 10, "eval_episodes": 50}
 
     def check(self) -> None:
         super().check()
@@ -149,7 +144,9 @@ class Args(Flags):
         if TASKS[self.env].timed:
             fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
         if self.env == "cartpole" and self.reward == "target":
-            fail("--reward target is of robots that walk or swim; cartpole has --reward native")
+            fail("--reward target needs a robot that walks or swims; cartpole has --reward native")
+        if not self.terrain:
+            fail("--terrain needs at least one name: level, incline:DEGREES, step:CM or rough:DEGREES")
         most = max(2, self.guides * len(self.terrain))
         least = dict(horizon=2, guiding_samples=most, restarts=self.guides, samples=most)
         least |= dict(active=self.guiding_samples + self.samples, stored=self.active)
@@ -161,7 +158,7 @@ class Args(Flags):
         if self.demonstration and self.guides > 1:
             fail("--demonstration is one trajectory: --guides must be 1")
         if self.adaptive and len(self.terrain) > 1:
-            fail("--adaptive is of guides on one --terrain")
+            fail("--adaptive takes one --terrain")
         named_terrains(*self.terrain, *(random_terrain(kind, torch.Generator()) for kind in self.practice))
 
 
@@ -182,77 +179,60 @@ class Search:
         self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn
         self.adapted: list[LinearGaussian] = []  # the last ones of line 9
         self.network = Policy(args.hidden, self.system)  # has theta*
-        self.w_r = 0.0 if args.variant == "unregularized" else math.prod(args.regularizer_bounds) ** 0.5
+        self.w_r = math.prod(args.regularizer_bounds) ** 0.5
         self.floor, self.scale = -math.inf, 1.0  # least reward of a step; standard deviation of rewards
         self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
         self.control_steps = self.plan_steps = self.nonfinite = 0
         sizes = (args.horizon + 1, self.system.nx), (args.horizon, self.system.nu), (args.horizon,)
         x, u, finite = (torch.zeros(0, *size, dtype=REAL, device=self.system.device) for size in sizes)
         self.S = SampleSet(self.system, self.network, self.measure(x, u, finite.bool()))
-        self.lessons: tuple[Tensor, ...] = ()  # what feedback and dagger fit
+        self.lessons: tuple[Tensor, ...] = ()  # what feedback fits
         self.student = self.network.theta  # the last of feedback's fits
 
-    def over(self, *names: str) -> System:
-        """The robot over terrains: trajectory i over number i % n."""
-        return System(self.env, self.args.threads or None, None if names == ("level",) else named_terrains(*names))
-
-    @property
-    def policy(self) -> nn.Sequential:
-        """theta* without noise, for environments and checkpoints."""
-        return self.network.deterministic()
-
-    def prepare(self, say: Callable[[str], None]) -> dict[str, float]:
-        """Lines 1 to 4, with progress told to say; returns the pretrained policy's metrics."""
-        args, policy = self.args, self.network
-        plans = [plan_trajectories(self, terrain, say) for terrain in self.grounds]
+    def prepare(self, say: Callable[[str], None], file: Path) -> dict[str, float]:
+        """Lines 1 to 4. Tells its progress, writes the plans to a file as soon as they exist, returns metrics."""
+        args, policy, plans = self.args, self.network, list[Plan]()
+        for name in self.grounds:
+            plans.append(self.plan(name, say))
+            best = [(plan.x[0], plan.u[0]) for plan in plans]
+            save_demonstration(self.system, best, file, list(self.grounds)[: len(plans)])
         self.plan_return = -sum(plan.cost.min().item() for plan in plans) / len(plans)
         policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
-        pairs = zip(self.grounds.values(), plans, strict=True)  # line 1: generate DDP solutions
-        self.guides = [guide for ground, plan in pairs for guide in make_guides(self, ground, plan, say)]
+        for ground, plan in zip(self.grounds.values(), plans, strict=True):  # line 1: guides about DDP solutions
+            self.guides += self.guide(ground, plan, say)
         self.plan_steps = sum(ground.steps for ground in self.grounds.values())
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
         policy.standardise(guiding.obs, guiding.u)
-        obs, u = guiding.obs, guiding.u
-        if args.variant == "single-example":
-            obs = self.system.observe(torch.stack([guide.x[:-1] for guide in self.guides]))
-            u = torch.stack([guide.u for guide in self.guides])
-        policy.theta = policy.fit(policy.initial(self.rng), obs, u, args.pretraining)  # line 3: initialise theta*
-        if args.variant in GUIDED:  # line 4: build S from the guides and theta*
-            self.S.append(guiding, *self.guides)
-            self.S.initial = len(self.guides)
+        policy.theta = self.student = self.pretrain(guiding)  # line 3: initialise theta*
+        self.build(guiding)  # line 4: build S from the guides and theta*
         self.S.best = len(self.S.generators)
         own = self.draw(policy.theta, self.S.best)
         self.S.append(own, policy.theta)
         self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
         say(f"return of guides {mean:.2f} +- {std:.2f}, of the pretrained policy {own.returns.mean():.2f}")
-        self.student = policy.theta
-        if args.variant == "dagger":
-            self.lessons = guiding.obs, guiding.u
         if args.variant == "feedback":
             self.learn(guiding.pick(slice(0, args.samples * len(plans), len(plans))))  # more would outweigh own ones
             self.learn(own)
         return self.metrics(own) | {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
 
     def iterate(self, iteration: int) -> dict[str, float]:
-        """Lines 6 to 17, or what a variant does in their place; returns metrics."""
+        """Lines 6 to 17; returns metrics."""
         args, policy, S = self.args, self.network, self.S
-        if args.variant in ("policy-gradient", "dagger"):
-            return policy_gradient(self) if args.variant == "policy-gradient" else dagger(self)
         active = S.choose(args.active, args.samples)  # line 6: choose S_k
         imitating = args.variant == "feedback" and iteration <= args.imitation  # line 7: theta_k <- arg max Phi
         theta, metrics = self.imitate() if imitating else self.optimise(S.samples.pick(active))
         source, before = len(S.generators), len(S.samples.u)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
         active = torch.cat((active, S.append(new, theta)))
-        if iteration <= args.adaptive and args.variant in GUIDED:
+        if iteration <= args.adaptive:
             active = torch.cat((active, self.adapt()))  # line 9: generate adaptive guiding samples
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
         if better:  # its samples may have been lucky: confirm it with as many again
             active = torch.cat((active, S.append(self.draw(theta, source))))
             better, values = self.estimate(theta, active)
         metrics |= values | {"gps/accepted": float(better), "gps/regularizer": self.w_r}
-        low, high = (0.0, 0.0) if args.variant == "unregularized" else args.regularizer_bounds
+        low, high = args.regularizer_bounds
         if better:  # line 11
             policy.theta, S.best = theta, source  # line 12: theta* <- theta_k
             self.w_r = max(self.w_r / 10, low)  # line 13: decrease w_r
@@ -262,79 +242,60 @@ class Search:
         if imitating:
             metrics["gps/near"] = self.learn(S.samples.pick(slice(before, None)))
         S.prune(args.stored)
-        return metrics | self.metrics(self.draw(theta) if args.variant == "restart" else new)
+        return metrics | self.metrics(new)
 
-    def reward(self, x: Tensor, u: Tensor) -> Tensor:
-        """What is optimised (Section 6): reward (...) of u (..., nu), which led to x (..., nx)."""
-        args, system = self.args, self.system
-        cost = args.action_cost * u.square().sum(-1)
-        if args.reward == "native":
-            return system.reward(x, u) - cost
-        if system.scene.floating:
-            height, attitude = x[..., 2], 4.0 * x[..., 4:7].square().sum(-1)
-        else:
-            height, attitude = x[..., 1] + float(system.scene.mj_model.body_pos[1, 2]), x[..., 2].square()
-        cost = cost + (x[..., system.nq] - args.target_velocity).square() + args.attitude_weight * attitude
-        return -(cost + args.height_weight * (height - args.target_height).square())
+    def plan(self, terrain: str, say: Callable[[str], None]) -> Plan:
+        """Line 1: trajectory optimisation from random action sequences or a demonstration; the best results."""
+        args, system, T = self.args, self.grounds[terrain], self.args.horizon
 
-    def noise(self, count: int, rng: torch.Generator | None = None) -> Tensor:
-        """(count, T, nu) standard normal."""
-        size, rng = (count, self.args.horizon, self.system.nu), rng or self.rng
-        return torch.randn(size, generator=rng, dtype=REAL).to(self.system.device)
+        def show(iteration: int, costs: Tensor) -> None:
+            if iteration % 10 == 9:
+                say(f"planning {terrain}, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
 
-    def measure(self, x: Tensor, u: Tensor, finite: Tensor, source: int = -1) -> Samples:
-        """What the estimator needs of trajectories; one diverged step earns the floor, so that it cannot own J."""
-        self.nonfinite += int((~finite[:, -1]).sum())
-        reward = torch.where(finite, self.reward(x[:, 1:], u), self.floor).clamp(min=self.floor)
-        native = torch.where(finite, self.system.reward(x[:, 1:], u), 0.0)
-        sources, log_q = torch.full((len(u),), source, device=u.device), u.mT[:, :0]
-        return Samples(x, self.system.observe(x[:, :-1]), u, reward, native, sources, log_q)
+        first = min(args.window or T, T)
+        try:
+            if args.demonstration:
+                x, u = load_demonstration(system, args.demonstration, T, terrain, first)
+                x, u = follow_demonstration(system, x, u, args.tracking)
+            else:
+                u = starting_actions(args.restarts, first, system.nu, system.control_dt, self.rng).to(system.device)
+                x, u = best_of_random_starts(system, self.cost, system.start()[0], u, args.guides, args.screening, show)
+        except ValueError as error:
+            fail(error)
+        x, u = receding_horizon(system, self.cost, x, u, T, max(first // 5, 1), 8, self.rng)
+        return ilqr(system, self.cost, x, u, args.ilqr_iterations, show=show)
 
-    def roll_out(self, system: System, theta: Tensor, noise: Tensor, start: Tensor, source: int = -1) -> Samples:
-        """Trajectories of a policy with standard normal noise (m, T, nu), from start (1 or m, nx)."""
-
-        def act(t: int, x: Tensor) -> Tensor:
-            return self.network.mean(theta, system.observe(x)) + self.network.sigma * noise[:, t]
-
-        return self.measure(*system.rollout(start.expand(len(noise), -1), self.args.horizon, act), source)
-
-    def draw(self, theta: Tensor, source: int = -1) -> Samples:
-        """Trajectories, --samples of them, from starts near the guides'; restart's that join S from any state."""
-        args, system, count = self.args, self.system, self.args.samples
-        self.control_steps, noise = self.control_steps + count * args.horizon, self.noise(count)
-        x = torch.cat([guide.x[:-1] for guide in self.guides])
-        start = x[:1].expand(count, -1)  # has no part in the importance weights
-        if source >= 0 and args.variant == "restart":
-            start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
-        elif args.perturb:
-            away = torch.randn(count, system.nd, generator=self.rng, dtype=REAL).to(x.device)
-            start = system.retract(start, args.perturb * system.difference(x, x[:1]).std(0) * away)
-        if kinds := args.practice:
-            system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
-        return self.roll_out(system, theta, noise, start, source)
-
-    def metrics(self, samples: Samples) -> dict[str, float]:
-        objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
-        objective["charts/episodic_return"] = samples.native.sum(1).mean()
-        counts = {"sim/nonfinite": self.nonfinite, "sim/model_steps": self.plan_steps}
-        return {name: value.item() for name, value in objective.items()} | counts
-
-    def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
-        """So many trajectories of guides in equal shares, each over its terrain, numbered from the first source on."""
-        self.control_steps += count * self.args.horizon
-        shares = [self.noise(len(range(i, count, len(guides)))) for i in range(len(guides))]
-        grounds = [ground for ground in self.grounds.values() for _ in range(self.args.guides)]
-        parts = [self.measure(*g.sample(grounds[i], shares[i]), first + i) for i, g in enumerate(guides)]
-        return Samples(*map(torch.cat, zip(*parts, strict=True)))
+    def guide(self, ground: System, plan: Plan, say: Callable[[str], None]) -> list[LinearGaussian]:
+        """Line 1: controllers about a plan, with Section 6's tracking term. Checks the Jacobians that they rest on."""
+        cost, every = Sum((self.cost, Tracking(ground, plan.x, plan.u, self.args.tracking))), len(plan.u[0]) // 16 or 1
+        guides = maximum_entropy_controllers(ground, cost, plan, self.network.sigma, self.args.spread)
+        returns = ", ".join(f"{-cost:.2f} ({note})" for cost, note in zip(plan.cost, plan.note, strict=True))
+        say(f"planned in {ground.steps:,} control steps: returns {returns}")
+        for mu in [guide.mu for guide in guides if guide.mu > 1e-2]:
+            say(f"warning: a guide's Q_uu needed mu = {mu:.1e}; it is far from an optimum")
+        error = ground.check_jacobians(plan.x[0, :-1:every], plan.u[0, ::every])
+        say(f"Jacobians against central differences: relative error {error.median():.1e}, worst {error.max():.1e}")
+        if not error.median() < 1e-3:
+            fail("the simulator's Jacobians are not those of its steps")
+        return guides
 
     def sample_guides(self) -> Samples:
-        """Line 2. As far below the worst step as that is below the best is the floor of all rewards to come."""
+        """Line 2. The floor of all later rewards lies as far below the worst step as that one below the best."""
         samples = self.follow(self.guides, self.args.guiding_samples)
         worst, top = samples.reward[torch.isfinite(samples.reward)].aminmax()
         self.floor = (2 * worst - top).item()
         samples = samples._replace(reward=samples.reward.clamp(min=self.floor))
         self.guide_return = samples.returns.mean().item(), samples.returns.std(correction=0).item()
         return samples
+
+    def pretrain(self, guiding: Samples) -> Tensor:
+        """Line 3: the theta under which the guiding samples are likeliest."""
+        return self.network.fit(self.network.initial(self.rng), guiding.obs, guiding.u, self.args.pretraining)
+
+    def build(self, guiding: Samples) -> None:
+        """Line 4: S begins with the guides and their samples."""
+        self.S.append(guiding, *self.guides)
+        self.S.initial = len(self.guides)
 
     def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
         """Line 7, from two starts (Section 5): theta*, and theta* fitted to the sample of the highest reward."""
@@ -349,19 +310,6 @@ class Search:
         start = int(ends[1][1] > ends[0][1])
         return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
 
-    def learn(self, samples: Samples) -> float:
-        """Adds to the lessons the guides' feedback at the states of samples that are near them; returns their share.
-
-        By the step that looks most like a state: the policy does not see the time. Far away feedback means nothing.
-        """
-        x = samples.x[:, :-1].flatten(0, 1)
-        guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
-        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std, self.args.bound, BLEND)
-        near = distance <= REACH
-        new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
-        self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
-        return near.double().mean().item()
-
     def imitate(self) -> tuple[Tensor, dict[str, float]]:
         """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides."""
         index = torch.randperm(len(self.lessons[0]), generator=self.rng)[:LESSONS]
@@ -374,6 +322,17 @@ class Search:
         fit, value = maximise(objective, self.student, self.args.pretraining // 10)
         self.student = (self.student + fit) / 2  # a fit alone swings with what its policy visited last
         return self.student, {"gps/lessons": len(u), "gps/error": -value}
+
+    def learn(self, samples: Samples) -> float:
+        """Adds the guides' feedback at the states near them to the lessons; returns the share of these states."""
+        x = samples.x[:, :-1].flatten(0, 1)
+        guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
+        # By the step that looks most like a state, as the policy does not see the time
+        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std, self.args.bound, BLEND)
+        near = distance <= REACH  # far away feedback means nothing
+        new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
+        self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
+        return near.double().mean().item()
 
     def adapt(self) -> Tensor:
         """Line 9: guides of exp(reward / eta) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
@@ -398,8 +357,7 @@ class Search:
         if not all(map(math.isfinite, values)):
             raise FloatingPointError(f"the value estimates are {values}: no active sample has a finite density")
         log_w = log_weights(log_pi[0], mixture)
-        weights = torch.softmax(log_w, 0)
-        guided = S.source < self.S.initial
+        weights, guided = torch.softmax(log_w, 0), S.source < self.S.initial
         return values[0] > values[1], {
             "gps/estimate": values[0],
             "gps/best_estimate": values[1],
@@ -407,6 +365,82 @@ class Search:
             "gps/guide_share": (weights[guided].sum() / weights.sum()).item(),
             "gps/guide_nats": -log_w[guided, -1].mean().item() if self.S.initial else math.nan,
         }
+
+    def metrics(self, samples: Samples) -> dict[str, float]:
+        objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
+        objective["charts/episodic_return"] = samples.native.sum(1).mean()
+        metrics = {name: value.item() for name, value in objective.items()}
+        return metrics | {"sim/nonfinite": self.nonfinite, "sim/model_steps": self.plan_steps}
+
+    # Trajectories -----------------------------------------------------------------------------------------------------
+
+    def over(self, *names: str) -> System:
+        """The robot over terrains: trajectory i over number i % n."""
+        return System(self.env, self.args.threads or None, None if names == ("level",) else named_terrains(*names))
+
+    def reward(self, x: Tensor, u: Tensor) -> Tensor:
+        """What is optimised (Section 6): reward (...) of u (..., nu), which led to x (..., nx)."""
+        args, system = self.args, self.system
+        cost = args.action_cost * u.square().sum(-1)
+        if args.reward == "native":
+            return system.reward(x, u) - cost
+        if system.scene.floating:
+            height, attitude = x[..., 2], 4.0 * x[..., 4:7].square().sum(-1)
+        else:
+            height, attitude = x[..., 1] + float(system.scene.mj_model.body_pos[1, 2]), x[..., 2].square()
+        cost = cost + (x[..., system.nq] - args.target_velocity).square() + args.attitude_weight * attitude
+        return -(cost + args.height_weight * (height - args.target_height).square())
+
+    def noise(self, count: int, rng: torch.Generator | None = None) -> Tensor:
+        """(count, T, nu) standard normal."""
+        size, rng = (count, self.args.horizon, self.system.nu), rng or self.rng
+        return torch.randn(size, generator=rng, dtype=REAL).to(self.system.device)
+
+    def measure(self, x: Tensor, u: Tensor, finite: Tensor, source: int = -1) -> Samples:
+        """What the estimator needs of trajectories; a diverged step earns the floor, so that it does not rule Phi."""
+        self.nonfinite += int((~finite[:, -1]).sum())
+        reward = torch.where(finite, self.reward(x[:, 1:], u), self.floor).clamp(min=self.floor)
+        native = torch.where(finite, self.system.reward(x[:, 1:], u), 0.0)
+        sources, log_q = torch.full((len(u),), source, device=u.device), u.mT[:, :0]
+        return Samples(x, self.system.observe(x[:, :-1]), u, reward, native, sources, log_q)
+
+    def roll_out(self, system: System, theta: Tensor, noise: Tensor, start: Tensor, source: int = -1) -> Samples:
+        """Trajectories of a policy with standard normal noise (m, T, nu), from start (1 or m, nx)."""
+
+        def act(t: int, x: Tensor) -> Tensor:
+            return self.network.mean(theta, system.observe(x)) + self.network.sigma * noise[:, t]
+
+        return self.measure(*system.rollout(start.expand(len(noise), -1), self.args.horizon, act), source)
+
+    def draw(self, theta: Tensor, source: int = -1) -> Samples:
+        """Trajectories of a policy, --samples of them; those without a source do not join S."""
+        system, count, kinds = self.system, self.args.samples, self.args.practice
+        self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
+        start = self.starts(count, source)
+        if kinds:
+            system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
+        return self.roll_out(system, theta, noise, start, source)
+
+    def starts(self, count: int, source: int) -> Tensor:
+        """(count, nx) near the guides' start. They have no part in the importance weights."""
+        system, x = self.system, torch.cat([guide.x[:-1] for guide in self.guides])
+        if not self.args.perturb:
+            return x[:1].expand(count, -1)
+        away = torch.randn(count, system.nd, generator=self.rng, dtype=REAL).to(x.device)
+        return system.retract(x[:1].expand(count, -1), self.args.perturb * system.difference(x, x[:1]).std(0) * away)
+
+    def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
+        """So many trajectories of guides in equal shares, each over its terrain, numbered from the first source on."""
+        self.control_steps += count * self.args.horizon
+        shares = [self.noise(len(range(i, count, len(guides)))) for i in range(len(guides))]
+        grounds = [ground for ground in self.grounds.values() for _ in range(self.args.guides)]
+        parts = [self.measure(*g.sample(grounds[i], shares[i]), first + i) for i, g in enumerate(guides)]
+        return Samples(*map(torch.cat, zip(*parts, strict=True)))
+
+    @property
+    def policy(self) -> nn.Sequential:
+        """theta* without noise, for environments and checkpoints."""
+        return self.network.deterministic()
 
     def state_dict(self) -> dict[str, Any]:
         state = {name: getattr(self, name) for name in self.NUMBERS} | {"rng": self.rng.get_state()}
@@ -421,47 +455,6 @@ class Search:
             setattr(self, name, [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[name]])
         self.lessons, self.student = tuple(t.to(device) for t in state["lessons"]), state["student"].to(device)
         self.rng.set_state(state["rng"])
-
-
-# Planning: line 1 -----------------------------------------------------------------------------------------------------
-
-
-def plan_trajectories(search: Search, terrain: str, say: Callable[[str], None]) -> Plan:
-    """Trajectory optimisation on a terrain, from random action sequences or from a demonstration; its best results."""
-    args, system, T = search.args, search.grounds[terrain], search.args.horizon
-
-    def show(iteration: int, costs: Tensor) -> None:
-        if iteration % 10 == 9:
-            say(f"planning {terrain}, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
-
-    first = min(args.window or T, T)
-    try:
-        if args.demonstration:
-            x, u = load_demonstration(system, args.demonstration, T, terrain, first)
-            x, u = follow_demonstration(system, x, u, args.tracking)
-        else:
-            u = starting_actions(args.restarts, first, system.nu, system.control_dt, search.rng).to(system.device)
-            x, u = best_of_random_starts(system, search.cost, system.start()[0], u, args.guides, args.screening, show)
-        x, u = receding_horizon(system, search.cost, x, u, T, max(first // 5, 1), 8, search.rng)
-    except ValueError as error:
-        fail(error)
-    return ilqr(system, search.cost, x, u, args.ilqr_iterations, show=show)
-
-
-def make_guides(search: Search, system: System, plan: Plan, say: Callable[[str], None]) -> list[LinearGaussian]:
-    """The controllers about a plan, with the tracking term of Section 6. Checks the Jacobians that they rest on."""
-    args = search.args
-    cost = Sum((search.cost, Tracking(system, plan.x, plan.u, args.tracking)))
-    guides = maximum_entropy_controllers(system, cost, plan, search.network.sigma, args.spread)
-    returns = ", ".join(f"{-cost:.2f} ({note})" for cost, note in zip(plan.cost, plan.note, strict=True))
-    say(f"planned in {system.steps:,} control steps: returns {returns}")
-    for mu in [guide.mu for guide in guides if guide.mu > 1e-2]:
-        say(f"warning: a guide's Q_uu needed mu = {mu:.1e}; it is far from an optimum")
-    error = system.check_jacobians(plan.x[0, : -1 : args.horizon // 16 or 1], plan.u[0, :: args.horizon // 16 or 1])
-    say(f"Jacobians against central differences: relative error {error.median():.1e}, worst {error.max():.1e}")
-    if not error.median() < 1e-3:
-        fail("the simulator's Jacobians are not those of its steps")
-    return guides
 
 
 # The policy -----------------------------------------------------------------------------------------------------------
@@ -521,137 +514,6 @@ class Policy(nn.Module):
         return nn.Sequential(normalizer, layers[0], nn.Softplus(), layers[1], nn.Tanh())
 
 
-# Importance sampling --------------------------------------------------------------------------------------------------
-
-
-class Samples(NamedTuple):
-    """m trajectories."""
-
-    x: Tensor  # (m, T + 1, nx)
-    obs: Tensor  # (m, T, obs_dim) on which u acted
-    u: Tensor  # (m, T, nu)
-    reward: Tensor  # (m, T), bounded from below
-    native: Tensor  # (m, T) the task's own
-    source: Tensor  # (m,) index of the generator it came from
-    log_q: Tensor  # (m, n, T) cumulated log density under each generator
-
-    def pick(self, index: Tensor | slice) -> Samples:
-        return Samples(*(tensor[index] for tensor in self))
-
-    @property
-    def returns(self) -> Tensor:
-        return self.reward.sum(1)
-
-    @property
-    def log_mixture(self) -> Tensor:
-        """(m, T) of the distributions that these samples come from."""
-        return log_mixture(self.log_q[:, self.source.unique()])
-
-
-class SampleSet:
-    """S: samples, and the distributions that they come from."""
-
-    def __init__(self, system: System, policy: Policy, samples: Samples) -> None:
-        self.system, self.policy, self.samples = system, policy, samples
-        self.generators: list[LinearGaussian | Tensor] = []  # guides, the initial ones first, and policies as theta
-        self.best = -1  # theta*'s index among them
-        self.initial = 0  # initial guides among them
-
-    def log_density(self, generator: LinearGaussian | Tensor, samples: Samples) -> Tensor:
-        """(m, T) of prefixes."""
-        if isinstance(generator, LinearGaussian):
-            return generator.log_prob(self.system, samples.x, samples.u).cumsum(1)
-        return self.policy.log_prob(generator, samples.obs, samples.u).cumsum(1)
-
-    def append(self, samples: Samples, *new: LinearGaussian | Tensor) -> Tensor:
-        """Adds samples, and the generators that they are the first of; returns the samples' indices."""
-        for generator in new:
-            self.generators.append(generator)
-            column = self.log_density(generator, self.samples).unsqueeze(1)
-            self.samples = self.samples._replace(log_q=torch.cat((self.samples.log_q, column), 1))
-        log_q = torch.stack([self.log_density(generator, samples) for generator in self.generators], 1)
-        first, joined = len(self.samples.u), zip(self.samples, samples._replace(log_q=log_q), strict=True)
-        self.samples = Samples(*(torch.cat(tensors) for tensors in joined))
-        return torch.arange(first, len(self.samples.u), device=log_q.device)
-
-    def score(self) -> Tensor:
-        """(m,) sum of a sample's weights under theta*; ties are broken by its density."""
-        S, policy = self.samples, self.policy
-        log_w = log_weights(policy.log_prob(policy.theta, S.obs, S.u), S.log_mixture)
-        return torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
-
-    def choose(self, active: int, newest: int) -> Tensor:
-        """Line 6, indices: theta*'s newest, the initial guides' samples (adapted: too many), then by weight."""
-        score = torch.where(self.samples.source < self.initial, 2e9, self.score())
-        score[(self.samples.source == self.best).nonzero().flatten()[-newest:]] = 3e9
-        return score.argsort(descending=True, stable=True)[:active].sort().values
-
-    def prune(self, stored: int) -> None:
-        """Keeps so many: the initial guides', those of theta*, the best-scored others; drops generators without any."""
-        if len(self.samples.u) <= stored:
-            return
-        score = self.score() + 2e9 * (self.samples.source < self.initial) + 1e9 * (self.samples.source == self.best)
-        kept = self.samples.pick(score.argsort(descending=True, stable=True)[:stored].sort().values)
-        used = torch.tensor(sorted({*kept.source.tolist(), self.best}), device=score.device)
-        index = torch.full((len(self.generators),), -1, device=used.device)
-        index[used] = torch.arange(len(used), device=used.device)
-        self.samples = kept._replace(source=index[kept.source], log_q=kept.log_q[:, used])
-        self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
-
-    def state_dict(self) -> dict[str, Any]:
-        generators = [tuple(g) if isinstance(g, LinearGaussian) else (g,) for g in self.generators]
-        return dict(samples=tuple(self.samples), generators=generators, best=self.best, initial=self.initial)
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        device = self.system.device
-        self.samples = Samples(*(tensor.to(device) for tensor in state["samples"]))
-        stored = ([tensor.to(device) for tensor in generator] for generator in state["generators"])
-        self.generators = [LinearGaussian(*tensors) if len(tensors) > 1 else tensors[0] for tensors in stored]
-        self.best, self.initial = state["best"], state["initial"]
-
-
-def log_mixture(log_q: Tensor) -> Tensor:
-    """(m, T) log of the mixture of n PREFIX densities, from cumulated log q_j (m, n, T) (Section 3)."""
-    return torch.logsumexp(log_q, 1) - math.log(log_q.shape[1])
-
-
-def log_weights(log_pi: Tensor, log_mix: Tensor) -> Tensor:
-    """(m, T) log pi(zeta_1:t) / q(zeta_1:t) from per-step log pi (m, T)."""
-    return log_pi.cumsum(1) - log_mix
-
-
-def phi(log_pi: Tensor, log_mix: Tensor, reward: Tensor, w_r: float) -> Tensor:
-    """The objective of Section 3: Eq. 2 and the regulariser, of rewards (m, T). At w_r = 0 the value estimate."""
-    log_w = log_weights(log_pi, log_mix)
-    log_z = torch.logsumexp(log_w, 0) - math.log(len(log_w))
-    return (torch.softmax(log_w, 0) * reward).sum() + w_r * log_z.sum()
-
-
-# What Figure 2 compares it with, beside what skips some of its lines --------------------------------------------------
-
-
-def policy_gradient(search: Search) -> dict[str, float]:
-    """GPOMDP (Baxter et al. 2001): reward to go minus its mean over the samples, at each time."""
-    policy = search.network
-    new = search.draw(policy.theta)
-    to_go = new.reward.flip(1).cumsum(1).flip(1)
-    theta = policy.theta.clone().requires_grad_()
-    log_pi = policy.log_prob(theta, new.obs, new.u)
-    (gradient,) = torch.autograd.grad(((to_go - to_go.mean(0)) * log_pi).sum(), theta)
-    policy.theta = policy.theta + 0.1 * gradient / gradient.norm().clamp(min=1e-12)
-    return search.metrics(new)
-
-
-def dagger(search: Search) -> dict[str, float]:
-    """Ross et al. 2011: the controller's actions at the states that the policy visits join the data."""
-    args, policy = search.args, search.network
-    new = search.draw(policy.theta)
-    (obs, u), labels = search.lessons, search.guides[0].mean(search.system, slice(0, args.horizon), new.x[:, :-1])
-    obs, u = search.lessons = torch.cat((obs, new.obs)), torch.cat((u, labels))
-    policy.theta = policy.fit(policy.theta, obs, u, args.lbfgs_iterations)
-    return search.metrics(new)
-
-
 # The run --------------------------------------------------------------------------------------------------------------
 
 
@@ -659,7 +521,7 @@ def dagger(search: Search) -> dict[str, float]:
 def evaluate(search: Search) -> Evaluation:
     """The best policy, with the same noise each time: the task's own returns until it falls; also what is optimised."""
     system, count = search.system, search.args.eval_episodes
-    noise = search.noise(count + 1, torch.Generator().manual_seed(EVALUATION_SEED))
+    noise = search.noise(count + 1, torch.Generator().manual_seed(SEED))
     noise[0] = 0.0
     rollouts = search.roll_out(system, search.network.theta, noise, search.guides[0].x[:1])
     (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
@@ -674,12 +536,11 @@ def evaluate(search: Search) -> Evaluation:
     return Evaluation(returns, lengths, speed, qpos, action, system.copies(count, 1), system.control_dt, others)
 
 
-def train(args: Args) -> None:
+def train(args: Args, learner: type[Search] = Search) -> None:
     run = Run(args)
-    search = run.restore(Search(args, run.make_eval_env()))
+    search = run.restore(learner(args, run.make_eval_env()))
     if run.iteration == 0:
-        run.log(search.prepare(run.message), search.control_steps)
-        save_demonstration(search.system, search.guides[:: args.guides], run.directory / "plan.npz", search.grounds)
+        run.log(search.prepare(run.message, run.directory / "plan.npz"), search.control_steps)
     for iteration in run:  # lines 5 to 18
         before = search.control_steps
         run.log(search.iterate(iteration), search.control_steps - before)

@@ -21,7 +21,7 @@ from tables import ROOT, Row
 
 import diffsim
 from diffsim import DiffEnv
-from diffsim.sim.simulator import check_device
+from diffsim.sim.options import check_device
 from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
 from diffsim.training.ranges import check_ranges

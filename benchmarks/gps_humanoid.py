@@ -1,7 +1,6 @@
 """How long a robot of guided policy search runs, beside its guides: with noise, pushed off its start, on rough ground.
 
-    python benchmarks/gps_humanoid.py runs/gps/humanoid__feedback__1 runs/gps/humanoid__feedback-guides__1
-    python benchmarks/gps_humanoid.py --draw-only
+    python benchmarks/gps_humanoid.py runs/gps/humanoid__spread-3__1 runs/gps/humanoid__spread-30__1
 
 Figure 5 of the paper, of runs of gps.py in folders TASK__CASE__SEED. The policy, the DDP controller and that of the
 step that looks most alike (TBDP) run for 8 s, until the task says that they fell: from the guides' start with the
@@ -15,9 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
-import common
 import torch
-from common import parse
+from common import CheckpointFlags, checkpoint_of, run
 from gps_experiments import CONTROLLERS, RUN, Act, controllers, environment, grouped, load_search
 from tables import Row, digits, markdown
 from torch import Tensor
@@ -55,10 +53,10 @@ def noisy(act: Act, noise: Tensor) -> Act:
 
 def measure(path: Path) -> Iterator[Row]:
     """One row for each case, size and controller."""
-    run, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
+    about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
     level, policy, guide = System(env, 1), search.network, search.guides[0]
     T = min(round(SECONDS / level.control_dt), search.args.horizon)
-    rng = torch.Generator().manual_seed(gps.EVALUATION_SEED)
+    rng = torch.Generator().manual_seed(gps.SEED)
     noise = policy.sigma * torch.randn(COUNT, T, level.nu, generator=rng, dtype=REAL)
     away = level.difference(guide.x, guide.x[:1]).std(0) * torch.randn(COUNT, level.nd, generator=rng, dtype=REAL)
     for case, size in ((case, size) for case, sizes in SIZES.items() for size in sizes):
@@ -73,33 +71,29 @@ def measure(path: Path) -> Iterator[Row]:
             steps, speed = until_fall(system, x, finite)
             numbers = dict(whole=steps == T, seconds=steps * level.control_dt, speed=speed)
             means = {key: value.double().mean().item() for key, value in numbers.items()}
-            yield run | dict(case=case, size=size, controller=name, trajectories=len(x)) | means
+            yield about | dict(case=case, size=size, controller=name, trajectories=len(x)) | means
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A row for each case and size, a column for each kind of run: policy / DDP / TBDP, means over its seeds."""
+    """A row for each case and size, a column for each kind of run: mean seconds of policy / DDP / TBDP."""
     result, kinds = list[Row](), grouped(rows, "env", "variant")
-    for (case, size), _ in grouped(rows, "case", "size").items():
+    for case, size in grouped(rows, "case", "size"):
         row: dict[str, object] = {"": case, "size": size}
         for (_, variant), own in kinds.items():
-            parts = [
-                [r for r in own if (r["case"], r["size"], r["controller"]) == (case, size, name)]
-                for name in CONTROLLERS
-            ]
-            shares, seconds = ([mean(float(r[key]) for r in part) for part in parts] for key in ("whole", "seconds"))
-            whole = " / ".join(f"{share:.0%}" for share in shares)
-            row[variant] = f"{whole} ({' / '.join(f'{s:.1f}' for s in seconds)} s)"
+            here = grouped((r for r in own if (r["case"], r["size"]) == (case, size)), "controller")
+            seconds = (mean(float(r["seconds"]) for r in here[(name,)]) for name in CONTROLLERS)
+            row[variant] = " / ".join(f"{s:.1f}" for s in seconds)
         result.append(row)
     return result
 
 
-def main(args: common.CheckpointFlags) -> None:
+def main(args: CheckpointFlags) -> None:
     for path in args.measured:
-        for row in measure(common.checkpoint_of(path)):
+        for row in measure(checkpoint_of(path)):
             print(", ".join(digits(value) for value in row.values()), flush=True)
             args.merge("gps_humanoid", [row], KEY)
     args.publish("gps humanoid", markdown(table(args.read("gps_humanoid"))), "gps_terrain.md", everywhere=True)
 
 
 if __name__ == "__main__":
-    main(parse(common.CheckpointFlags, __doc__))
+    run(main, CheckpointFlags, __doc__)

@@ -18,10 +18,10 @@ from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration
-from diffsim.sim.simulator import Simulator, check_device
+from diffsim.sim.options import check_device, check_dtype
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation
 from diffsim.tasks.imitation.clip import Clip, read_clip
-from diffsim.view.screen import RenderMode
 
 __all__ = [
     "TASKS",
@@ -52,39 +52,35 @@ def make(
     contact: Contact = "soft",
     penalty: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float32,
-    stochastic_init: bool = True,
-    early_termination: bool = True,
-    threads: int | None = None,
-    max_episode_steps: int | None = None,
-    render_mode: RenderMode | None = None,
-    factors: bool = False,
-    forces: bool = False,
     clip: Clip | Path | str | None = None,
     terrain: ArrayLike | None = None,
+    **others: Any,
 ) -> DiffEnv:
-    """Build the tensor environment of a task; arguments as of DiffEnv and Simulator.
+    """Build the tensor environment of a task.
 
     Args:
         name: one of diffsim.TASKS.
+        num_envs, device, dtype: how many environments, where, and in which precision.
+        seed, horizon: see DiffEnv.
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
             docs/accuracy.md has what each costs and how much it errs.
         substeps, integrator, theta: each in place of the preset's, if given.
         contact: "soft" (the paper's) or "firm" (as MuJoCo's): the constants of contact and limits and how they are
             integrated; docs/transfer.md has what each costs and how much of a policy's speed is true.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
-        factors: let constants differ between environments: `env.sim.factors`, see Simulator.
-        forces: let external forces act on the bodies: `env.sim.forces`, see Simulator.
         terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
             of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
             observes, rewards and ends by are then those over the ground below the root.
         clip: the motion that humanoid_imitation tracks, or its .npz file, see read_clip; default the shipped run.
+        **others: stochastic_init, early_termination, max_episode_steps, render_mode: see DiffEnv; threads, factors,
+            forces: see sim.Options.
 
     Raises:
         ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
     """
     if name not in TASKS:
         raise ValueError(f"unknown task {name!r}; choose from {', '.join(TASKS)}")
-    device = check_device(device)
+    device, dtype = check_device(device), check_dtype(dtype)
     startup.check_kernel_cache()
     kind = TASKS[name]
     if clip is None:
@@ -104,13 +100,7 @@ def make(
         horizon=horizon,
         device=device,
         dtype=dtype,
-        stochastic_init=stochastic_init,
-        early_termination=early_termination,
-        threads=threads,
-        max_episode_steps=max_episode_steps,
-        render_mode=render_mode,
-        factors=factors,
-        forces=forces,
+        **others,
     )
 
 

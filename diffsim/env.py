@@ -16,7 +16,8 @@ from torch import Tensor
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration, check_count
 from diffsim.sim.launcher import check_memory
-from diffsim.sim.simulator import Simulator, check_device
+from diffsim.sim.options import Options
+from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
 from diffsim.terrain import Elevation
 from diffsim.view.screen import RENDER_MODES, Frames, RenderMode, Screen
@@ -47,13 +48,15 @@ class DiffEnv(VectorEnv):
         task: task on the simulator's device and dtype.
         scene: its robot. On a terrain, heights that the task knows (of start, observation, reward and end) are those
             over the ground straight below the root; `qpos` remains the world's.
+        num_envs, horizon: see Simulator.
         integration: default the task's "default".
-        num_envs, horizon, threads, factors, forces: see Simulator; env.sim has the factors and the forces.
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
         render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
+        **options: device, dtype, threads, factors, forces, division: see sim.Options. `env.sim` has the factors and the
+            forces.
 
     Attributes:
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.
@@ -76,41 +79,27 @@ class DiffEnv(VectorEnv):
         integration: Integration | None = None,
         seed: int | None = None,
         horizon: int = 32,
-        device: str | torch.device = "cpu",
-        dtype: torch.dtype = torch.float32,
         stochastic_init: bool = True,
         early_termination: bool = True,
-        threads: int | None = None,
         max_episode_steps: int | None = None,
         render_mode: RenderMode | None = None,
-        factors: bool = False,
-        forces: bool = False,
+        **options: Any,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
+        asked = Options(integration or task.integration("default"), **options).check()
+        self.device, self.dtype = torch.device(asked.device), asked.dtype
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
-        check_memory("start states of a window", num_envs, numbers * dtype.itemsize, check_device(device))
+        check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         if max_episode_steps is not None:
-            self.episode_length = check_count("max_episode_steps", max_episode_steps)
+            self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
         self.metadata = self.metadata | {"render_fps": round(1 / task.control_dt)}
         self._screen = Screen(scene, render_mode, 1 / task.control_dt) if render_mode else None
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
-        self.sim = Simulator(
-            scene,
-            num_envs,
-            integration or task.integration("default"),
-            task.control_dt,
-            horizon,
-            device,
-            dtype,
-            threads,
-            factors=factors,
-            forces=forces,
-        )
-        self.device, self.dtype = self.sim.device, dtype
-        self._elevation = None if scene.terrain is None else Elevation(scene, self.device, dtype)
-        real = np.float32 if dtype == torch.float32 else np.float64
+        self.sim = Simulator(scene, num_envs, control_dt=task.control_dt, horizon=horizon, **asked._asdict())
+        self._elevation = None if scene.terrain is None else Elevation(scene, self.device, self.dtype)
+        real = np.float32 if self.dtype == torch.float32 else np.float64
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.obs_dim,), real)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (scene.nu,), real)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -121,10 +110,10 @@ class DiffEnv(VectorEnv):
         else:
             self.generator.manual_seed(check_seed(seed))
 
-        self._no_action = torch.zeros(num_envs, scene.nu, dtype=dtype, device=self.device)
+        self._no_action = torch.zeros(num_envs, scene.nu, dtype=self.dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.first_step = torch.zeros_like(self.episode_step)
-        self._episode_return = torch.zeros(num_envs, dtype=dtype, device=self.device)
+        self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
         self._restart()
         self.render_mode = render_mode
@@ -251,7 +240,7 @@ class DiffEnv(VectorEnv):
         everyone = np.ones(self.num_envs, dtype=np.bool_)
         try:
             mask = torch.as_tensor(options.get("reset_mask", everyone))
-        except TypeError as error:
+        except (TypeError, RuntimeError) as error:  # torch's for None and for what is no array
             raise ValueError(f"reset_mask is {options['reset_mask']!r}, must be bool ({self.num_envs},)") from error
         if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask is {mask.dtype} {tuple(mask.shape)}, must be bool ({self.num_envs},)")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -39,7 +40,7 @@ class NumpyEnv(gymnasium.Env[Array, Array]):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:
         """Start an episode; returns obs (obs_dim,) and an empty info."""
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else _check_seed(seed))
         return _begin(self.env, np.zeros(1, np.int64), [self.np_random])[0], {}
 
     @torch.no_grad()
@@ -84,7 +85,7 @@ class NumpyVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self.action_space, self.single_action_space = env.action_space, env.single_action_space
         self._ended = np.zeros(self.num_envs, bool)
         self._seeds, self._generators = [0] * self.num_envs, [np.random.default_rng(0)] * self.num_envs
-        self._seed(np.arange(self.num_envs), env.np_random_seed)
+        self._seed(range(self.num_envs), [env.np_random_seed + i for i in range(self.num_envs)])
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
@@ -108,7 +109,14 @@ class NumpyVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
             ValueError: seeds or a mask of another length, or a mask that is not bool.
         """
         rows = self.env.masked(options).numpy(force=True)
-        self._seed(rows, seed)
+        if seed is not None:
+            if isinstance(seed, Sequence | np.ndarray):
+                seeds = list(seed)
+            else:
+                seeds = [_check_seed(seed) + i for i in range(self.num_envs)]
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments; give one each, or one integer")
+            self._seed(rows, [None if each is None else _check_seed(each) for each in seeds])
         self._ended[rows] = False
         return self._begin(rows), {}
 
@@ -153,18 +161,20 @@ class NumpyVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
     def close_extras(self, **_: Any) -> None:
         self.env.close()
 
-    def _seed(self, rows: NDArray[np.int64], seed: int | Sequence[int | None] | None) -> None:
-        if seed is None:
-            return
-        seeds = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments; give one each, or one integer")
+    def _seed(self, rows: Iterable[int], seeds: Sequence[int | None]) -> None:
         for i in rows:
             if seeds[i] is not None:
-                self._generators[i], self._seeds[i] = seeding.np_random(int(seeds[i]))
+                self._generators[i], self._seeds[i] = seeding.np_random(seeds[i])
 
     def _begin(self, rows: NDArray[np.int64]) -> Array:
         return _begin(self.env, rows, [self._generators[i] for i in rows])
+
+
+def _check_seed(seed: object) -> int:
+    """The seed as an int, be it NumPy's; gymnasium takes True and 1.0, too."""
+    if not isinstance(seed, Integral) or isinstance(seed, bool):
+        raise ValueError(f"seed is {seed!r}, must be an integer")
+    return int(seed)
 
 
 def _begin(env: DiffEnv, rows: NDArray[np.int64], generators: Sequence[np.random.Generator]) -> Array:
@@ -176,7 +186,13 @@ def _begin(env: DiffEnv, rows: NDArray[np.int64], generators: Sequence[np.random
 
 
 def _tensor(env: DiffEnv, array: ArrayLike) -> torch.Tensor:
-    return torch.tensor(np.asarray(array), dtype=env.dtype, device=env.device)
+    """A copy; raises ValueError if the array holds anything but real numbers."""
+    array = np.asarray(array)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"action is an array of {array.dtype}, must be one of real numbers")
+    with np.errstate(over="ignore"):  # to infinity, and so to the end of the range
+        array = np.array(array, env.single_action_space.dtype, order="C")  # whatever its strides and its byte order
+    return torch.from_numpy(array).to(env.device)
 
 
 def _array(tensor: torch.Tensor) -> NDArray[Any]:

@@ -8,11 +8,9 @@ import importlib
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-from weakref import WeakSet
 
 import warp as wp
 
@@ -20,7 +18,6 @@ ROOM = 16 * 2**20  # bytes that a kernel takes in Warp's cache at most; LLVM abo
 # What Warp prints when it starts and nobody needs: pip installs a Warp that supports the Python at hand.
 NOISE = (b"Could not find or load the NVIDIA CUDA driver", b"Support for Python 3.10 is deprecated")
 _announced: set[str] = set()
-_watched: WeakSet[Any] = WeakSet()
 
 
 class KernelCacheError(ValueError):
@@ -33,7 +30,10 @@ class KernelCacheError(ValueError):
 
 
 def import_mujoco() -> None:
-    """Import MuJoCo even where MUJOCO_GL names an OpenGL that is not there: only drawing needs it, and says so."""
+    """Import MuJoCo even where MUJOCO_GL names an OpenGL that is not there: only drawing needs it, and says so.
+
+    Its warnings go to stderr, unless the host already has another place for them.
+    """
     try:
         importlib.import_module("mujoco")
     except Exception:  # AttributeError among them
@@ -45,6 +45,9 @@ def import_mujoco() -> None:
             importlib.import_module("mujoco")
         finally:
             os.environ["MUJOCO_GL"] = wanted
+    mujoco = sys.modules["mujoco"]
+    if mujoco.get_mju_user_warning() is None:  # MuJoCo would write MUJOCO_LOG.TXT into the user's folder
+        mujoco.set_mju_user_warning(lambda text: print(f"MuJoCo: {text}", file=sys.stderr))
 
 
 def start_warp() -> None:
@@ -89,35 +92,29 @@ def check_kernel_cache() -> Path:
     return Path(str(wp.config.kernel_cache_dir))
 
 
-def announce_compilation(kernels: Iterable[wp.Kernel], name: str) -> None:
-    """Say in one line on stderr when Warp begins to compile the first of the kernels; nothing if its cache has them."""
-    for kernel in kernels:
-        if kernel.module not in _watched:
-            _watched.add(kernel.module)
-            _watch(kernel.module, name)
+def load(module: wp.Module, device: str, block_dim: int, name: str) -> None:
+    """Load a module of kernels. One that the cache lacks, or has damaged, is compiled, which one line on stderr says.
 
-
-def _watch(module: Any, name: str) -> None:
-    load = module.load
-
-    def announcing_load(device: Any, block_dim: int | None = None, *args: Any, **kwargs: Any) -> Any:
-        try:
-            if not _is_compiled(module, wp.get_device(device), block_dim):
-                if shutil.disk_usage(str(wp.config.kernel_cache_dir)).free < ROOM:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                if name not in _announced and os.environ.get("RANK", "0") == "0":
-                    print(f"compiling kernels for {name} (once, about 10 s) ...", file=sys.stderr, flush=True)
-                _announced.add(name)
-            return load(device, block_dim, *args, **kwargs)
-        except OSError as error:
-            raise KernelCacheError(wp.config.kernel_cache_dir, error) from error
-
-    module.load = announcing_load
-
-
-def _is_compiled(module: Any, device: wp.Device, block_dim: int | None) -> bool:
+    Raises:
+        KernelCacheError: the cache cannot be written, or what was compiled cannot be loaded from there.
+    """
+    pattern, block_dim = ("*.o", 1) if device == "cpu" else ("*.sm*", block_dim)  # Warp's block on a CPU is 1
     folder = Path(str(wp.config.kernel_cache_dir)) / module.get_module_identifier(block_dim)
-    return any(folder.glob("*.o" if device.is_cpu else "*.sm*"))
+    try:
+        if any(folder.glob(pattern)):
+            try:
+                module.load(device, block_dim)
+                return
+            except Exception:  # Warp's and json's
+                shutil.rmtree(folder)
+        if shutil.disk_usage(folder.parent).free < ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if name not in _announced and os.environ.get("RANK", "0") == "0":
+            print(f"compiling kernels for {name} (once, about 10 s) ...", file=sys.stderr, flush=True)
+        _announced.add(name)
+        module.load(device, block_dim)
+    except OSError as error:
+        raise KernelCacheError(wp.config.kernel_cache_dir, error) from error
 
 
 @contextmanager

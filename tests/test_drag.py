@@ -14,14 +14,15 @@ from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
 # A free box of three unlike sides, two more on hinges about unlike axes, one of them on a slide besides. It is fast in
-# its fluid, so that both parts of the law count.
+# its fluid, so that both parts of the law count. A planar root, and the implicit integrator, are the swimmer's in
+# test_dynamics.py and test_gradient.py.
 FISH = """
 <mujoco>
   <option density="300" viscosity="2" gravity="0.3 -0.2 -9.81"/>
   <default> <geom contype="0" conaffinity="0"/> </default>
   <worldbody>
     <body>
-      {root} <geom type="box" size="0.2 0.1 0.05" euler="10 20 30" pos="0.1 0.02 0.03" density="400"/>
+      <freejoint/> <geom type="box" size="0.2 0.1 0.05" euler="10 20 30" pos="0.1 0.02 0.03" density="400"/>
       <body pos="0.3 0 0.1">
         <joint name="a" axis="0.2 1 0.1" damping="0.1"/> <geom type="box" size="0.1 0.05 0.2" density="400"/>
         <body pos="0 0.1 0.2">
@@ -33,8 +34,6 @@ FISH = """
   </worldbody>
   <actuator> <motor joint="a" gear="5"/> <motor joint="b" gear="5"/> </actuator>
 </mujoco>"""
-# A planar root is the swimmer's, in test_dynamics.py and test_gradient.py.
-ROOTS = {"floating": "<freejoint/>", "fixed": '<joint axis="0 1 1"/>'}
 BALL = """
 <mujoco>
   <option density="3" viscosity="{viscosity}" gravity="0 0 0"/>
@@ -42,24 +41,13 @@ BALL = """
 </mujoco>"""
 
 
-def fish(root):
-    return parse(FISH.format(root=ROOTS[root]))
-
-
-# The integrator is nothing to the drag, and each kernel takes seconds to compile.
-every_kind = pytest.mark.parametrize(
-    "root, integrator", [*((root, "semi_implicit") for root in ROOTS), ("floating", "implicit")]
-)
-
-
 def states_of(scene, rng):
     qpos, qvel, ctrl = free_states(scene, 8, rng)
     return qpos, 2 * qvel, ctrl
 
 
-@pytest.mark.parametrize("root", ROOTS)
-def test_accelerations_are_mujocos(root, rng):
-    scene = fish(root)
+def test_accelerations_are_mujocos(rng):
+    scene = parse(FISH)
     model, data, states = scene.mj_model, mujoco.MjData(scene.mj_model), states_of(scene, rng)
     for state, qacc in zip(zip(*states, strict=True), acceleration(scene, *states), strict=True):
         data.qpos[:], data.qvel[:], data.ctrl[:] = state
@@ -68,9 +56,8 @@ def test_accelerations_are_mujocos(root, rng):
         np.testing.assert_allclose(qacc, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
 
 
-@every_kind
-def test_steps_are_the_references(root, integrator, rng):
-    scene, integration = fish(root), Integration(integrator, 4)
+def test_steps_are_the_references(rng):
+    scene, integration = parse(FISH), Integration(substeps=4)
     states = states_of(scene, rng)
     q, v = run(scene, *states, integration=integration)
     for e, state in enumerate(zip(*states, strict=True)):
@@ -79,10 +66,9 @@ def test_steps_are_the_references(root, integrator, rng):
         np.testing.assert_allclose(v[e], expected[1], atol=1e-10)
 
 
-@every_kind
-def test_gradient_is_that_of_differences(root, integrator, rng):
-    scene = fish(root)
-    check_gradients(scene, states_of(scene, rng), rng, integration=Integration(integrator, 8))
+def test_gradient_is_that_of_differences(rng):
+    scene = parse(FISH)
+    check_gradients(scene, states_of(scene, rng), rng, integration=Integration(substeps=8))
 
 
 def test_gradient_at_rest_is_the_viscous_one(rng):
@@ -108,5 +94,5 @@ def test_terminal_velocity():
 
 
 def test_no_fluid_no_kernel_code():
-    scene = parse(FISH.format(root=ROOTS["floating"]))
+    scene = parse(FISH)
     assert "drag" in scene.features and "drag" not in scene.without("drag").features

@@ -122,8 +122,9 @@ def test_time_limit_can_be_set():
     with torch.no_grad():
         limits = [env.step(torch.zeros(2, 1))[3].tolist() for _ in range(6)]
     assert limits == [[False] * 2, [False] * 2, [True] * 2] * 2
-    with pytest.raises(ValueError, match="max_episode_steps is 0"):
-        diffsim.make("cartpole", max_episode_steps=0)
+    for steps, message in ((0, "max_episode_steps is 0"), (2**63, "must be at most 4611686018427387904")):
+        with pytest.raises(ValueError, match=message):
+            diffsim.make("cartpole", max_episode_steps=steps)
 
 
 def test_early_termination_can_be_off():
@@ -379,7 +380,7 @@ def test_seeds_are_integers(seed):
             call()
 
 
-@pytest.mark.parametrize("options", [5, {"mask": np.array([True, False])}, {"reset_mask": "all"}])
+@pytest.mark.parametrize("options", [5, {"mask": np.array([True, False])}, {"reset_mask": "all"}, {"reset_mask": None}])
 def test_unknown_reset_options_are_refused(options):
     env = diffsim.make("cartpole", num_envs=2, seed=0)
     qpos = env.qpos.clone()

@@ -23,7 +23,7 @@ SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
 # The hopper's kernels are other tests' already.
 @pytest.mark.parametrize(
     "name, integration",
-    [*(("linear", setting) for setting in SETTINGS), *zip(("planar", "hopper"), SETTINGS, strict=True)],
+    [*(("linear", setting) for setting in SETTINGS), *zip(("hopper", "planar"), SETTINGS, strict=True)],
 )
 def test_steps_are_the_references(name, integration, rng):
     scene, states = varied_robot(name, 4, rng)
@@ -35,12 +35,12 @@ def test_steps_are_the_references(name, integration, rng):
             np.testing.assert_allclose(value[e], end, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name, integration", [*zip(("linear", "hopper"), SETTINGS, strict=True)])
-def test_factors_of_one_change_no_bit(name, integration, rng):
+@pytest.mark.parametrize("name", ["linear", "hopper"])
+def test_factors_of_one_change_no_bit(name, rng):
     scene, states = varied_robot(name, 16, rng)
     results = []
     for factors in (False, True):
-        sim = Simulator(scene, 16, integration, dtype=torch.float64, factors=factors)
+        sim = Simulator(scene, 16, SETTINGS[0], dtype=torch.float64, factors=factors)
         leaves = [torch.tensor(x, requires_grad=True) for x in states]
         q, v = sim.step(*leaves)
         results.append([q, v, *torch.autograd.grad(q.sin().sum() + v.cos().sum(), leaves)])

@@ -19,8 +19,9 @@ from torch import Tensor
 
 import diffsim
 import gps
-from diffsim.planning import LinearGaussian, save_demonstration
+from diffsim.planning import LinearGaussian, gaussian_log_prob, load_demonstration, save_demonstration
 from diffsim.planning.lbfgs import maximise
+from diffsim.planning.samples import log_mixture, log_weights, phi
 from diffsim.planning.terrains import named_terrains
 from diffsim.training import evaluate, load_policy
 from diffsim.training.checkpoint import load, restore
@@ -67,10 +68,10 @@ def test_gradient_of_phi_is_that_of_appendix_a(w_r: float, rng: np.random.Genera
     policy, theta = a_policy(rng, "hopper")
     obs, u, reward, log_q = a_set(rng)
     u = policy.mean(theta, obs) + 0.6 * u  # likely enough under the policy that no product underflows
-    mixture = gps.log_mixture(log_q)
+    mixture = log_mixture(log_q)
 
     def objective(theta: Tensor) -> Tensor:
-        return gps.phi(policy.log_prob(theta, obs, u), mixture, reward, w_r)
+        return phi(policy.log_prob(theta, obs, u), mixture, reward, w_r)
 
     leaf = theta.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(objective(leaf), leaf)
@@ -96,14 +97,14 @@ def test_mixture_is_of_prefixes() -> None:
     """Not a product of per-step mixtures: with components this unlike the two are many nats apart."""
     per_step = torch.tensor([[[0.0, -20.0, 0.0], [-20.0, 0.0, -20.0]]], dtype=torch.float64)
     expected = [[math.log((math.exp(a) + math.exp(b)) / 2) for a, b in ((0, -20), (-20, -20), (-20, -40))]]
-    torch.testing.assert_close(gps.log_mixture(per_step.cumsum(2)), torch.tensor(expected, dtype=torch.float64))
+    torch.testing.assert_close(log_mixture(per_step.cumsum(2)), torch.tensor(expected, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("w_r", [0.0, 0.5])
 def test_adding_a_constant_to_all_densities(w_r: float, rng: np.random.Generator) -> None:
     _, _, reward, log_q = a_set(rng)
     log_pi = normal(rng, *reward.shape)
-    one, other = (gps.phi(log_pi, gps.log_mixture(q), reward, w_r).item() for q in (log_q, log_q + 300))
+    one, other = (phi(log_pi, log_mixture(q), reward, w_r).item() for q in (log_q, log_q + 300))
     assert one == pytest.approx(other + w_r * 300 * reward.shape[1], rel=1e-10)
 
 
@@ -136,8 +137,8 @@ def test_estimate_is_unbiased_and_its_error_falls(rng: np.random.Generator) -> N
     def estimate(m: int) -> tuple[float, Tensor]:
         x, u, reward = scalar_rollouts(rng, m, (0.3, 0.9), 0.4, T)
         log_q = torch.stack([scalar_log_prob(x, u, g, 0.4).cumsum(1) for g in (0.3, 0.9)], 1)
-        log_pi, mixture = scalar_log_prob(x, u, gain, std), gps.log_mixture(log_q)
-        return gps.phi(log_pi, mixture, reward, 0.0).item(), gps.log_weights(log_pi, mixture).exp()
+        log_pi, mixture = scalar_log_prob(x, u, gain, std), log_mixture(log_q)
+        return phi(log_pi, mixture, reward, 0.0).item(), log_weights(log_pi, mixture).exp()
 
     few, many = (np.array([estimate(m)[0] for _ in range(200)]) for m in (200, 1800))
     for values in (few, many):
@@ -153,7 +154,7 @@ def test_phi_finds_the_optimum_of_a_bandit(rng: np.random.Generator) -> None:
     flat, reward = torch.full((20_000, 1), -math.log(7.0)).double(), -(u - 0.7).square()
 
     def objective(mean: Tensor) -> Tensor:
-        return gps.phi(gps.gaussian_log_prob(u[..., None], mean, 0.3 * torch.ones(1).double()), flat, reward, 0.0)
+        return phi(gaussian_log_prob(u[..., None], mean, 0.3 * torch.ones(1).double()), flat, reward, 0.0)
 
     best, value = maximise(objective, torch.zeros(1).double(), 50)
     assert best.item() == pytest.approx(0.7, abs=0.02) and value == pytest.approx(-0.09, rel=0.05)
@@ -228,13 +229,12 @@ def test_policy_does_not_look_at_the_action_before(rng: np.random.Generator) -> 
     torch.testing.assert_close(network(obs), policy.mean(theta, obs).tanh())
 
 
-@pytest.mark.parametrize("bounds, start", [((1e-6, 1e-2), 1e-4), (None, 0.0)])
+@pytest.mark.parametrize("bounds, start", [((1e-6, 1e-2), 1e-4), ((0.0, 0.0), 0.0)])
 def test_schedule_of_the_regulariser(
-    bounds: tuple[float, float] | None, start: float, search: gps.Search, monkeypatch: pytest.MonkeyPatch
+    bounds: tuple[float, float], start: float, search: gps.Search, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lines 10 to 16: a better policy is kept, and w_r falls; otherwise w_r grows, and the best is sampled again."""
-    search.args.regularizer_bounds = bounds or (1e-6, 1e-2)
-    search.args.variant, search.w_r, best = "full" if bounds else "unregularized", start, search.network.theta
+    search.args.regularizer_bounds, search.w_r, best = bounds, start, search.network.theta
     monkeypatch.setattr(search, "optimise", lambda S: (search.network.theta + 1e-3, {}))
     seen = []
     for better in (True, True, True, False, False, False, False, False, False, True):
@@ -248,7 +248,7 @@ def test_schedule_of_the_regulariser(
         seen.append(search.w_r)
     assert drawn == search.control_steps
     expected = [1e-5, 1e-6, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-2, 1e-2, 1e-3]
-    np.testing.assert_allclose(seen, expected if bounds else 0.0)
+    np.testing.assert_allclose(seen, expected if start else 0.0)
 
 
 def test_guides_reproduce_the_plan(search: gps.Search) -> None:
@@ -403,7 +403,7 @@ def test_an_evaluation_ends_where_the_robot_falls() -> None:
     search.network.u_std, search.network.sigma = torch.zeros(3).double(), torch.full((3,), 0.1).double()
     evaluation = gps.evaluate(search)
     env = diffsim.make("hopper", 2, horizon=1, dtype=torch.float64, stochastic_init=False)
-    noise = search.noise(3, torch.Generator().manual_seed(gps.EVALUATION_SEED))[1:]
+    noise = search.noise(3, torch.Generator().manual_seed(gps.SEED))[1:]
     env.reset()
     returns: dict[int, tuple[int, float]] = {}
     for t in range(400):
@@ -415,20 +415,29 @@ def test_an_evaluation_ends_where_the_robot_falls() -> None:
         assert evaluation.returns[e].item() == pytest.approx(returns[e][1], rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "variant", ["feedback", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
-)
-def test_variants(variant: str, tmp_path: Path) -> None:
-    modules = run(gps, tmp_path, *TINY, "--variant", variant)["modules"]
-    search, S = modules["search"], modules["samples"]
-    guided = variant in ("feedback", "unregularized")
-    assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
-    assert (search["w_r"] == 0) == (variant == "unregularized")
-    assert (len(S["samples"][0][:, 0].unique(dim=0)) > 3) == (variant == "restart")
-    assert len(search["lessons"]) == {"feedback": 3, "dagger": 2}.get(variant, 0)
-    assert variant != "dagger" or len(search["lessons"][0]) == 8 + 2 * 4
-    moved = not torch.equal(modules["policy"]["theta"], S["generators"][S["best"]][0])
-    assert moved == (variant in ("policy-gradient", "dagger"))
+def test_feedback(tmp_path: Path) -> None:
+    """It learns the guides' lessons, and S has its guide."""
+    modules = run(gps, tmp_path, *TINY, "--variant", "feedback")["modules"]
+    assert len(modules["learner"]["lessons"]) == 3 and modules["S"]["initial"] == 1
+
+
+def test_an_interrupted_run_keeps_its_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the moment that it exists, and the next run can start from it."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    plans = list[Tensor]()
+    with monkeypatch.context() as patch:
+        plan = gps.Search.plan
+        patch.setattr(gps.Search, "plan", lambda *args: (made := plan(*args), plans.append(made.x[0]))[0])
+        patch.setattr(gps.Search, "guide", interrupt)
+        with pytest.raises((KeyboardInterrupt, SystemExit)):
+            gps.main([*TINY, "--run-dir", str(tmp_path / "run")])
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["plan.npz"]
+    x, _ = load_demonstration(make_search("cartpole").system, tmp_path / "run" / "plan.npz", 8)
+    assert torch.equal(x, plans[0])
+    run(gps, tmp_path / "run", *TINY, "--demonstration", tmp_path / "run" / "plan.npz")
 
 
 @pytest.mark.gpu
@@ -439,23 +448,23 @@ def test_a_gpu_plans_and_learns_as_the_cpu_does(variant: str, tmp_path: Path) ->
     one, other = (run(gps, tmp_path / device, *flags, device)["modules"] for device in ("cpu", "cuda"))
     for part in ("x", "u", "K", "L"):
         place = LinearGaussian._fields.index(part)
-        torch.testing.assert_close(other["search"]["guides"][0][place].cpu(), one["search"]["guides"][0][place])
-    assert other["search"]["control_steps"] == one["search"]["control_steps"]
-    torch.testing.assert_close(other["policy"]["theta"].cpu(), one["policy"]["theta"], rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(other["learner"]["guides"][0][place].cpu(), one["learner"]["guides"][0][place])
+    assert other["learner"]["control_steps"] == one["learner"]["control_steps"]
+    torch.testing.assert_close(other["network"]["theta"].cpu(), one["network"]["theta"], rtol=1e-3, atol=1e-3)
 
 
 def test_seeds_and_adaptive_guides(tmp_path: Path) -> None:
     arguments = [*TINY, *"--guides 2 --adaptive 1 --adaptive-iterations 2 --stored 60 --seed".split()]
     one, other = (run(gps, tmp_path / str(seed), *arguments, seed)["modules"] for seed in (1, 2))
-    assert not torch.equal(one["policy"]["theta"], other["policy"]["theta"])
-    assert len(one["search"]["guides"]) == len(one["search"]["adapted"]) == one["samples"]["initial"] == 2
-    assert sum(len(generator) > 1 for generator in one["samples"]["generators"]) == 4
+    assert not torch.equal(one["network"]["theta"], other["network"]["theta"])
+    assert len(one["learner"]["guides"]) == len(one["learner"]["adapted"]) == one["S"]["initial"] == 2
+    assert sum(len(generator) > 1 for generator in one["S"]["generators"]) == 4
 
 
 def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
     path, qpos = tmp_path / "demo.npz", np.linspace((0.3, 3.0), (0.5, 2.8), 9)
     np.savez(path, qpos=qpos, qvel=np.zeros((9, 2)), action=np.full((8, 1), 0.1))
-    search = run(gps, tmp_path / "run", *TINY, "--demonstration", path)["modules"]["search"]
+    search = run(gps, tmp_path / "run", *TINY, "--demonstration", path)["modules"]["learner"]
     assert search["guides"][0][0][0].tolist() == [0.3, 3.0, 0.0, 0.0]
 
 
@@ -494,7 +503,7 @@ def test_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     for i, name in enumerate(SLOPES):  # each is the start of its own terrain's guide, and is followed to its end
         again = make_search("hopper", f"--horizon 8 --terrain {name} --demonstration {tmp_path / 'plan.npz'}")
         again.args.ilqr_iterations = 0
-        torch.testing.assert_close(gps.plan_trajectories(again, name, print).x[0], search.guides[i].x)
+        torch.testing.assert_close(again.plan(name, print).x[0], search.guides[i].x)
     evaluation = gps.evaluate(search)  # beside these two one without noise, which is the first
     world = evaluation.qpos[0, :, 1] - search.guides[0].x[0, 1]
     torch.testing.assert_close(world, torch.tensor([1.0, -1.0]).double() * math.tan(math.radians(15.0)))
@@ -517,7 +526,7 @@ def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyP
     arguments = [*HOPPING, "level", "--practice", *kinds, "--perturb", "0"]
     whole = run(gps, tmp_path / "whole", *arguments)
     assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
-    start, S = whole["modules"]["search"]["guides"][0][0][0], whole["modules"]["samples"]
+    start, S = whole["modules"]["learner"]["guides"][0][0][0], whole["modules"]["S"]
     own = S["samples"][0][S["samples"][5] > 0]
     assert len(own) >= 6 and len(own[:, 1].unique(dim=0)) == len(own) and (own[:, 0] == start).all()
     search = gps.Search(gps.Args(**whole["args"]), environment("hopper", 1))
@@ -539,7 +548,7 @@ def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None
     flags = f"--horizon 8 --window 4 --terrain level step:-20:0.01 --demonstration {path}"
     search = make_search("hopper", flags)
     search.args.ilqr_iterations = 0
-    level, step = (gps.plan_trajectories(search, name, print) for name in search.grounds)
+    level, step = (search.plan(name, print) for name in search.grounds)
     torch.testing.assert_close(level.x, x)
     assert step.x.shape == x.shape and not torch.allclose(step.u, u)
     ground = search.grounds["step:-20:0.01"]
@@ -551,9 +560,18 @@ def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None
     [
         ("--env hopper --terrain hill", "terrain 'hill' must be level, incline:DEGREES"),
         ("--env hopper --terrain level step:0", "terrain 'step:0': height is 0.0"),
+        ("--env hopper --terrain", "--terrain needs at least one name: level, incline:DEGREES"),
+        ("--env hopper --terrain rough:10:1:inf", "terrain 'rough:10:1:inf'"),
+        ("--env hopper --practice incline:100", "terrain 'incline:100': degrees is 100.0"),
+        ("--env hopper --practice rough:10 step:nan", "terrain 'step:nan': height is nan"),
+        ("--env cartpole --horizon 4611686018427387904", "--horizon must be from 1 to 10,000, not 46"),
+        ("--env cartpole --hidden 10001", "--hidden must be from 1 to 10,000, not 10001"),
+        ("--env cartpole --restarts 4611686018427387904", "--restarts must be from 1 to 10,000"),
+        ("--env cartpole --stored 4611686018427387904", "--stored must be from 1 to 10,000"),
+        ("--env cartpole --pretraining 2147483648", "--pretraining must be from 1 to 10,000"),
         ("--env hopper --practice incline:10:1", "kind of terrain 'incline:10:1' must be incline:DEGREES"),
         ("--env hopper --terrain level step:1 step:2 --samples 2", "--samples must be at least 3, not 2"),
-        ("--env hopper --terrain level step:1 --adaptive 1", "--adaptive is of guides on one --terrain"),
+        ("--env hopper --terrain level step:1 --adaptive 1", "--adaptive takes one --terrain"),
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant"),
         ("--env cartpole --horizon 1", "--horizon must be at least 2, not 1"),
         ("--env cartpole --guiding-samples 1", "--guiding-samples must be at least 2, not 1"),

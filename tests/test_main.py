@@ -173,16 +173,6 @@ def test_only_a_compilation_is_announced(tmp_path: Path) -> None:
     assert result.stderr == "compiling kernels for cartpole (once, about 10 s) ...\n"
 
 
-def test_what_is_compiled_already_is_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    env = diffsim.make("cartpole", 1)
-    with torch.no_grad():
-        env.step(torch.zeros(1, 1))
-    module, cpu = env.sim._stepper._launcher._kernels["forward"].module, wp.get_device("cpu")
-    assert startup._is_compiled(module, cpu, 1)
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    assert not startup._is_compiled(module, cpu, 1)
-
-
 def test_only_the_warning_is_held_back(capfd: pytest.CaptureFixture[str]) -> None:
     with startup._without(b"noise"):
         os.write(2, b"first\nmuch noise here\nlast\n")
@@ -213,7 +203,7 @@ assert "diffsim.view.gait" not in sys.modules  # no training needs it
 
 def test_a_full_kernel_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     env = diffsim.make("cartpole", 1, substeps=1)
-    monkeypatch.setattr(startup, "_is_compiled", lambda *_: False)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1e6))
     with pytest.raises(startup.KernelCacheError, match=r"kernel cache /.*: set WARP_CACHE_PATH to .* \(No space left"):
         env.step(torch.zeros(1, 1))

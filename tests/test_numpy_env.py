@@ -179,13 +179,25 @@ def test_actions_of_other_types() -> None:
     results = []
     read_only = np.full((2, 3), 0.5, np.float32)
     read_only.flags.writeable = False
-    for action in (read_only, np.full((2, 3), 0.5), [[0.5] * 3] * 2):
+    plain = np.full((2, 3), 0.5)
+    for action in (read_only, plain, plain.tolist(), plain[:, ::-1], plain.astype(">f8"), plain.astype(np.longdouble)):
         env.reset(seed=0)
         results.append(env.step(action)[0])
-    np.testing.assert_array_equal(results[0], results[1])
-    np.testing.assert_array_equal(results[0], results[2])
+    for result in results[1:]:
+        np.testing.assert_array_equal(results[0], result)
+    for action in (plain.astype(complex), plain.astype(object), plain.astype(str)):
+        with pytest.raises(ValueError, match=f"array of {action.dtype}, must be one of real numbers"):
+            env.step(action)
     with pytest.raises(ValueError, match=r"action has shape \(2, 2\), must be \(2, 3\)"):
         env.step(np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("seed", [True, 1.5, [1.5, 2], [True, 2]])
+def test_seeds_are_integers(seed: Any) -> None:
+    single, many = gymnasium.make(HOPPER), gymnasium.make_vec(HOPPERS, num_envs=2)
+    for env in (many, single) if not isinstance(seed, list) else (many,):
+        with pytest.raises(ValueError, match="must be an integer"):
+            env.unwrapped.reset(seed=seed)
 
 
 # Wrappers and pictures ------------------------------------------------------------------------------------------------

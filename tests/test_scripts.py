@@ -237,7 +237,7 @@ def test_evaluate(script: ModuleType, trained: Path, tmp_path: Path, capsys: pyt
     assert evaluation["settings"].items() >= settings.items()
     assert evaluation["lengths"] == [240] * 3 and evaluation["speed"] is None
 
-    explicit = "--integrator semi_implicit --substeps 16 --no-finer --run-dir".split()
+    explicit = "--integrator semi_implicit --substeps 16 --no-finer --device cpu --run-dir".split()
     script.main(["--evaluate", str(path), *explicit, str(tmp_path / "explicit")])
     again = json.loads((tmp_path / "explicit" / "evaluation.json").read_text())
     assert again["return"] == finer["return"] and "finer" not in again

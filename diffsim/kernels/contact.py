@@ -1,4 +1,4 @@
-"""The contact law of one sphere on the ground plane, Eq. 3, and its adjoint.
+"""The contact of spheres with the ground, Eq. 3, and its adjoint.
 
 With depth d < 0, point velocity v and its normal component v_z (the rate of d),
 
@@ -9,6 +9,8 @@ At zero slip c = k_t without a division.
 
 Implicit step: the law is linear in the acceleration a of the point, f = f(d + theta h v_z, v) - B a, with
 B = diag(h c, h c, theta h^2 k_n - h k_d d) and c lagged; the explicit law is B = 0, h_implicit = theta = 0.
+
+On a terrain (terrain.py) the law and its adjoint act in the frame E of the feature that the sphere touches.
 """
 
 from functools import cache
@@ -16,13 +18,32 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.factors import K_D, K_N, K_T, MU
+from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import types
+from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.terrain import terrain_contact
 
 
 @cache
-def contact_law(dtype: type) -> SimpleNamespace:
-    t = types(dtype)
-    T, vec3, vec4, Law = dtype, t.vec3, t.vec4, t.Law
+def contact_law(spec: KernelSpec) -> SimpleNamespace:
+    t, sp = types(spec.dtype), spatial(spec.dtype)
+    T, vec3, vec4, vec6, mat3, Model, Law = spec.dtype, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
+    Place, force_at, point_velocity = kinematics(spec).Place, sp.force_at, sp.point_velocity
+    sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
+    IMPLICIT, VARIED = spec.implicit, spec.varied
+
+    @wp.func
+    def sphere_state(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
+        """Lowest point p, its velocity, and the depth (predicted theta h ahead if implicit) of contact sphere k."""
+        p = x + R * m.contact_position[k]
+        depth = height + p[2] - m.contact_radius[k]
+        p = p - vec3(T(0.0), T(0.0), m.contact_radius[k])
+        v = point_velocity(V, p)
+        if wp.static(IMPLICIT):
+            depth = depth + theta * h * v[2]
+        return p, v, depth
 
     @wp.func
     def touches(law: Law, d: T, v: vec3):
@@ -86,10 +107,128 @@ def contact_law(dtype: type) -> SimpleNamespace:
         g_kn = -g_n * d - g[2] * theta * h * h * a[2]
         return vec4(g_kn, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
-    return SimpleNamespace(
-        touches=touches,
-        contact_force=contact_force,
-        contact_resistance=contact_resistance,
-        contact_adjoint=contact_adjoint,
-        contact_constants_adjoint=contact_constants_adjoint,
-    )
+    @wp.func
+    def add_contacts(
+        m: Model,
+        law: Law,
+        k: int,
+        R: mat3,
+        x: vec3,
+        V: vec6,
+        place: Place,
+        h: T,
+        theta: T,
+        Ia: mat3,
+        Ib: mat3,
+        Id: mat3,
+        F: vec6,
+    ):
+        """Inertia blocks and bias force of link k with its contacts added."""
+        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+            if wp.static(TERRAIN):
+                p, v, depth, E, _ = sphere_on_terrain(m, law.profile, c, R, x, V, place, h, theta)
+            else:
+                p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
+            if touches(law, depth, v):
+                fc = contact_force(law, depth, v)
+                f = vec3(fc[0], fc[1], fc[2])
+                if wp.static(TERRAIN):
+                    f = E * f
+                if wp.static(IMPLICIT):
+                    B = contact_resistance(law, depth, fc[3], h, theta)
+                    if wp.static(TERRAIN):
+                        D = E * wp.diag(B) * wp.transpose(E)
+                        f = f - D * m.gravity
+                    else:
+                        f = f - wp.cw_mul(B, m.gravity)
+                        D = wp.diag(B)
+                    PB = wp.skew(p) * D
+                    Ia = Ia - PB * wp.skew(p)
+                    Ib = Ib + PB
+                    Id = Id + D
+                F = F - force_at(p, f)
+        return Ia, Ib, Id, F
+
+    @wp.func
+    def add_contacts_adjoint(
+        m: Model,
+        law: Law,
+        k: int,
+        R: mat3,
+        x: vec3,
+        V: vec6,
+        A: vec6,
+        W: vec6,
+        place: Place,
+        h: T,
+        theta: T,
+        adj_a: vec6,
+        adj_v: vec6,
+        adj_w: vec6,
+        adj_p: vec6,
+        adj_factors: t.array,  # written if varied only
+    ):
+        """The adjoints of link k with its contacts' part of phi added."""
+        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+            if wp.static(TERRAIN):
+                p, v, depth, E, curvature = sphere_on_terrain(m, law.profile, c, R, x, V, place, h, theta)
+            else:
+                p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
+            if touches(law, depth, v):
+                fc = contact_force(law, depth, v)
+                f = vec3(fc[0], fc[1], fc[2])
+                g_f = -point_velocity(W, p)
+                if wp.static(TERRAIN):
+                    g_f = wp.transpose(E) * g_f
+                a = vec3()
+                hi = T(0.0)
+                if wp.static(IMPLICIT):
+                    hi = h
+                    a = point_velocity(A, p) + m.gravity
+                    if wp.static(TERRAIN):
+                        a = wp.transpose(E) * a
+                    B = contact_resistance(law, depth, fc[3], h, theta)
+                    f = f - wp.cw_mul(B, a)
+                g = contact_adjoint(law, depth, v, a, g_f, hi, theta)
+                if wp.static(VARIED):
+                    gk = contact_constants_adjoint(law, depth, v, a, g_f, hi, theta)
+                    adj_factors[K_N] = adj_factors[K_N] + m.k_n * gk[0]
+                    adj_factors[K_D] = adj_factors[K_D] + m.k_d * gk[1]
+                    adj_factors[K_T] = adj_factors[K_T] + m.k_t * gk[2]
+                    adj_factors[MU] = adj_factors[MU] + m.mu * gk[3]
+                g_v = vec3(g[0], g[1], g[2])
+                if wp.static(TERRAIN):
+                    g_turn = wp.cross(g_v, v)[1] - wp.cross(g_f, f)[1]  # adjoint of the angle of E
+                    f = E * f
+                    g_v = E * g_v
+                wrench = force_at(p, f)
+                G = force_at(p, g_v)
+                g_p = vec3(T(0.0), T(0.0), g[3])
+                if wp.static(TERRAIN):
+                    g_p = E * g_p
+                g_p = g_p + wp.cross(g_v, wp.spatial_top(V)) - wp.cross(f, wp.spatial_top(W))
+                if wp.static(IMPLICIT):
+                    g_a = -wp.cw_mul(B, g_f)
+                    if wp.static(TERRAIN):
+                        g_turn = g_turn + wp.cross(g_a, a)[1]
+                        g_a = E * g_a
+                    GA = force_at(p, g_a)
+                    g_p = g_p + wp.cross(g_a, wp.spatial_top(A))
+                    adj_a = adj_a + GA
+                    adj_v = adj_v + wp.spatial_cross_dual(V, GA)
+                    adj_p = adj_p + wp.spatial_cross_dual(A, GA)
+                adj_w = adj_w - wrench
+                adj_v = adj_v + G
+                # The lowest point follows the sphere's centre, not the body's material.
+                if wp.static(TERRAIN):
+                    radius = m.contact_radius[c]
+                    tangent = E * vec3(T(1.0), T(0.0), T(0.0))
+                    centre = p + radius * E * vec3(T(0.0), T(0.0), T(1.0))
+                    g_p = g_p + curvature * (g_turn - radius * wp.dot(tangent, g_p)) * tangent
+                else:
+                    centre = p + vec3(T(0.0), T(0.0), m.contact_radius[c])
+                adj_p = adj_p + force_at(centre, g_p)
+                adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
+        return adj_a, adj_v, adj_w, adj_p
+
+    return SimpleNamespace(add_contacts=add_contacts, add_contacts_adjoint=add_contacts_adjoint)

@@ -1,9 +1,8 @@
 """External wrenches on bodies, MuJoCo's xfrc_applied, and their adjoint.
 
-A kernel with forces finds them behind the controls and, if there are any, the factors: six columns of ctrl for each
-body, force f and torque in world axes, at the body's centre of mass p. Their adjoints stand in the same columns of
-that of ctrl. The wrench is constant over a control step, p moves with the body. Of phi (backward.py) it is the term
--W . wrench, with the derivatives
+The array `forces` has six columns for each body, force f and torque in world axes at the body's centre of mass p; it
+has none in kernels without forces. The wrench is constant over a control step, p moves with the body. In phi
+(backward.py) it is the term -W . wrench, with the derivatives
 
     d/df = -(velocity of p under W),   d/dtorque = -(angular part of W),   d/dp = -f x (angular part of W).
 
@@ -28,22 +27,21 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
     mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (t.mat3, vec3, vec6))
     join, force_at, point_velocity = sp.join, sp.force_at, sp.point_velocity
     FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base feels no force
-    FORCES = spec.nu + spec.nfactors  # the column of ctrl where they begin
 
     @wp.func
-    def external(ctrl: t.array2, e: int, body: int, p: vec3):
+    def external(forces: t.array2, e: int, body: int, p: vec3):
         """The force on a body, and the wrench about the carrier."""
-        k = FORCES + 6 * body
-        f = vec3(ctrl[e, k], ctrl[e, k + 1], ctrl[e, k + 2])
-        torque = vec3(ctrl[e, k + 3], ctrl[e, k + 4], ctrl[e, k + 5])
+        k = 6 * body
+        f = vec3(forces[e, k], forces[e, k + 1], forces[e, k + 2])
+        torque = vec3(forces[e, k + 3], forces[e, k + 4], forces[e, k + 5])
         return f, force_at(p, f) + join(torque, vec3())
 
     @wp.func
-    def add_forces(m: Model, at: int, n: int, ctrl: t.array2, e: int, R: mat3s, x: vec3s, P: vec6s):
+    def add_forces(m: Model, at: int, n: int, forces: t.array2, e: int, R: mat3s, x: vec3s, P: vec6s):
         """Adds the forces to the links' bias forces P."""
         for i in range(FIRST, n):
             for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
-                f, wrench = external(ctrl, e, m.body[entry], x[i] + R[i] * m.body_com[entry])
+                f, wrench = external(forces, e, m.body[entry], x[i] + R[i] * m.body_com[entry])
                 P[i] = P[i] - wrench
 
     @wp.func
@@ -51,41 +49,41 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         m: Model,
         at: int,
         n: int,
-        ctrl: t.array2,
+        forces: t.array2,
         e: int,
         R: mat3s,
         x: vec3s,
         W: vec6s,
         adj_w: vec6s,
         adj_p: vec6s,
-        g_forces: vec6s,  # of each body, (force, torque)
+        adj_forces: vec6s,  # of each body, (force, torque)
     ):
         """Adds the forces' part of phi to the links' adjoints."""
         for i in range(FIRST, n):
             for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
                 body = m.body[entry]
                 p = x[i] + R[i] * m.body_com[entry]
-                f, wrench = external(ctrl, e, body, p)
+                f, wrench = external(forces, e, body, p)
                 turn = wp.spatial_top(W[i])
                 adj_w[i] = adj_w[i] - wrench
                 adj_p[i] = adj_p[i] - force_at(p, wp.cross(f, turn)) - wp.spatial_cross_dual(W[i], wrench)
-                g_forces[body] = g_forces[body] - join(point_velocity(W[i], p), turn)
+                adj_forces[body] = adj_forces[body] - join(point_velocity(W[i], p), turn)
 
     @wp.func
-    def finite_forces(m: Model, at: int, g_forces: vec6s):
+    def finite_forces(m: Model, at: int, adj_forces: vec6s):
         """Whether the adjoints of the forces on this lane's bodies are all finite."""
         result = bool(True)
         for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
-            if not wp.isfinite(g_forces[m.body[entry]]):
+            if not wp.isfinite(adj_forces[m.body[entry]]):
                 result = False
         return result
 
     @wp.func
-    def write_forces_adjoint(m: Model, at: int, e: int, keep: bool, g_forces: vec6s, g_ctrl: t.array2):
+    def write_forces_adjoint(m: Model, at: int, e: int, keep: bool, adj_forces: vec6s, g_forces: t.array2):
         for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
             body = m.body[entry]
             for k in range(6):
-                g_ctrl[e, FORCES + 6 * body + k] = wp.where(keep, g_forces[body][k], spec.dtype(0.0))
+                g_forces[e, 6 * body + k] = wp.where(keep, adj_forces[body][k], spec.dtype(0.0))
 
     return SimpleNamespace(
         add_forces=add_forces,

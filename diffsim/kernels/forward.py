@@ -8,52 +8,39 @@ base's Cholesky factor) is what the paper caches as the factored mass matrix; th
 """
 
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.base import base_inertia
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
+from diffsim.kernels.exchange import lane_sums
+from diffsim.kernels.factors import environment_law
 from diffsim.kernels.force import external_force
-from diffsim.kernels.hill import hill_law
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.lanes import lane_sums
-from diffsim.kernels.law import environment_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import MAX_SPEED, KernelSpec, module_options
-from diffsim.kernels.terrain import terrain_contact
 
 
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
-    t, sp, kin = types(spec.dtype), spatial(spec.dtype), kinematics(spec)
-    T, vec2, vec3, vec6, mat3, mat6, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.mat6, t.quat
-    Model, Law, Place = t.Model, t.Law, kin.Place
-    mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
-    join, force_at, momentum, exp_quat = sp.join, sp.force_at, sp.momentum, sp.exp_quat
-    store, place_links, sphere_state = kin.store, kin.place_links, kin.sphere_state
-    link_of, qpos_adr, load_quat, place_balls = kin.link_of, kin.qpos_adr, kin.load_quat, kin.place_balls
-    contact = contact_law(T)
-    touches, contact_force, contact_resistance = contact.touches, contact.contact_force, contact.contact_resistance
-    uses = spec.features
-    sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in uses
-    joint, law_of, VARIED = joint_law(spec), environment_law(spec), spec.varied
-    passive_force, passive_resistance = joint.passive_force, joint.passive_resistance
-    muscle = muscle_law(spec, adjoint=False)
-    add_pull, measure, hill = muscle.add_pull, muscle.measure, hill_law(T).hill
-    FORCED, add_forces = spec.forced > 0, external_force(spec).add_forces
-    DRAG, drag_wrench = "drag" in uses, drag_law(T).drag_wrench
-    NU, FLOATING, CONTACT, IMPLICIT = spec.nu, spec.floating, "contact" in uses, spec.implicit
-    MOTOR, MUSCLE, HILL = "motor" in uses, "muscle" in uses, "hill" in uses
+    t, sp, kin, sums = types(spec.dtype), spatial(spec.dtype), kinematics(spec), lane_sums(spec)
+    T, vec2, vec3, vec6, mat3, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
+    Model, Law, Place, law_of = t.Model, t.Law, kin.Place, environment_law(spec)
+    join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
+    contact, drag, force, joint = contact_law(spec), drag_law(T), external_force(spec), joint_law(spec)
+    muscle, base = muscle_law(spec, adjoint=False), base_inertia(spec)
+    CONTACT, DRAG, TERRAIN, MOTOR, MUSCLE, HILL = (
+        name in spec.features for name in ("contact", "drag", "terrain", "motor", "muscle", "hill")
+    )
+    NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
-    BASE = 7 * (spec.nlink - 1)  # where the base's factor begins
     VADR = spec.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
-    sums = lane_sums(T, THREADS_PER_ENV, SHARERS)
 
     @wp.func
     def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, h: T, theta: T):
@@ -67,81 +54,12 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         Ib = mass * wp.skew(com)
         Ia = inertia - Ib * wp.skew(com)
         Id = wp.diag(vec3(mass, mass, mass))
-        F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
+        F = wp.spatial_cross_dual(V, sp.momentum(mass, com, inertia, V))
         if wp.static(DRAG):
-            F = F - drag_wrench(m, k, R, com, V)
+            F = F - drag.drag_wrench(m, k, R, com, V)
         if wp.static(CONTACT):
-            for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-                if wp.static(TERRAIN):
-                    p, v, depth, E, _ = sphere_on_terrain(m, law.profile, c, R, x, V, place, h, theta)
-                else:
-                    p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
-                if touches(law, depth, v):
-                    fc = contact_force(law, depth, v)
-                    f = vec3(fc[0], fc[1], fc[2])
-                    if wp.static(TERRAIN):
-                        f = E * f
-                    if wp.static(IMPLICIT):
-                        B = contact_resistance(law, depth, fc[3], h, theta)
-                        if wp.static(TERRAIN):
-                            D = E * wp.diag(B) * wp.transpose(E)
-                            f = f - D * m.gravity
-                        else:
-                            f = f - wp.cw_mul(B, m.gravity)
-                            D = wp.diag(B)
-                        PB = wp.skew(p) * D
-                        Ia = Ia - PB * wp.skew(p)
-                        Ib = Ib + PB
-                        Id = Id + D
-                    F = F - force_at(p, f)
+            Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, h, theta, Ia, Ib, Id, F)
         return Ia, Ib, Id, F
-
-    @wp.func
-    def factor_base(Ia: mat3, Ib: mat3, Id: mat3, b: vec6):
-        """Cholesky factor (reciprocal diagonal) of the base's articulated inertia, and the solution of I a = b."""
-        L = mat6()
-        for r in range(3):
-            for c in range(3):
-                L[r, c] = Ia[r, c]
-                L[3 + r, c] = Ib[c, r]
-                L[3 + r, 3 + c] = Id[r, c]
-        a = vec6()
-        for r in range(6):
-            for c in range(r):
-                s = L[r, c]
-                for k in range(c):
-                    s = s - L[r, k] * L[c, k]
-                L[r, c] = s * L[c, c]
-            s = L[r, r]
-            y = b[r]
-            for k in range(r):
-                s = s - L[r, k] * L[r, k]
-                y = y - L[r, k] * a[k]
-            L[r, r] = T(1.0) / wp.sqrt(s)
-            a[r] = y * L[r, r]
-        for rr in range(6):
-            r = 5 - rr
-            y = a[r]
-            for k in range(r + 1, 6):
-                y = y - L[k, r] * a[k]
-            a[r] = y * L[r, r]
-        return L, a
-
-    def summed(over: SimpleNamespace, last: int) -> wp.Function:
-        add_vec6, add_mat3, first = over.add_vec6, over.add_mat3, FIRST
-
-        @wp.func
-        def add_up(Ia: mat3s, Ib: mat3s, Id: mat3s, P: vec6s):
-            begin = int(first)
-            for i in range(begin, last + 1):
-                Ia[i] = add_mat3(Ia[i])
-                Ib[i] = add_mat3(Ib[i])
-                Id[i] = add_mat3(Id[i])
-                P[i] = add_vec6(P[i])
-
-        return add_up
-
-    add_sharers, add_limbs, add = summed(sums.sharers, SLOTS - 1), summed(sums.limbs, TRUNK), sums.all.add
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def forward(
@@ -154,7 +72,9 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         # state in
         qpos: t.array2,
         qvel: t.array2,
-        ctrl: t.array2,  # and behind it the factors, if varied, and the forces, if forced
+        ctrl: t.array2,
+        factors: t.array2,  # without columns unless varied
+        forces: t.array2,  # without columns unless forced
         # checkpoint out: rows row0 .. row0 + substeps - 1, written if record is 1
         record: int,
         row0: int,
@@ -192,15 +112,13 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         q = wp.zeros(shape=SLOTS, dtype=T)
         qd = wp.zeros(shape=SLOTS, dtype=T)
         motor = wp.zeros(shape=SLOTS, dtype=T)
-        law = law_of(m, ctrl, e)
+        law = law_of(m, factors, e)
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
-            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
-                k = m.muscle[entry]
-                pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
-                if wp.static(VARIED):
-                    pull[k] = law.motor * pull[k]
+            muscle.activate(m, law, lane, ctrl, e, pull)
             tension = pull
+            lengths = pull
+            rates = pull
         if wp.static(HILL):
             tension = wp.zeros(shape=NU, dtype=T)
             lengths = wp.zeros(shape=NU, dtype=T)
@@ -218,11 +136,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(NBALL > 0):
             turn = wp.zeros(shape=NBALL, dtype=quat)
             for b in range(m.ball_count[lane]):
-                turn[b] = wp.normalize(load_quat(qpos, e, qpos_adr(m, at + m.ball_slot[lane * NBALL + b])))
+                turn[b] = wp.normalize(kin.load_quat(qpos, e, qpos_adr(m, at + m.ball_slot[lane * NBALL + b])))
         R[0] = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
             pos = vec3(qpos[e, 0], qpos[e, 1], qpos[e, 2])
-            rot = wp.normalize(load_quat(qpos, e, 3))
+            rot = wp.normalize(kin.load_quat(qpos, e, 3))
             v = vec3(qvel[e, 0], qvel[e, 1], qvel[e, 2])
             w = vec3(qvel[e, 3], qvel[e, 4], qvel[e, 5])
 
@@ -248,8 +166,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     store(ck_q, row, 3, e, rot[3])
             # 1. outward: poses, velocities, velocity products, inertias and bias forces
             if wp.static(NBALL > 0):
-                place_balls(m, lane, turn, R, q)
-            place = place_links(m, at, n, q, R, x, S, place)
+                kin.place_balls(m, lane, turn, R, q)
+            place = kin.place_links(m, at, n, q, R, x, S, place)
             for i in range(1, n):
                 k = at + i
                 V[i] = V[m.parent[k]] + S[i] * qd[i]
@@ -273,28 +191,23 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 Id[i] = mat3()
                 P[i] = vec6()
             for i in range(FIRST, n):
-                ia, ib, id, force = link_inertia(m, law, at + i, R[i], x[i], V[i], place, h, theta)
+                ia, ib, id, f = link_inertia(m, law, at + i, R[i], x[i], V[i], place, h, theta)
                 Ia[i] = ia
                 Ib[i] = ib
                 Id[i] = id
-                P[i] = force
+                P[i] = f
             if wp.static(FORCED):
-                add_forces(m, at, n, ctrl, e, R, x, P)
-            if wp.static(HILL):
-                measure(m, lane, R, x, V, V, lengths, rates, rates)
-                for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
-                    k = m.muscle[entry]
-                    tension[k] = hill(m, k, pull[k], lengths[k], rates[k])[0]
+                force.add_forces(m, at, n, forces, e, R, x, P)
             if wp.static(MUSCLE):
-                add_pull(m, lane, tension, R, x, P)
+                muscle.add_muscles(m, lane, pull, tension, lengths, rates, R, x, V, P)
             # 2. inward: articulated inertias
             if wp.static(SHARERS > 1):
-                add_sharers(Ia, Ib, Id, P)
+                sums.sharers.add_inertias(Ia, Ib, Id, P)
             for j in range(1, slots + 1):
                 i = slots - j
                 if wp.static(THREADS_PER_ENV > SHARERS):
                     if i == TRUNK:
-                        add_limbs(Ia, Ib, Id, P)
+                        sums.limbs.add_inertias(Ia, Ib, Id, P)
                 if i > 0 and i < n:
                     k = at + i
                     p = m.parent[k]
@@ -307,10 +220,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     qi = q[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
-                        resistance = passive_resistance(m, law, k, qi, qd[i])
+                        resistance = joint.passive_resistance(m, law, k, qi, qd[i])
                         d = d + theta * h * h * resistance[0] + h * resistance[1]
                     di = T(1.0) / d
-                    ui = motor[i] + passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
+                    ui = motor[i] + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
                     if wp.static(FLOATING) or p > 0:
                         va = Ua * di
                         vl = Ul * di
@@ -332,16 +245,12 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base) and the new state
             A[0] = join(vec3(), -m.gravity)
             if wp.static(FLOATING):
-                L, a0 = factor_base(Ia[0], Ib[0], Id[0], -P[0])
+                L, a0 = base.factor_base(Ia[0], Ib[0], Id[0], -P[0])
                 A[0] = a0
                 wdot = wp.transpose(R[0]) * wp.spatial_top(a0)
                 vdot = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + m.gravity
                 if record == 1:
-                    f0 = int(BASE)
-                    for r in range(6):
-                        for c in range(r + 1):
-                            store(ck_f, row, f0, e, L[r, c])
-                            f0 = f0 + 1
+                    base.store_base(ck_f, row, e, L)
                     for k in range(3):
                         store(ck_a, row, k, e, vdot[k])
                         store(ck_a, row, 3 + k, e, wdot[k])
@@ -378,7 +287,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if not wp.isfinite(turn[b]):
                     broken = T(1.0)
         if wp.static(THREADS_PER_ENV > 1):
-            broken = add(broken)
+            broken = sums.add(broken)
         finite = broken == T(0.0)
         nonfinite[e] = not finite
         if wp.static(FLOATING):

@@ -1,4 +1,4 @@
-"""Stages that the forward and the backward kernel share: where each link is, and its contact spheres."""
+"""What the forward and the backward kernel share: where each link is, and how checkpoints are read and written."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -16,12 +16,12 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     T, vec2, vec3, vec6, mat3, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
     Model, array = t.Model, t.array
     sp = spatial(T)
-    join, point_velocity, log_quat, quat_of = sp.join, sp.point_velocity, sp.log_quat, sp.quat_of
+    join, log_quat, quat_of = sp.join, sp.log_quat, sp.quat_of
     mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
     NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
     BALL, STIFFNESS = "ball" in spec.features, "stiffness" in spec.features
     HINGE, SLIDE = "hinge" in spec.features, "slide" in spec.features
-    IMPLICIT, ENV_LAST, THREADS_PER_ENV = spec.implicit, spec.env_last, spec.threads_per_env
+    ENV_LAST, THREADS_PER_ENV = spec.env_last, spec.threads_per_env
     # Where the carrier is: its height over the ground, or with a terrain (x, z).
     TERRAIN = "terrain" in spec.features
     Place = vec2 if TERRAIN else T
@@ -110,17 +110,6 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             S[i] = Si
         return place
 
-    @wp.func
-    def sphere_state(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
-        """Lowest point p, its velocity, and the depth (predicted theta h ahead if implicit) of contact sphere k."""
-        p = x + R * m.contact_position[k]
-        depth = height + p[2] - m.contact_radius[k]
-        p = p - vec3(T(0.0), T(0.0), m.contact_radius[k])
-        v = point_velocity(V, p)
-        if wp.static(IMPLICIT):
-            depth = depth + theta * h * v[2]
-        return p, v, depth
-
     return SimpleNamespace(
         load=load,
         store=store,
@@ -131,5 +120,4 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
         load_quat_row=load_quat_row,
         place_balls=place_balls,
         place_links=place_links,
-        sphere_state=sphere_state,
     )

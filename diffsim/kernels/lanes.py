@@ -1,21 +1,20 @@
-"""Several GPU threads for one environment.
+"""How several GPU threads share one environment, and which of them computes what.
 
 One thread per environment leaves a GPU waiting: a substep is ten thousand instructions, most of which wait for the one
-before, and 64 environments keep 64 of its thousands of cores busy. So a few neighbouring threads may share an
-environment; each is a lane of it. A lane simulates a tree of its own: the trunk, which all have, and some limbs; where
-limbs have much to do, several lanes, `sharers`, have the same ones. Masses, contact spheres and muscles are dealt out
-among the lanes that have their links. Poses and velocities need no exchange. On the way in, each lane's inertias and
-forces are a summand of the true ones: they are added up over the sharers before the sweep, and over the limbs where it
-reaches the trunk. A butterfly adds the same numbers in the same tree on every lane: what lanes have in common stays
-equal to the last bit.
+before, and 64 environments keep 64 of its thousands of cores busy. So a few neighbouring threads of a CUDA warp, here
+called lanes, may share an environment. Each lane simulates a tree of its own: the trunk, which all lanes have, and some
+limbs. Where limbs have much to do, several lanes, the `sharers`, have the same limbs. Masses, contact spheres and
+muscles are dealt out among the lanes that have their links.
+
+Poses and velocities need no exchange. On the way in, each lane's inertias and forces are a summand of the true ones,
+which exchange.py adds up: over the sharers before the sweep, and over the limbs where the sweep reaches the trunk.
+
+On a CPU, an environment has one lane, which has all links.
 """
 
 import dataclasses
-from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
-import warp as wp
 
 from diffsim.robot.scene import Scene
 
@@ -25,7 +24,7 @@ POWERS = (1, 2, 4, 8, 16)
 
 @dataclasses.dataclass(frozen=True)
 class Division:
-    """Which lane of an environment computes what.
+    """How the links, masses, contact spheres and muscles of one environment are divided among its lanes.
 
     Attributes:
         threads_per_env: number of lanes.
@@ -113,51 +112,3 @@ def deal_limbs(scene: Scene, groups: int, ends: list[set[int]]) -> tuple[int, li
         trunk += root
         limbs += [below[i] for i in longest if i not in root and parent[i] in root]
     return best
-
-
-@cache
-def lane_sums(dtype: type, threads_per_env: int, sharers: int) -> SimpleNamespace:
-    """Sums over the lanes of an environment; all of its lanes must call them together."""
-    T, vec6, mat3 = dtype, wp.types.vector(6, dtype), wp.types.matrix((3, 3), dtype)
-    neighbour = f"""
-#if defined(__CUDA_ARCH__)
-    const unsigned first = (threadIdx.x & 31u) & ~({threads_per_env}u - 1u);
-    return __shfl_xor_sync({2**threads_per_env - 1}u << first, value, offset);
-#else
-    return value;
-#endif
-"""
-
-    @wp.func_native(neighbour)
-    def of_neighbour(value: T, offset: int) -> T: ...
-
-    def sums(offsets: tuple[int, ...]) -> SimpleNamespace:
-        steps, least = len(offsets), offsets[0] if offsets else 1
-
-        @wp.func
-        def add(value: T):
-            for k in range(steps):
-                value = value + of_neighbour(value, least << k)
-            return value
-
-        @wp.func
-        def add_vec6(value: vec6):
-            for k in range(6):
-                value[k] = add(value[k])
-            return value
-
-        @wp.func
-        def add_mat3(value: mat3):
-            for r in range(3):
-                for c in range(3):
-                    value[r, c] = add(value[r, c])
-            return value
-
-        return SimpleNamespace(add=add, add_vec6=add_vec6, add_mat3=add_mat3)
-
-    powers = [2**k for k in range(threads_per_env.bit_length() - 1)]
-    return SimpleNamespace(
-        all=sums(tuple(powers)),
-        sharers=sums(tuple(p for p in powers if p < sharers)),
-        limbs=sums(tuple(p for p in powers if p >= sharers)),
-    )

@@ -20,6 +20,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from diffsim.kernels.hill import hill_law
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -29,11 +30,20 @@ SHORTEST = 1e-6  # m
 
 @cache
 def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
-    t, sp = types(spec.dtype), spatial(spec.dtype)
-    T, vec3, vec6, Model, array = spec.dtype, t.vec3, t.vec6, t.Model, t.array
+    t, sp, hill = types(spec.dtype), spatial(spec.dtype), hill_law(spec.dtype).hill
+    T, vec3, vec6, Model, Law, array = spec.dtype, t.vec3, t.vec6, t.Model, t.Law, t.array
     join, point_velocity = sp.join, sp.point_velocity
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
-    HILL = "hill" in spec.features
+    HILL, VARIED = "hill" in spec.features, spec.varied
+
+    @wp.func
+    def activate(m: Model, law: Law, lane: int, ctrl: t.array2, e: int, pull: array):
+        """Into pull the maximum force times the activation, of each of the lane's muscles."""
+        for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+            k = m.muscle[entry]
+            pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+            if wp.static(VARIED):
+                pull[k] = law.motor * pull[k]
 
     @wp.func
     def outward(R: t.mat3, x: vec3, torque: vec3, force: vec3):
@@ -113,7 +123,7 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         adj_v: vec6s,
         adj_w: vec6s,
         adj_p: vec6s,
-        g_pull: array,  # the adjoint of u: written by linear only
+        adj_pull: array,  # the adjoint of u: written by linear only
     ):
         """Adds the muscles' part of phi to the links' adjoints."""
         for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
@@ -147,7 +157,7 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
                         damp_torque = damp_torque + wp.cross(a, n * g_rate[k])
                     else:
                         rate = wp.dot(n, z)
-                        g_pull[k] = g_pull[k] + rate
+                        adj_pull[k] = adj_pull[k] + rate
                         e = (z - n * rate) * (tension[k] / length)
                     force = force + f
                     torque = torque + wp.cross(a, f)
@@ -165,4 +175,56 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
             adj_p[i] = adj_p[i] - gp
             adj_p[j] = adj_p[j] + gp
 
-    return SimpleNamespace(add_pull=add_pull, measure=measure, add_pull_adjoint=add_pull_adjoint)
+    @wp.func
+    def add_muscles(
+        m: Model,
+        lane: int,
+        pull: array,
+        tension: array,  # pull itself, unless hill
+        lengths: array,
+        rates: array,
+        R: mat3s,
+        x: vec3s,
+        V: vec6s,
+        P: vec6s,
+    ):
+        """Adds the muscles to the links' bias forces P."""
+        if wp.static(HILL):
+            measure(m, lane, R, x, V, V, lengths, rates, rates)
+            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                k = m.muscle[entry]
+                tension[k] = hill(m, k, pull[k], lengths[k], rates[k])[0]
+        add_pull(m, lane, tension, R, x, P)
+
+    @wp.func
+    def add_muscles_adjoint(
+        m: Model,
+        lane: int,
+        pull: array,
+        tension: array,  # pull itself, unless hill
+        by_length: array,  # by_length to power: of use to hill only
+        by_rate: array,
+        path: array,
+        power: array,
+        R: mat3s,
+        x: vec3s,
+        V: vec6s,
+        W: vec6s,
+        adj_v: vec6s,
+        adj_w: vec6s,
+        adj_p: vec6s,
+        adj_pull: array,
+    ):
+        """Adds the muscles' part of phi to the adjoints of the links and of pull."""
+        if wp.static(HILL):
+            measure(m, lane, R, x, V, W, path, by_rate, power)
+            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                k = m.muscle[entry]
+                curve = hill(m, k, pull[k], path[k], by_rate[k])
+                tension[k] = curve[0]
+                adj_pull[k] = adj_pull[k] + power[k] * curve[1]
+                by_length[k] = power[k] * curve[2]
+                by_rate[k] = power[k] * curve[3]
+        add_pull_adjoint(m, lane, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, adj_pull)
+
+    return SimpleNamespace(activate=activate, add_muscles=add_muscles, add_muscles_adjoint=add_muscles_adjoint)

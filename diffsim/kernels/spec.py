@@ -20,7 +20,7 @@ class KernelSpec:
     features: frozenset[str]
     dtype: type
     implicit: bool
-    varied: bool  # constants are multiplied by factors of each environment (law.py)
+    varied: bool  # constants are multiplied by factors of each environment (factors.py)
     forced: int  # number of bodies that external forces act on (force.py), 0 without
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, environment, component]
     # how threads share an environment (lanes.py); slots: the most links that one of them has
@@ -49,7 +49,7 @@ class KernelSpec:
 
     @property
     def nfactors(self) -> int:
-        """Columns of the environment's factors behind the controls."""
+        """Columns of the array `factors`."""
         return len(FACTORS) if self.varied else 0
 
     @property

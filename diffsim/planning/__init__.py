@@ -1,4 +1,4 @@
-"""Planning: a robot as a discrete-time system, iterative LQR, and the linear-Gaussian controllers that come of it.
+"""Planning: a robot as a discrete-time system, iterative LQR, and linear-Gaussian controllers.
 
 The physics knows nothing of this package, and it knows nothing of training.
 """
@@ -16,7 +16,6 @@ from diffsim.planning.demonstration import follow_demonstration, load_demonstrat
 from diffsim.planning.dynamics import REAL, Dynamics
 from diffsim.planning.ilqr import (
     Cost,
-    Gains,
     Plan,
     backward_pass,
     follow,
@@ -31,7 +30,6 @@ __all__ = [
     "AfterStep",
     "Cost",
     "Dynamics",
-    "Gains",
     "LinearGaussian",
     "Plan",
     "Sum",

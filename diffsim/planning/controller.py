@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -56,29 +55,22 @@ class LinearGaussian(NamedTuple):
 
 
 def nearest_feedback(
-    system: System,
-    guides: Sequence[LinearGaussian],
-    x: Tensor,
-    scale: Tensor,
-    bound: float = math.inf,
-    blend: float = 0.0,
+    system: System, guides: list[LinearGaussian], x: Tensor, scale: Tensor, bound: float = math.inf, blend: float = 0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What controllers do where they look most like states, whatever the time.
+    """The feedback of the controllers' steps that look most like states, whatever the time.
 
-    Coordinates that are not observed, as the place along x, do not count for the likeness but for the feedback, which
-    lets a late policy catch up. On a terrain the place does not count at all: that of a guide is of its own terrain.
+    The place along x is not observed. It counts for the feedback alone, so that a late policy catches up, and on a
+    terrain not at all, as a guide's place belongs to its own terrain.
 
     Args:
         x: (m, nx) states.
-        scale: (obs_dim,) in which differences of observations are measured.
+        scale: (obs_dim,) of observations, in which their differences are measured.
         bound: of each controller's actions.
-        blend: 0 for the action of the one controller that is nearest, or the distance b of a mean: each controller's
-            nearest step, at distance d, has a weight in proportion to exp(-(d / b)^2). Who cannot see which of them
-            knows the ground can do no better than such a mean.
+        blend: b > 0 gives a mean over the controllers, with weights exp(-(d / b)^2) of their nearest steps at distance
+            d; 0 gives the action of the nearest one.
 
     Returns:
-        Mean actions (m, nu); of the nearest step of all, L (m, nu, nu) and the root mean square distance (m,) of the
-        observations, in their scale.
+        Actions (m, nu); L (m, nu, nu) of the nearest step of all, and its root mean square distance (m,).
     """
     own, parts = system.observe(x) / scale, []
     for guide in guides:
@@ -89,11 +81,9 @@ def nearest_feedback(
         u = (guide.u[t] + (guide.K[t] @ tangent).squeeze(-1)).clamp(-bound, bound)
         parts.append((u, guide.L[t], distance / own.shape[1] ** 0.5))
     u, L, distance = (torch.stack(part) for part in zip(*parts, strict=True))
-    nearest, rows = distance.argmin(0), torch.arange(len(x), device=x.device)
-    if blend:
-        weight = torch.softmax(-(distance / blend).square(), 0).unsqueeze(-1)
-        return (weight * u).sum(0), L[nearest, rows], distance[nearest, rows]
-    return u[nearest, rows], L[nearest, rows], distance[nearest, rows]
+    nearest = distance.argmin(0), torch.arange(len(x), device=x.device)
+    weight = torch.softmax(-(distance / blend).square(), 0).unsqueeze(-1) if blend else None
+    return u[nearest] if weight is None else (weight * u).sum(0), L[nearest], distance[nearest]
 
 
 @torch.no_grad()

@@ -13,6 +13,11 @@ from diffsim.planning.dynamics import Dynamics
 from diffsim.planning.ilqr import Cost, symmetric
 
 
+def _jacobian(y: Tensor, d: Tensor) -> Tensor:
+    """(..., k, n) derivatives of y (..., k), each row of which depends on its own d (..., n) alone."""
+    return torch.stack([torch.autograd.grad(part.sum(), d, retain_graph=True)[0] for part in y.unbind(-1)], -2)
+
+
 class AfterStep(NamedTuple):
     """A loss of each action and the state that it led to, e.g. minus a reward."""
 
@@ -29,9 +34,9 @@ class AfterStep(NamedTuple):
         with torch.enable_grad():
             total = self.loss(self.system.retract(x[:, 1:], d[..., :nd]), u + d[..., nd:]).sum()
             (g,) = torch.autograd.grad(total, d, create_graph=True)
-            rows = [torch.autograd.grad(g[..., i].sum(), d, retain_graph=True)[0] for i in range(nz)]
+            hessian = _jacobian(g, d)
         # The joint Hessian is made positive, not its blocks: the cross terms would break them again.
-        values, vectors = torch.linalg.eigh(symmetric(torch.stack(rows, -2)))
+        values, vectors = torch.linalg.eigh(symmetric(hessian))
         h = (vectors * values.clamp(min=0.0).unsqueeze(-2)) @ vectors.mT
         actions = torch.eye(nz, dtype=f_z.dtype, device=f_z.device)[nd:].expand(*u.shape[:2], -1, -1)
         y_z = torch.cat((f_z, actions), -2)
@@ -74,9 +79,9 @@ class Surprisal(NamedTuple):
         d = u.new_zeros(*u.shape[:2], nd, requires_grad=True)
         with torch.enable_grad():
             mean = self.mean(self.system.retract(x[:, :-1], d))
-            rows = [torch.autograd.grad(mean[..., i].sum(), d, retain_graph=True)[0] for i in range(nu)]
+            slopes = _jacobian(mean, d)
         eye = torch.eye(nu, dtype=u.dtype, device=u.device).expand(*u.shape[:2], -1, -1)
-        e_z = torch.cat((-torch.stack(rows, -2), eye), -1) / self.sigma.unsqueeze(-1)
+        e_z = torch.cat((-slopes, eye), -1) / self.sigma.unsqueeze(-1)
         e = ((u - mean.detach()) / self.sigma).unsqueeze(-1)
         return self.weight * (e_z.mT @ e).squeeze(-1), self.weight * e_z.mT @ e_z
 

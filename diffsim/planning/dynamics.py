@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,8 @@ from torch import Tensor
 
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
-from diffsim.sim.simulator import Simulator, check_device
+from diffsim.sim.options import check_device
+from diffsim.sim.simulator import Simulator
 
 REAL = torch.float64  # a dynamic program multiplies hundreds of Jacobians
 BATCH = 8192  # environments of one backward pass: bounds the memory of its checkpoints
@@ -23,9 +25,8 @@ class Dynamics:
     A state x = (qpos, qvel) has nx = nq + nv numbers in MuJoCo's conventions. An action u (nu) is squashed: the motors
     get tanh(u), so that planning has no bounds to heed. Both may have leading dimensions where nothing else is said.
 
-    Differences of states are tangent vectors of nd = 2 nv numbers: a quaternion q moves by a vector v of the body's
-    frame to q (1, v / 2) normalised. To second order this is the exponential map, so gradients and Hessians are the
-    same; its inverse 2 vec / w takes q and -q for the one rotation that they are.
+    Differences of states are tangent vectors of nd = 2 nv numbers. A vector v of the body's frame moves a quaternion q
+    to q (1, v / 2), normalised, which is the exponential map to second order. Its inverse is 2 vec / w for q and -q.
 
     Args:
         scene: the robot.
@@ -48,7 +49,8 @@ class Dynamics:
     ) -> None:
         self.scene, self.control_dt, self.device = scene, control_dt, check_device(device)
         self.nq, self.nv, self.nu, self.nx, self.nd = scene.nq, scene.nv, scene.nu, scene.nq + scene.nv, 2 * scene.nv
-        self._integration, self._threads = integration, threads
+        self._options: dict[str, Any] = dict(device=self.device, dtype=REAL, threads=threads)
+        self._integration = integration
         self._simulators: dict[int, Simulator] = {}
         self.steps = 0
         self.simulator(1)
@@ -64,13 +66,7 @@ class Dynamics:
     def simulator(self, num_envs: int) -> Simulator:
         if num_envs not in self._simulators:
             self._simulators[num_envs] = Simulator(
-                self.copies(num_envs),
-                num_envs,
-                self._integration,
-                self.control_dt,
-                device=self.device,
-                dtype=REAL,
-                threads=self._threads,
+                self.copies(num_envs), num_envs, self._integration, self.control_dt, **self._options
             )
         return self._simulators[num_envs]
 
@@ -152,8 +148,7 @@ class Dynamics:
     def jacobians(self, x: Tensor, u: Tensor, following: Tensor) -> Tensor:
         """(n, nd, nd + nu) d following / d (x, u) of steps from x (n, nx) with u (n, nu), in tangent coordinates.
 
-        Reverse mode gives one row per backward pass. Environments are independent, so n x nd copies give all rows of
-        all steps in one.
+        A backward pass gives one row. Environments are independent: n x nd copies give all rows of all steps at once.
         """
         n, nd, nq = len(x), self.nd, self.nq
         cotangents, result = self.left_inverse(following), x.new_empty(n, nd, nd + self.nu)

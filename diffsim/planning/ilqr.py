@@ -16,6 +16,7 @@ from torch import Tensor
 
 from diffsim.planning.dynamics import REAL, Dynamics
 
+Show = Callable[[int, Tensor], None]  # (iteration, costs (R,))
 ALPHAS = 0.5 ** torch.arange(11, dtype=REAL)  # step sizes of the line search
 
 
@@ -129,39 +130,24 @@ def line_search(
     return x, u, torch.where(accepted, totals[pick], total), torch.where(accepted, alphas[choice], 0.0)
 
 
-def raise_mu(mu: Tensor, delta: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """More regularisation for some: mu grows by delta, which grows itself each time in a row."""
-    delta = torch.where(where, (delta * 1.6).clamp(min=1.6), delta)
-    return torch.where(where, (mu * delta).clamp(min=1e-6), mu), delta
-
-
-def lower_mu(mu: Tensor, delta: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """Less regularisation for some, in the same way; in the end none."""
-    delta = torch.where(where, (delta / 1.6).clamp(max=1 / 1.6), delta)
-    mu = torch.where(where, mu * delta, mu)
-    return torch.where(mu < 1e-8, 0.0, mu), delta
+def change_mu(mu: Tensor, delta: Tensor, more: Tensor, less: Tensor) -> tuple[Tensor, Tensor]:
+    """More regularisation for some, less for others: mu changes by delta, which itself grows each time in a row."""
+    delta = torch.where(more, (delta * 1.6).clamp(min=1.6), delta)
+    delta = torch.where(less, (delta / 1.6).clamp(max=1 / 1.6), delta)
+    mu = torch.where(more, (mu * delta).clamp(min=1e-6), torch.where(less, mu * delta, mu))
+    return torch.where(less & (mu < 1e-8), 0.0, mu), delta
 
 
 @torch.no_grad()
 def ilqr(
-    system: Dynamics,
-    cost: Cost,
-    x: Tensor,
-    u: Tensor,
-    iterations: int,
-    mu: float = 1.0,
-    show: Callable[[int, Tensor], None] | None = None,
+    system: Dynamics, cost: Cost, x: Tensor, u: Tensor, iterations: int, mu: float = 1.0, show: Show | None = None
 ) -> Plan:
-    """Optimises R trajectories side by side, each with its own regularisation.
+    """Optimises R trajectories of the system, x (R, T + 1, nx) and u (R, T, nu), side by side.
 
     Args:
-        system: what moves.
-        cost: what is minimised.
-        x: (R, T + 1, nx) trajectories of the system.
-        u: (R, T, nu) their actions.
         iterations: at most so many.
-        mu: initial regularisation.
-        show: called as show(iteration, costs (R,)) after each iteration.
+        mu: initial regularisation; each trajectory has its own.
+        show: called after each iteration.
     """
     total = cost.value(x.unsqueeze(1), u.unsqueeze(1)).sum(-1).squeeze(1)
     mus, delta = torch.full_like(total, mu), torch.ones_like(total)
@@ -172,13 +158,12 @@ def ilqr(
             quadratic = cost.quadratic(x, u, f_z)
         gains = backward_pass(f_z, *quadratic, mus)
         while not bool((gains.ok | ~moving).all()):
-            mus, delta = raise_mu(mus, delta, ~gains.ok)
+            mus, delta = change_mu(mus, delta, ~gains.ok, torch.zeros_like(moving))
             moving = moving & (mus < 1e10)
             gains = backward_pass(f_z, *quadratic, mus)
         before = total
         x, u, total, step = line_search(system, cost, x, u, total, gains, moving)
-        mus, delta = raise_mu(mus, delta, step <= 0.01)
-        mus, delta = lower_mu(mus, delta, step > 0.01)
+        mus, delta = change_mu(mus, delta, step <= 0.01, step > 0.01)
         scale = 1 + total.abs()
         ends = {
             "gradient": gains.d1.abs() < 1e-7 * scale,

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from diffsim.planning.dynamics import REAL, Dynamics
-from diffsim.planning.ilqr import Cost, ilqr
+from diffsim.planning.ilqr import Cost, Show, ilqr
 
 
 def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Generator) -> Tensor:
-    """Where to start from: (count, steps, nu) nothing, then by turns a wave, a random walk and white noise.
+    """Where to start from: (count, steps, nu) nothing, then by turns a wave, a random walk and white noise, on the CPU.
 
-    The motors of a wave have one frequency of 0.5 to 8 Hz, and each its amplitude and phase.
-
-    Args:
-        dt: the control step in seconds.
-        rng: on the CPU, as the result.
+    The motors of a wave have one frequency of 0.5 to 8 Hz; dt is the control step in seconds.
     """
     t = dt * torch.arange(steps, dtype=REAL).view(-1, 1)
     result = [torch.zeros(steps, nu, dtype=REAL)]
@@ -35,21 +30,13 @@ def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Gene
 
 
 def best_of_random_starts(
-    system: Dynamics,
-    cost: Cost,
-    start: Tensor,
-    actions: Tensor,
-    keep: int,
-    iterations: int,
-    show: Callable[[int, Tensor], None] | None = None,
+    system: Dynamics, cost: Cost, start: Tensor, actions: Tensor, keep: int, iterations: int, show: Show | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Optimises trajectories from one state, side by side and for a few iterations.
+    """Optimises trajectories from one state (nx,), side by side and for a few iterations; see ilqr.
 
     Args:
-        start: (nx,) the state.
         actions: (R, T, nu) where to start from, see starting_actions; those that diverge are left out.
         keep: at most so many trajectories are returned.
-        iterations, show: see ilqr.
 
     Returns:
         x (keep, T + 1, nx), u (keep, T, nu), the cheapest first.
@@ -67,30 +54,14 @@ def best_of_random_starts(
 
 
 def receding_horizon(
-    system: Dynamics,
-    cost: Cost,
-    x: Tensor,
-    u: Tensor,
-    steps: int,
-    advance: int,
-    iterations: int,
-    rng: torch.Generator,
+    system: Dynamics, cost: Cost, x: Tensor, u: Tensor, steps: int, advance: int, iterations: int, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Continues R trajectories window by window, each of which begins `advance` steps after the one before.
+    """Continues optimised first windows x (R, W + 1, nx), u (R, W, nu) to x (R, T + 1, nx), u (R, T, nu), T = steps.
 
     Over a long horizon most random starts fall, and what comes after a fall has no useful gradient. A window ends soon
-    enough for a few actions to prevent the fall. What it adds begins with no action, the last one, the last ones
-    repeated, and noise; the cheapest of the four optima is kept.
-
-    Args:
-        x, u: (R, W + 1, nx), (R, W, nu) the first windows, optimised.
-        steps: T, the length in the end.
-        advance: control steps of a window that are kept, at most W / 2.
-        iterations: of iLQR, a window.
-        rng: of the noise, on the CPU.
-
-    Returns:
-        x (R, T + 1, nx), u (R, T, nu).
+    enough for a few actions to prevent the fall. Each begins `advance` steps after the one before, at most W / 2. Its
+    new actions begin as none, the last one, the last ones repeated, and noise from rng, on the CPU. The cheapest of the
+    four optima after so many iterations of iLQR is kept.
     """
     (R, W, nu), done, xs, us = u.shape, 0, list[Tensor](), list[Tensor]()
     while done + W < steps:

@@ -22,11 +22,7 @@ class System(Dynamics):
     Args:
         env: its robot, integration and device are taken, its state is not.
         threads: see Simulator.
-        terrain: profile (K, 2) in place of the environment's, or (M, K, 2), of which trajectory i of a rollout has
-            number i % M; see diffsim.terrain.
-
-    Raises:
-        ValueError: see Scene.with_terrain.
+        terrain: in place of the environment's: (K, 2), or (M, K, 2) with number i % M for trajectory i of a rollout.
 
     Attributes:
         observed: (obs_dim,) 1 where an observation is of the state, 0 where it is of the action before.

@@ -51,8 +51,10 @@ def is_real(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def check_count(name: str, value: int) -> int:
-    """The value as an int, be it NumPy's; raises ValueError unless it is an integer of at least 1. True is none."""
+def check_count(name: str, value: int, most: int = 2**63 - 1) -> int:
+    """The value as an int, be it NumPy's; raises ValueError unless it is an integer from 1 to `most`. True is none."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
+    if value > most:
+        raise ValueError(f"{name} is {value}, must be at most {most}")
     return int(value)

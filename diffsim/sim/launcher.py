@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import time
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -17,15 +17,15 @@ from diffsim.kernels.lanes import Division, divide
 from diffsim.kernels.model import model_of
 from diffsim.kernels.spec import kernel_spec
 from diffsim.robot.scene import Scene
-from diffsim.sim.integration import Integration
+from diffsim.sim.options import WARP_DTYPE, Options
 
-WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
 # Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
 # thread (about 1 ms) it saves nothing. A whole iteration of 64 ants takes 0.22 s with two threads, 0.26 s with one.
 MIN_WORK_PER_THREAD = 4_000
 # Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
+building = threading.RLock()  # Warp crashes where two threads make, compile or load kernels
 
 
 class TooLargeError(ValueError):
@@ -38,42 +38,32 @@ class Launcher:
     On a CPU some threads take a share of the environments each; on a GPU a launch goes to torch's current stream.
 
     Args:
-        scene, num_envs, integration, device, dtype, threads, division, factors, forces: see Simulator.
+        scene, num_envs: see Simulator.
+        options: checked ones.
 
     Attributes:
         spec: what the kernels were generated for.
         nonfinite_gradients: see Simulator.
-        seconds: wall seconds spent in the kernels on the CPU, {"forward": ..., "backward": ...}.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        num_envs: int,
-        integration: Integration,
-        device: torch.device,
-        dtype: torch.dtype,
-        threads: int | None,
-        division: Division | None,
-        factors: bool,
-        forces: bool,
-    ) -> None:
-        real, cuda = WARP_DTYPE[dtype], device.type == "cuda"
+    def __init__(self, scene: Scene, num_envs: int, options: Options) -> None:
+        self.scene, self.num_envs = scene, num_envs
+        self.device, self.dtype = torch.device(options.device), options.dtype
+        real, cuda, division = WARP_DTYPE[self.dtype], self.device.type == "cuda", options.division
         if division is None:
             division = default_division(scene, num_envs) if cuda else divide(scene)
         elif division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
-        self.scene, self.num_envs, self.device, self.dtype = scene, num_envs, device, dtype
-        self.spec = kernel_spec(scene, division, real, integration.integrator == "implicit", cuda, factors, forces)
-        self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=device)
-        self.seconds = {"forward": 0.0, "backward": 0.0}
-        self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
-        startup.announce_compilation(self._kernels.values(), scene.name)
-        self._model = model_of(scene, division, real, str(device))
+        implicit = options.integration.integrator == "implicit"
+        self.spec = kernel_spec(scene, division, real, implicit, cuda, options.factors, options.forces)
+        self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
+        with building:
+            self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
+            self._model = model_of(scene, division, real, str(self.device))
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
-        work = num_envs * integration.substeps * scene.nlink
-        wanted = 1 if cuda else threads or min(available_cores(), max(1, work // MIN_WORK_PER_THREAD))
+        work = num_envs * options.integration.substeps * scene.nlink
+        wanted = 1 if cuda else options.threads or min(available_cores(), max(1, work // MIN_WORK_PER_THREAD))
         count = min(wanted, num_envs)
         bounds = [num_envs * k // count for k in range(count + 1)]
         self._shares = list(zip(bounds, bounds[1:], strict=False))  # environments of each thread: first, end
@@ -81,32 +71,32 @@ class Launcher:
 
     def command(self, kernel: str, inputs: list[Any]) -> list[wp.Launch]:
         """The launches of all shares with their arguments packed once: packing costs more than a small kernel."""
-        return [
-            wp.launch(
-                self._kernels[kernel],
-                dim=(end - first) * self.spec.threads_per_env,
-                inputs=[self._model, first, *inputs],
-                device=str(self.device),
-                block_dim=self._block_dim,
-                record_cmd=True,
-            )
-            for first, end in self._shares
-        ]
+        with building:
+            startup.load(self._kernels[kernel].module, str(self.device), self._block_dim, self.scene.name)
+            return [
+                wp.launch(
+                    self._kernels[kernel],
+                    dim=(end - first) * self.spec.threads_per_env,
+                    inputs=[self._model, first, *inputs],
+                    device=str(self.device),
+                    block_dim=self._block_dim,
+                    record_cmd=True,
+                )
+                for first, end in self._shares
+            ]
 
-    def launch(self, kernel: str, command: list[wp.Launch]) -> None:
+    def launch(self, command: list[wp.Launch]) -> None:
         """Runs a command; on a CPU returns when it is done."""
         if self.device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
             with wp.ScopedStream(stream, sync_enter=False, sync_exit=False):
                 command[0].launch()
             return
-        start = time.perf_counter()
         # Warp runs a CPU kernel on the calling thread and releases the interpreter lock meanwhile.
         pending = [self._pool.submit(share.launch) for share in command[1:]] if self._pool else []
         command[0].launch()
         for future in pending:
             future.result()
-        self.seconds[kernel] += time.perf_counter() - start
 
 
 def default_division(scene: Scene, num_envs: int) -> Division:

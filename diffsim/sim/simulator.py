@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import torch
 
-from diffsim.kernels.lanes import Division
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
-from diffsim.sim.launcher import WARP_DTYPE, Launcher, check_memory
+from diffsim.sim.launcher import Launcher, check_memory
+from diffsim.sim.options import Options
 from diffsim.sim.stepper import ExtrapolatedStepper, State, Stepper
 
 
@@ -26,12 +26,7 @@ class Simulator:
         integration: integrator, substeps and theta.
         control_dt: seconds of one control step.
         horizon: differentiable control steps that can be alive at once.
-        device: "cpu" or a CUDA device.
-        dtype: torch.float32 or torch.float64.
-        threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
-        division: of an environment among GPU threads, from kernels.lanes.divide; default as measured to be fastest.
-        factors: let constants of the scene differ between environments, see the attribute.
-        forces: let external forces act on the bodies, see the attribute.
+        **options: device, dtype, threads, factors, forces, division: see Options.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.
@@ -48,7 +43,6 @@ class Simulator:
         nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s. Their
             state is returned as it was before that step, its gradient is zero; other environments are not touched.
         nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
-        seconds: wall seconds spent in kernels on the CPU, {"forward": ..., "backward": ...}.
     """
 
     def __init__(
@@ -58,38 +52,29 @@ class Simulator:
         integration: Integration = Integration(),
         control_dt: float = 1 / 60,
         horizon: int = 1,
-        device: str | torch.device = "cpu",
-        dtype: torch.dtype = torch.float32,
-        threads: int | None = None,
-        division: Division | None = None,
-        factors: bool = False,
-        forces: bool = False,
+        **options: Any,
     ) -> None:
         if not isinstance(scene, Scene):
             raise ValueError(f"scene is a {type(scene).__name__}, must be a Scene: load_scene reads one from a file")
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
-        if threads is not None:
-            threads = check_count("threads", threads)
-        integration = integration.check()
         if not is_real(control_dt) or not 0 < control_dt < math.inf:
             raise ValueError(f"control_dt is {control_dt!r}, must be positive seconds")
-        if dtype not in WARP_DTYPE:
-            raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
         if scene.terrain is not None and len(scene.terrain) not in (1, num_envs):
             raise ValueError(f"terrain has {len(scene.terrain)} profiles, must have 1 or one for each of {num_envs}")
-        self.device = check_device(device)
-        width, bodies = len(FACTORS) if factors else 0, scene.nbody if forces else 0
-        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width + 6 * bodies)
-        check_memory("states and actions", num_envs, numbers * dtype.itemsize, self.device)
-        self.scene, self.num_envs, self.dtype = scene, num_envs, dtype
+        self.options = Options(integration, **options).check()
+        self.scene, self.num_envs, self.control_dt, self.horizon = scene, num_envs, control_dt, horizon
+        self.integration, self.dtype = self.options.integration, self.options.dtype
+        self.device = torch.device(self.options.device)
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
-        self.integration, self.control_dt, self.horizon = integration, control_dt, horizon
-        launcher = Launcher(scene, num_envs, integration, self.device, dtype, threads, division, factors, forces)
-        stepper = ExtrapolatedStepper if integration.integrator == "extrapolated" else Stepper
-        self._stepper = stepper(launcher, integration, control_dt, horizon)
-        self.seconds, self.nonfinite_gradients = launcher.seconds, launcher.nonfinite_gradients
-        self._factors = torch.ones(num_envs, width, dtype=dtype, device=self.device)
-        self._forces = torch.zeros(num_envs, bodies, 6, dtype=dtype, device=self.device)
+        width, bodies = len(FACTORS) if self.options.factors else 0, scene.nbody if self.options.forces else 0
+        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width + 6 * bodies)
+        check_memory("states and actions", num_envs, numbers * self.dtype.itemsize, self.device)
+        launcher = Launcher(scene, num_envs, self.options)
+        stepper = ExtrapolatedStepper if self.integration.integrator == "extrapolated" else Stepper
+        self._stepper = stepper(launcher, self.integration, control_dt, horizon)
+        self.nonfinite_gradients = launcher.nonfinite_gradients
+        self._factors = torch.ones(num_envs, width, dtype=self.dtype, device=self.device)
+        self._forces = torch.zeros(num_envs, bodies, 6, dtype=self.dtype, device=self.device)
 
     @property
     def nonfinite(self) -> torch.Tensor:
@@ -184,25 +169,3 @@ def check_factors(factors: torch.Tensor) -> None:
             f"the factor of {FACTORS[column]} is {factors[env, column].item()} in environment {env}; factors must be "
             "finite and not negative"
         )
-
-
-def check_device(device: str | torch.device) -> torch.device:
-    """The device, with an index if it is a GPU.
-
-    Raises:
-        ValueError: neither the CPU nor a CUDA device that is there.
-    """
-    try:
-        result = torch.device(device)
-    except RuntimeError as error:
-        raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda") from error
-    if result.type not in ("cpu", "cuda"):
-        raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda")
-    if result.type == "cuda":
-        if not torch.cuda.is_available():
-            raise ValueError(f"device {str(device)!r} asked for, but PyTorch sees no CUDA GPU here; choose cpu")
-        count = torch.cuda.device_count()
-        if (result.index or 0) >= count:
-            raise ValueError(f"device {str(device)!r} asked for, but there are {count} CUDA GPUs")
-        result = torch.device("cuda", torch.cuda.current_device() if result.index is None else result.index)
-    return result

@@ -56,8 +56,8 @@ class Stepper:
 
         self._launcher, self._horizon, self._substeps = launcher, horizon, integration.substeps
         self._scalars = [h, spec.dtype(integration.theta), integration.substeps]
-        # One buffer for all that a step starts from, side by side: torch copies it in one operation, the kernels see
-        # parts, and each slot keeps the factors and forces of its step.
+        # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
+        # kernels see its parts. Each slot keeps those of its step.
         self._widths = (spec.nq, spec.nv, spec.nu, spec.nfactors, 6 * spec.forced)
         self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
         self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
@@ -92,7 +92,7 @@ class Stepper:
         """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl, factors, forces)."""
         torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
         self._last = slot
-        self._launcher.launch("forward", self._command("forward", slot))
+        self._launcher.launch(self._command("forward", slot))
         return self._end.clone()
 
     def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -107,7 +107,7 @@ class Stepper:
                 "differentiable steps can be alive; build the simulator with a larger horizon"
             )
         self._g_end.copy_(g_end)
-        self._launcher.launch("backward", self._command("backward", checkpoint.slot))
+        self._launcher.launch(self._command("backward", checkpoint.slot))
         return self._g_start.clone().split(self._widths, dim=1)
 
     def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
@@ -122,13 +122,21 @@ class Stepper:
             self._checkpoint = self._rows(self._horizon * self._substeps)
         rows = self._checkpoint if record and self._checkpoint else self._rows(0)
         row0 = slot * self._substeps if record else 0
-        qpos, qvel, ctrl = self._parts(self._start[slot], 3)
+        start, end, g_start, g_end = (
+            [wp.from_torch(part) for part in buffer.split(widths, dim=1)]
+            for buffer, widths in (
+                (self._start[slot], self._widths),
+                (self._end, self._widths[:2]),
+                (self._g_start, self._widths),
+                (self._g_end, self._widths[:2]),
+            )
+        )
         nonfinite = wp.from_torch(self._nonfinite[slot])
         if kernel == "forward":
-            return [*self._scalars, qpos, qvel, ctrl, int(record), row0, *rows, *self._parts(self._end, 2), nonfinite]
-        gradients = [*self._parts(self._g_end, 2), *self._parts(self._g_start, 3)]
+            return [*self._scalars, *start, int(record), row0, *rows, *end, nonfinite]
+        qpos, _, *inputs = start  # ctrl, factors and forces
         blown_up = wp.from_torch(self._launcher.nonfinite_gradients)
-        return [*self._scalars, row0, *rows, qpos, ctrl, nonfinite, *gradients, blown_up]
+        return [*self._scalars, row0, *rows, qpos, *inputs, nonfinite, *g_end, *g_start, blown_up]
 
     def _rows(self, count: int) -> list[wp.array]:
         """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
@@ -138,11 +146,6 @@ class Stepper:
         check_memory("checkpoints", n, numbers * self._launcher.dtype.itemsize, self._launcher.device)
         sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
         return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
-
-    def _parts(self, buffer: torch.Tensor, count: int) -> list[Any]:
-        """The kernels' views of qpos, qvel and, if `count` is 3, ctrl with factors and forces behind it."""
-        nq, nv, *rest = self._widths
-        return [wp.from_torch(part) for part in buffer.split((nq, nv, sum(rest))[:count], dim=1)]
 
 
 class ExtrapolatedStepper:

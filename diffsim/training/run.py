@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffsim.env import ActionError, DiffEnv
-from diffsim.sim.simulator import check_device
+from diffsim.sim.options import check_device
 from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.assess import make_env, write_evaluation
 from diffsim.training.checkpoint import Learner

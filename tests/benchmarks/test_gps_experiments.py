@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
 import gps_experiments as experiments
+import gps_variants
 import numpy as np
 import pytest
 import torch
+from common import DOCS, RESULTS
 from learners import run
-from tables import read_csv
+from tables import markdown, read_csv, write_csv
 
 import bptt
 import diffsim
@@ -28,25 +31,32 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs")
     path = directory / "cartpole__full__1"
     run(gps, path, *SMALL)
-    experiments.measure(path, 4)
+    rows = experiments.generalisation(experiments.load_search(path / "checkpoint.pt"), 4)
+    write_csv(path / "generalisation.csv", rows)
     return directory
 
 
-def test_tables_and_pictures(runs: Path, tmp_path: Path) -> None:
-    """Of a run; a second time from the tables alone."""
-    docs, results = tmp_path / "docs", tmp_path / "results"
-    options = ["--results", str(results), "--docs", str(docs), "--count", "4", "--draw-only"]
+def test_table_and_pictures(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a run; a second time from the csv files alone."""
+    options = ["--output", str(tmp_path / "results"), "--figures", str(tmp_path / "figures"), "--draw-only"]
     experiments.main([*options, "--runs", str(runs)])
-    rows = read_csv(results / "gps_generalisation.csv")
+    rows = read_csv(tmp_path / "results" / "gps_generalisation.csv")
     assert {row["controller"] for row in rows} == {"policy", "ddp", "tbdp"}
     plan = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt").plan_return
     ddp = next(row for row in rows if row["controller"] == "ddp" and float(row["size"]) == 0)
     assert float(ddp["mean"]) == pytest.approx(plan, rel=1e-9)  # unperturbed, it repeats the plan
-    assert "| cartpole | full | 12 |" in (docs / "gps.md").read_text()
-    before = {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
+    first = capsys.readouterr().out
+    assert "| cartpole | full | 12 |" in first
+    before = {path: path.read_bytes() for path in (tmp_path / "results").iterdir()}
     experiments.main([*options, "--runs", str(tmp_path / "nowhere")])
-    assert before == {path: path.read_bytes() for path in (docs / "gps.md", *results.iterdir())}
-    assert len(list((docs / "figures").glob("gps_*.png"))) == 3
+    assert before == {path: path.read_bytes() for path in (tmp_path / "results").iterdir()}
+    assert capsys.readouterr().out == first and len(list((tmp_path / "figures").glob("gps_*.png"))) == 2
+
+
+def test_a_run_that_was_stopped_before_an_evaluation_has_no_end() -> None:
+    rows = [dict(eval_objective=value) for value in ("", "-2.5", "")]
+    assert experiments.final_return(rows) == -2.5
+    assert math.isnan(experiments.final_return(rows[:1]))
 
 
 def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -> None:
@@ -65,16 +75,19 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
     assert len(lines) == 5 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
     assert lines[0].startswith("python gps.py --env hopper") and lines[0].endswith("--run-dir runs/plans/hopper_500")
     assert experiments.CASES["adaptive"].startswith("--variant full --perturb 0 --adaptive")
-    for flags in experiments.CASES.values():
-        gps.parse(gps.Args, ["--env", "hopper", *flags.split()])
+
+
+def parse(env: str, case: str, *flags: str) -> None:
+    kind = gps_variants.VariantArgs if case in gps_variants.CASES else gps.Args
+    gps.parse(kind, ["--env", env, *experiments.CASES[case].split(), *flags])
 
 
 def test_the_list_holds_the_runs_that_the_page_shows() -> None:
     """Of each task, case and seed in results/; a case that has other flags for a seed keeps them."""
     jobs = experiments.jobs(experiments.Args())
-    runs = read_csv(experiments.RESULTS / "cpu" / "gps_runs.csv")
+    runs = read_csv(RESULTS / "cpu" / "gps_runs.csv")
     assert {"__".join((row["env"], row["variant"], row["seed"])) for row in runs} <= jobs.keys()
-    runs = read_csv(experiments.RESULTS / "cpu" / "gps_terrain.csv")
+    runs = read_csv(RESULTS / "cpu" / "gps_terrain.csv")
     assert {"__".join((row["env"], row["variant"], row["seed"])) for row in runs} <= jobs.keys()
     one, two, other = (experiments.jobs(experiments.Args(env=("swimmer",), seeds=(seed,))) for seed in (1, 2, 7))
     assert "200" in one["swimmer__feedback__1"] and "100" in two["swimmer__feedback__2"]
@@ -85,7 +98,7 @@ def test_the_list_holds_the_runs_that_the_page_shows() -> None:
         gps.parse(gps.Args, flags.split())
     for name, flags in jobs.items():
         env, case, _ = name.split("__")
-        gps.parse(gps.Args, ["--env", env, *experiments.CASES[case].split(), *flags])
+        parse(env, case, *flags)
 
 
 def test_a_finished_run_is_kept(runs: Path) -> None:
@@ -105,10 +118,15 @@ def test_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     sim = diffsim.make("cartpole", 250, substeps=2).sim
     for value, expected in zip(sim.step(qpos[:-1], qvel[:-1], action), (qpos[1:], qvel[1:]), strict=True):
         torch.testing.assert_close(value, expected)
-    search = run(gps, tmp_path / "gps", *SMALL, "--demonstration", path)["modules"]["search"]
+    search = run(gps, tmp_path / "gps", *SMALL, "--demonstration", path)["modules"]["learner"]
     assert search["guides"][0][0][0].tolist() == [*data["qpos"][0], *data["qvel"][0]]
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["gps_experiments.py"])
     with pytest.raises(SystemExit) as exit:
         experiments.main(["--record", str(path)])
     assert exit.value.code == 2 and "--record needs --actor" in capsys.readouterr().err
+
+
+def test_the_page_has_the_table_of_the_csv_file() -> None:
+    runs = experiments.grouped(read_csv(RESULTS / "cpu" / "gps_runs.csv"), *experiments.RUN)
+    assert markdown(experiments.table(runs)) in (DOCS / "gps.md").read_text()

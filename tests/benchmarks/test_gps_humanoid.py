@@ -8,9 +8,9 @@ from pathlib import Path
 import gps_humanoid
 import pytest
 import torch
-from common import CheckpointFlags
+from common import DOCS, RESULTS, CheckpointFlags
 from learners import run
-from tables import read_csv
+from tables import markdown, read_csv
 
 import diffsim
 import gps
@@ -71,6 +71,9 @@ def test_table() -> None:
         for seed in (0, 2)
     ]
     (row,) = gps_humanoid.table(rows)
-    assert row == {"": "rough", "size": "3"} | dict.fromkeys(
-        ("feedback", "other"), "50% / 75% / 25% (1.0 / 2.0 / 0.0 s)"
-    )
+    assert row == {"": "rough", "size": "3"} | dict.fromkeys(("feedback", "other"), "1.0 / 2.0 / 0.0")
+
+
+def test_the_page_has_the_table_of_the_csv_file() -> None:
+    rows = read_csv(RESULTS / "cpu" / "gps_humanoid.csv")
+    assert markdown(gps_humanoid.table(rows)) in (DOCS / "gps_terrain.md").read_text()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -54,12 +56,29 @@ def test_several_terrains_in_one_file(tmp_path: Path, rng: np.random.Generator) 
         ({"qpos": np.zeros((9, 2))}, r"qpos has shape \(9, 2\), must be at least \(10, 2\) for 9 steps"),
         ({"qvel": np.zeros((20, 3))}, r"qvel has shape \(20, 3\), must be at least \(10, 2\)"),
         ({"qpos": np.full((20, 2), np.nan)}, "qpos holds numbers that are not finite"),
+        ({"qpos": np.full((20, 2), 1j)}, r"qpos has shape \(20, 2\) of complex128, must be .* of real numbers"),
         ({"action": np.array(["a"], dtype=object)}, "is not an .npz with qpos, qvel and action"),
     ],
 )
 def test_refusals(changes: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 9, **changes), 9)
+
+
+def test_a_header_that_asks_for_terabytes_is_refused_before_memory_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, header = write(tmp_path / "a.npz", 9), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 2)})
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in (parts | {"qvel.npy": header.getvalue()}).items():
+            archive.writestr(name, content)
+    read = np.lib.format.read_array
+    monkeypatch.setattr(np.lib.format, "read_array", lambda file, **how: "qvel" in file.name or read(file, **how))
+    with pytest.raises(ValueError, match=r"qvel has shape \(1000000000000, 2\) of float64, must be"):
+        load_demonstration(task_system("cartpole"), path, 9)
 
 
 def test_a_controller_brings_the_system_along(rng: np.random.Generator) -> None:

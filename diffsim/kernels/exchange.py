@@ -1,0 +1,77 @@
+"""Sums over the lanes that share an environment (lanes.py); all of them must call these functions together.
+
+A butterfly adds the same numbers in the same tree on every lane: what lanes have in common stays equal to the last bit.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.model import types
+from diffsim.kernels.spec import KernelSpec
+
+
+@cache
+def lane_sums(spec: KernelSpec) -> SimpleNamespace:
+    t, threads = types(spec.dtype), spec.threads_per_env
+    T, vec6, mat3 = spec.dtype, t.vec6, t.mat3
+    mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
+    neighbour = f"""
+#if defined(__CUDA_ARCH__)
+    const unsigned first = (threadIdx.x & 31u) & ~({threads}u - 1u);
+    return __shfl_xor_sync({2**threads - 1}u << first, value, offset);
+#else
+    return value;
+#endif
+"""
+
+    @wp.func_native(neighbour)
+    def of_neighbour(value: T, offset: int) -> T: ...
+
+    def sums(offsets: list[int], last: int) -> SimpleNamespace:
+        """Of a number, of inertias and forces with them, and of spatial vectors: the links' up to `last`."""
+        steps, least, inertial = len(offsets), offsets[0] if offsets else 1, 0 if spec.floating else 1 + spec.inert
+
+        @wp.func
+        def add(value: T):
+            for k in range(steps):
+                value = value + of_neighbour(value, least << k)
+            return value
+
+        @wp.func
+        def add_vec6(value: vec6):
+            for k in range(6):
+                value[k] = add(value[k])
+            return value
+
+        @wp.func
+        def add_mat3(value: mat3):
+            for r in range(3):
+                for c in range(3):
+                    value[r, c] = add(value[r, c])
+            return value
+
+        @wp.func
+        def add_inertias(Ia: mat3s, Ib: mat3s, Id: mat3s, P: vec6s):
+            begin = int(inertial)
+            for i in range(begin, last + 1):
+                Ia[i] = add_mat3(Ia[i])
+                Ib[i] = add_mat3(Ib[i])
+                Id[i] = add_mat3(Id[i])
+                P[i] = add_vec6(P[i])
+
+        @wp.func
+        def add_vectors(a: vec6s):
+            begin = int(0)
+            for i in range(begin, last + 1):
+                a[i] = add_vec6(a[i])
+
+        return SimpleNamespace(add=add, add_inertias=add_inertias, add_vectors=add_vectors)
+
+    powers = [2**k for k in range(threads.bit_length() - 1)]
+    return SimpleNamespace(
+        add=sums(powers, 0).add,
+        sharers=sums([p for p in powers if p < spec.sharers], spec.slots - 1),
+        limbs=sums([p for p in powers if p >= spec.sharers], spec.trunk),
+    )

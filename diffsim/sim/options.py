@@ -1,0 +1,73 @@
+"""What a simulator can be asked for, and what of it is allowed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from diffsim.kernels.lanes import Division
+from diffsim.sim.integration import Integration, check_count
+
+WARP_DTYPE = {torch.float32: wp.float32, torch.float64: wp.float64}
+
+
+class Options(NamedTuple):
+    """How a scene is simulated, whatever the number of its copies.
+
+    Attributes:
+        integration: integrator, substeps and theta.
+        device: "cpu" or a CUDA device.
+        dtype: torch.float32 or torch.float64.
+        threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.
+        factors: let constants of the scene differ between environments: Simulator.factors.
+        forces: let external forces act on the bodies: Simulator.forces.
+        division: how GPU threads share an environment, from kernels.lanes.divide; default the fastest as measured.
+    """
+
+    integration: Integration = Integration()
+    device: str | torch.device = "cpu"
+    dtype: torch.dtype = torch.float32
+    threads: int | None = None
+    factors: bool = False
+    forces: bool = False
+    division: Division | None = None
+
+    def check(self) -> Options:
+        """Itself, with plain types; raises ValueError, with what is allowed, if it cannot be simulated so."""
+        return self._replace(
+            integration=self.integration.check(),
+            device=check_device(self.device),
+            dtype=check_dtype(self.dtype),
+            threads=None if self.threads is None else check_count("threads", self.threads),
+        )
+
+
+def check_dtype(dtype: torch.dtype) -> torch.dtype:
+    """The dtype; raises ValueError unless the kernels have it."""
+    if dtype not in WARP_DTYPE:
+        raise ValueError(f"dtype is {dtype!r}, must be torch.float32 or torch.float64")
+    return dtype
+
+
+def check_device(device: str | torch.device) -> torch.device:
+    """The device, with an index if it is a GPU.
+
+    Raises:
+        ValueError: neither the CPU nor a CUDA device that is there.
+    """
+    try:
+        result = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda") from error
+    if device is None or result.type not in ("cpu", "cuda"):  # torch takes None for its default device
+        raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda")
+    if result.type == "cuda":
+        if not torch.cuda.is_available():
+            raise ValueError(f"device {str(device)!r} asked for, but PyTorch sees no CUDA GPU here; choose cpu")
+        count = torch.cuda.device_count()
+        if (result.index or 0) >= count:
+            raise ValueError(f"device {str(device)!r} asked for, but there are {count} CUDA GPUs")
+        result = torch.device("cuda", torch.cuda.current_device() if result.index is None else result.index)
+    return result

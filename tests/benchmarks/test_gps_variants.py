@@ -1,0 +1,38 @@
+"""benchmarks/gps_variants.py: what each variant of Figure 2 does otherwise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gps_variants
+import pytest
+import torch
+from learners import assert_same, run
+
+TINY = (
+    "--env cartpole --horizon 8 --restarts 3 --screening 4 --ilqr-iterations 3 --pretraining 5 --hidden 8 "
+    "--guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 2 --lbfgs-iterations 5 --eval-episodes 1 "
+    "--quiet"
+).split()
+
+
+@pytest.mark.parametrize("case", list(gps_variants.CASES))
+def test_variants(case: str, tmp_path: Path) -> None:
+    modules = run(gps_variants, tmp_path, *TINY, "--case", case)["modules"]
+    search, S, guided = modules["learner"], modules["S"], case == "unregularized"
+    assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
+    assert (search["w_r"] == 0) == (case == "unregularized")
+    assert (len(S["samples"][0][:, 0].unique(dim=0)) > 3) == (case == "restart")
+    assert len(search["lessons"]) == {"dagger": 2}.get(case, 0)
+    assert case != "dagger" or len(search["lessons"][0]) == 8 + 2 * 4
+    moved = not torch.equal(modules["network"]["theta"], S["generators"][S["best"]][0])
+    assert moved == (case in ("policy-gradient", "dagger"))
+
+
+def test_resume(tmp_path: Path) -> None:
+    """The checkpoint says which variant it is of."""
+    whole = run(gps_variants, tmp_path / "whole", *TINY, "--case", "restart")
+    run(gps_variants, tmp_path / "parts", *TINY, "--case", "restart", "--stop-after", "1")
+    gps_variants.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
+    parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
+    assert_same(parts["modules"], whole["modules"])
