@@ -81,7 +81,7 @@ def test_steps_of_a_ball_are_the_references(ball, rng):
     runs = np.diff(HILLS, axis=0)
     slopes = np.stack([-runs[:, 1], runs[:, 0]], 1) / np.linalg.norm(runs, axis=1, keepdims=True)
     between = ~np.isclose(normals[:, None], slopes, atol=1e-6).all(2).any(1)
-    assert between.sum() > 5  # in valleys and on ridges
+    assert between.sum() > 3  # in valleys and on ridges
 
 
 def test_steps_of_the_hopper_are_the_references(rng):
