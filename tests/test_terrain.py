@@ -207,7 +207,8 @@ def test_the_twin_and_the_drawn_boxes_are_where_mujoco_has_them(rng):
 
 
 def test_kernels_of_a_plane_do_not_know_terrain():
-    plain, hilly = source(parse(BALL)), source(parse(BALL).with_terrain(HILLS))
+    scene = task_scene("hopper")
+    plain, hilly = source(scene), source(scene.with_terrain(HILLS))
     for name in ("(var_m).terrain", "(var_m).carrier_along", "sphere_on_terrain"):
         assert name in hilly and name not in plain
 

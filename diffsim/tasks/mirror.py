@@ -76,7 +76,7 @@ def reflections(
     Raises:
         ValueError: a joint or an actuator has no partner of the other side's name, or its axis is another one.
     """
-    qpos, qvel, action = [], list[tuple[int, float]](), []  # from where, sign
+    qpos, qvel, action = (list[tuple[int, float]]() for _ in range(3))  # from where, sign
     for joint, partner in enumerate(_partners([model.joint(k).name for k in range(model.njnt)], sides)):
         positions, rates = _joint_signs(model, joint, partner)
         qpos += enumerate(positions, int(model.jnt_qposadr[partner]))

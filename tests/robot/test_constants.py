@@ -87,7 +87,7 @@ def test_default_limits():
 
 def test_a_ball_sinks_in_as_far_as_it_says():
     scene = parse(BALL.format("", ""))
-    depth = reference.contacts(scene, motion(scene, 2.0)[-1], np.zeros(scene.nv))[0].min()
+    depth = reference.contacts(scene, motion(scene, 2.0, torch.float64)[-1], np.zeros(scene.nv))[0].min()
     np.testing.assert_allclose(depth, -2 * 9.81 / scene.k_n, rtol=1e-3)
     assert "at rest the robot sinks in by about 2 mm" in scene.approximations[0]
 
@@ -99,17 +99,17 @@ def start(scene: Scene) -> np.ndarray:
     return qpos
 
 
-def motion(scene: Scene, seconds: float) -> np.ndarray:
+def motion(scene: Scene, seconds: float, dtype: torch.dtype = torch.float32) -> np.ndarray:
     """(control steps + 1, nq) from the start without control, at the default substeps."""
-    sim = Simulator(scene, 1, dtype=torch.float64)
-    qpos, qvel = torch.tensor(start(scene)[None]), torch.zeros(1, scene.nv, dtype=torch.float64)
-    ctrl = torch.tensor(-scene.motor_bias / np.where(scene.gear, scene.gear, 1))[None]
-    rows = [qpos[0].numpy()]
+    sim = Simulator(scene, 1, dtype=dtype)
+    qpos, qvel = torch.tensor(start(scene)[None], dtype=dtype), torch.zeros(1, scene.nv, dtype=dtype)
+    ctrl = torch.tensor(-scene.motor_bias / np.where(scene.gear, scene.gear, 1), dtype=dtype)[None]
+    rows = [qpos[0].double().numpy()]
     with torch.no_grad():
         for _ in range(round(60 * seconds)):
             qpos, qvel = sim.step(qpos, qvel, ctrl)
             assert not sim.nonfinite.any()
-            rows.append(qpos[0].numpy())
+            rows.append(qpos[0].double().numpy())
     return np.array(rows)
 
 
