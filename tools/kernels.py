@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -16,7 +16,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 import diffsim
-from diffsim.training import fail, graph
+from diffsim.training import command, fail, graph
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import shac  # noqa: E402
@@ -51,11 +51,16 @@ def profiled(function: Half, device: torch.device, env: diffsim.DiffEnv | None) 
     return call
 
 
-if __name__ == "__main__":
-    if len(sys.argv) < 2 or sys.argv[1] not in diffsim.TASKS:
+@command
+def main(argv: Sequence[str]) -> None:
+    if not argv or argv[0] not in diffsim.TASKS:
         fail(f"give a task: {', '.join(diffsim.TASKS)}")
     if not torch.cuda.is_available():
         fail("PyTorch sees no CUDA GPU here, and on a CPU there are no graphs")
     graph.capture = profiled  # type: ignore[assignment]
     stop = ["--stop-after", str(LAST), "--eval-every", "0", "--quiet", "--run-dir", mkdtemp()]
-    shac.main(["--env", sys.argv[1], "--device", "cuda", *stop, *sys.argv[2:]])
+    shac.main(["--env", argv[0], "--device", "cuda", *stop, *argv[1:]])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
