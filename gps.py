@@ -33,9 +33,7 @@ from diffsim.planning.samples import Samples, SampleSet, log_weights, phi
 from diffsim.planning.system import System
 from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import TASKS
-from diffsim.training import distributed
-from diffsim.training.assess import evaluate_checkpoint
-from diffsim.training.errors import command, fail
+from diffsim.training import command, distributed, evaluate_checkpoint, fail
 from diffsim.training.evaluation import SEED, Evaluation, travels
 from diffsim.training.flags import Flags, parse
 from diffsim.training.layers import ObsNormalizer

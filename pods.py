@@ -26,7 +26,7 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, distributed, evaluate, evaluate_checkpoint, fail
 from diffsim.training.flags import Flags, parse
-from diffsim.training.ranges import Count, NonNegative, Positive, Widths
+from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
 
 # fmt: off
 COLUMNS = ("hidden", "horizon", "normalize_obs")
@@ -59,7 +59,7 @@ class Args(Flags):
     """control steps T of a sequence (1/60 s each), of which whole ones make an episode (per task)"""
     improvements: Count = 1
     """line-searched steps of each sequence in an iteration (per order)"""
-    candidates: Count = 8
+    candidates: Repeats = 8
     """first order: step sizes of the line search, each half the one before"""
     max_step: Positive = 1.0
     """first order: the largest of them, as root mean square change of the actions before tanh"""

@@ -44,13 +44,8 @@ PER_TASK = {
     "humanoid_imitation": ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
 }
 # How --accuracy default integrates, where that is not as in the paper.
-INTEGRATION = {
-    "hopper": TASKS["hopper"].integration("fast"),
-    "half_cheetah": TASKS["half_cheetah"].integration("fast"),
-    "ant": TASKS["ant"].integration("fast"),
-    "humanoid": Integration("implicit", 16),
-    "humanoid_mtu": Integration("implicit", 16),
-}
+INTEGRATION = {name: TASKS[name].integration("fast") for name in ("hopper", "half_cheetah", "ant")}
+INTEGRATION |= {name: Integration("implicit", 16) for name in ("humanoid", "humanoid_mtu")}
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
 ON_CPU = {
     "ant": {"iterations": 1500},
@@ -134,7 +129,7 @@ class Args(ParallelFlags):
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
         if self.device == "cpu":
-            values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
+            values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
             values |= ON_CPU.get(self.env, {})
         if (self.accuracy, self.contact) == ("default", "soft") and self.env in INTEGRATION:
             values |= INTEGRATION[self.env]._asdict()
@@ -202,7 +197,7 @@ class Actor(nn.Module):
         """The actions without noise, of normalized observations (..., obs_dim)."""
         return torch.tanh(self.mean(self.body(obs)))
 
-    def deterministic(self, member: int = 0) -> nn.Sequential:
+    def deterministic(self) -> nn.Sequential:
         """The policy without noise, of observations as they come, with the same weights."""
         return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
 
@@ -214,14 +209,6 @@ def spread(args: Args, width: int, action_dim: int) -> nn.Linear:
         layer.weight.mul_(0.1)
         layer.bias.fill_(args.initial_log_std)
     return layer
-
-
-class Temperature(nn.Module):
-    """The weight of the entropy."""
-
-    def __init__(self, args: Args) -> None:
-        super().__init__()
-        self.log = nn.Parameter(torch.full((args.population,), math.log(args.initial_temperature)))
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -244,31 +231,28 @@ class SAPO:
     They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
     """
 
-    actor: Actor
-    actor_optimizer: ClippedAdam
-    temperature_optimizer: ClippedAdam
-
     def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.args, self.env = args, env
-        if args.symmetric:
-            self.mirror = env.task.mirror
-        self.build()
+        self.args, self.env, obs_dim = args, env, env.task.obs_dim
+        self.actor = self.make_actor(obs_dim, env.scene.nu).to(env.device)
+        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * args.population)]).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        log = torch.full((args.population,), math.log(args.initial_temperature))
+        self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
+        self.actor_optimizer = self.make_optimizer(self.actor)
+        self.critic_optimizer = self.make_optimizer(self.critics)
+        self.temperature_optimizer = self.make_optimizer(self.temperature)
         self.temperature_optimizer.lr.fill_(args.temperature_lr)
         self.target_entropy = torch.zeros((), device=env.device)
-
-    def build(self) -> None:
-        """The networks, their optimisers, and the critics' samples of a window."""
-        args, env, obs_dim = self.args, self.env, self.env.task.obs_dim
-        self.actor = Actor(args, obs_dim, env.scene.nu).to(env.device)
-        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics)]).to(env.device)
-        self.temperature = Temperature(args).to(env.device)
-        self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
-        self.critic_optimizer = EnsembleAdam(self.critics, 1, args.max_grad_norm, args.betas)
-        self.temperature_optimizer = ClippedAdam(self.temperature, args.max_grad_norm, args.betas)
-        samples = args.horizon * env.num_envs * (1 + args.symmetric)
+        samples = args.horizon * env.num_envs * (1 + args.symmetric)  # a window's, for the critics
         self.obs = torch.zeros(samples, obs_dim, device=env.device)
         self.value = torch.zeros(samples, device=env.device)
+
+    def make_actor(self, obs_dim: int, action_dim: int) -> Actor:
+        return Actor(self.args, obs_dim, action_dim)
+
+    def make_optimizer(self, module: nn.Module) -> ClippedAdam:
+        limits = self.args.max_grad_norm, self.args.betas
+        return EnsembleAdam(module, 1, *limits) if module is self.critics else ClippedAdam(module, *limits)
 
     @property
     def policy(self) -> nn.Sequential:
@@ -279,9 +263,8 @@ class SAPO:
         args, done = self.args, (iteration - 1) / self.args.iterations
         self.actor_optimizer.lr.fill_(args.actor_lr + (args.final_lr - args.actor_lr) * done)
         self.critic_optimizer.lr.fill_(args.critic_lr + (args.final_lr - args.critic_lr) * done)
-        self.target_entropy.fill_(
-            args.initial_target_entropy + (args.target_entropy - args.initial_target_entropy) * done
-        )
+        begin, end = args.initial_target_entropy, args.target_entropy
+        self.target_entropy.fill_(begin + (end - begin) * done)
 
     def update_actor(self) -> dict[str, Tensor]:
         """Descend the soft loss of a window of all environments; keep the critics' samples of it."""
@@ -290,7 +273,7 @@ class SAPO:
         next_values = self.next_values(rollout)
         reward = rollout.reward
         if args.entropy:
-            weight = self.temperature.log.detach().exp().repeat_interleave(len(reward[0]) // args.population)
+            weight = self.temperature["log"].detach().exp().repeat_interleave(len(reward[0]) // args.population)
             reward = reward + weight * (1 + rollout.entropy) / 2
         loss = actor_loss(reward, next_values.mean(0), rollout.done, args.gamma)
         if args.symmetric:
@@ -299,13 +282,13 @@ class SAPO:
         rollout = Rollout(*(tensor.detach() for tensor in rollout))
         self.keep(rollout, reward.detach(), next_values.detach())
         entropy = self.flatten(rollout.entropy).mean(-1)
-        self.temperature_optimizer.step((self.temperature.log.exp() * (entropy - self.target_entropy)).sum())
+        self.temperature_optimizer.step((self.temperature["log"].exp() * (entropy - self.target_entropy)).sum())
         return {
             "losses/actor": loss.detach(),
             "grad/norm": norm,
             "charts/reward": self.flatten(rollout.reward).mean(-1),
             "charts/entropy": entropy.mean(),
-            "charts/temperature": self.temperature.log.detach().exp().mean(),
+            "charts/temperature": self.temperature["log"].detach().exp().mean(),
         }
 
     def update_critic(self) -> dict[str, Tensor]:
@@ -351,7 +334,7 @@ class SAPO:
         args, normalizer, samples = self.args, self.actor.normalizer, rollout.obs
         value = td_lambda(reward, next_values.amin(0), rollout.done, args.gamma, args.td_lambda)
         if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
-            samples = torch.stack((samples, self.mirror.obs(samples)), 1).flatten(0, 1)
+            samples = torch.stack((samples, self.env.task.mirror.obs(samples)), 1).flatten(0, 1)
             value = value.repeat_interleave(2, 0)
         self.value.copy_(self.flatten(value))
         self.obs.copy_(self.flatten(normalizer(samples)))
@@ -359,9 +342,9 @@ class SAPO:
 
     def asymmetry(self, obs: Tensor) -> Tensor:
         """Mean squared difference between the actions in mirrored states and the mirrored actions, without noise."""
-        there = self.actor.act(self.flatten(self.actor.normalizer(self.mirror.obs(obs))))
-        here = self.actor.act(self.flatten(self.actor.normalizer(obs)))
-        return (there - self.mirror.action(here)).square().mean()
+        mirror, normalizer = self.env.task.mirror, self.actor.normalizer
+        there, here = (self.actor.act(self.flatten(normalizer(x))) for x in (mirror.obs(obs), obs))
+        return (there - mirror.action(here)).square().mean()
 
     def imitate(self, policy: nn.Module, lead: bool) -> Tensor:
         """A window from whose states the actor learns another policy's actions, and the critics the returns.
@@ -459,22 +442,19 @@ class Population(SAPO):
     the second ones.
     """
 
-    actor_optimizer: EnsembleAdam
-    temperature_optimizer: EnsembleAdam
+    actor: Actors
 
-    def build(self) -> None:
-        args, env, K, obs_dim = self.args, self.env, self.args.population, self.env.task.obs_dim
-        self.actor = Actors(args, obs_dim, env.scene.nu).to(env.device)
-        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * K)]).to(env.device)
-        self.temperature = Temperature(args).to(env.device)
-        self.score = Running(K).to(env.device)
-        options = K, args.max_grad_norm, args.betas, self.score.tied
-        self.actor_optimizer = EnsembleAdam(self.actor, *options)
-        self.critic_optimizer = EnsembleAdam(self.critics, *options)
-        self.temperature_optimizer = EnsembleAdam(self.temperature, *options)
-        samples = args.horizon * env.num_envs // K * (1 + args.symmetric)
-        self.obs = torch.zeros(K, samples, obs_dim, device=env.device)
-        self.value = torch.zeros(K, samples, device=env.device)
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.score = Running(args.population).to(env.device)
+        super().__init__(args, env)
+        self.obs, self.value = (tensor.unflatten(0, (args.population, -1)) for tensor in (self.obs, self.value))
+
+    def make_actor(self, obs_dim: int, action_dim: int) -> Actors:
+        return Actors(self.args, obs_dim, action_dim)
+
+    def make_optimizer(self, module: nn.Module) -> EnsembleAdam:
+        args = self.args
+        return EnsembleAdam(module, args.population, args.max_grad_norm, args.betas, self.score.tied)
 
     @property
     def policy(self) -> nn.Sequential:
@@ -489,6 +469,7 @@ class Population(SAPO):
     def select(self, member: int) -> None:
         """From now on all members are this one, and learn from the samples of all."""
         for optimizer in (self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer):
+            assert isinstance(optimizer, EnsembleAdam)
             optimizer.tie(member)
         for p in self.targets.parameters():
             members = p.unflatten(0, (self.args.critics, -1))

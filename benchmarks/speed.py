@@ -41,7 +41,7 @@ from diffsim.kernels.lanes import divide
 from diffsim.sim.launcher import available_cores
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
-from diffsim.training.assess import make_env
+from diffsim.training.evaluation import make_env
 
 Precision = Literal["float32", "float64"]
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}

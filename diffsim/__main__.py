@@ -38,9 +38,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="python -m diffsim", description=__doc__)
         else:
             print(report())
-        sys.stdout.flush()
-    except BrokenPipeError:  # head, for one, has read enough; Python would complain once more when it ends
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        raise
     except (OSError, RuntimeError, ValueError) as error:
         fail(error)
 

@@ -343,6 +343,9 @@ class DiffEnv(VectorEnv):
         theirs, ours = (f"{len(x['qpos'])} x {x['task']} in {x['qpos'].dtype}" for x in (state, own))
         if theirs != ours:
             raise ValueError(f"the state is of {theirs}; this environment is {ours}")
+        for name, value in own.items():
+            if isinstance(value, Tensor) and (state[name].shape, state[name].dtype) != (value.shape, value.dtype):
+                raise ValueError(f"{name} of the state is of another shape or type")
         self.qpos, self.qvel = state["qpos"].to(self.device), state["qvel"].to(self.device)
         self._obs = state["obs"].to(self.device)
         self.episode_step.copy_(state["episode_step"])

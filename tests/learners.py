@@ -25,7 +25,7 @@ SMALL = {
     "sapo": [*_SMALL, "--critic-iterations", "3", "--population", "3"],
     "bptt": _SMALL,
     "ppo_baseline": [*_SMALL, "--minibatch-size", "40", "--epochs", "2"],
-    "pfpn": [*_SMALL, "--minibatch-size", "40", "--epochs", "2"],
+    "pfpn": [*_SMALL, "--minibatch-size", "40", "--epochs", "2", "--particles", "7"],
 }
 SCRIPTS = {name: importlib.import_module(name) for name in SMALL}
 

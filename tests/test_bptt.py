@@ -39,15 +39,14 @@ def test_loss_and_its_gradient_are_those_of_a_loop(rng: np.random.Generator, hor
     torch.testing.assert_close(torch.autograd.grad(result, reward), torch.autograd.grad(loss, reward))
 
 
-@pytest.mark.parametrize(("task", "horizon"), [("cartpole", 64), ("ant", 8)])
-def test_gradient_is_the_finite_difference(task: str, horizon: int) -> None:
-    """Through a whole window of cartpole, and of ants of which one runs out of time."""
+def test_gradient_is_the_finite_difference() -> None:
+    """Through a whole window of three ants of which one runs out of time."""
     torch.manual_seed(0)
-    learner = build(task, "--hidden", "16", "--horizon", str(horizon), dtype=torch.float64)
+    learner = build("ant", "--hidden", "16", "--horizon", "8", dtype=torch.float64)
     env, policy = learner.env, learner.actor
     env.episode_step[1] = env.episode_length - 4
     start = env.state_dict()
-    noise = torch.randn(horizon, 3, env.single_action_space.shape[0], dtype=torch.float64)
+    noise = torch.randn(8, 3, env.single_action_space.shape[0], dtype=torch.float64)
 
     def loss() -> torch.Tensor:
         env.load_state_dict(start)

@@ -131,10 +131,11 @@ def test_mistakes_are_one_line(
     assert message.format(tmp=tmp_path) in error
 
 
-def test_a_closed_pipe_is_no_error() -> None:
+@pytest.mark.parametrize("program", [["-m", "diffsim"], ["shac.py", "--help"]])
+def test_a_closed_pipe_is_no_error(program: list[str]) -> None:
     """As of `python -m diffsim | head -3`."""
-    command = [sys.executable, "-m", "diffsim"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | PATH) as process:
+    options = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | PATH, cwd=ROOT)
+    with subprocess.Popen([sys.executable, *program], **options) as process:
         assert process.stdout and process.stderr
         process.stdout.close()
         assert process.stderr.read() == b"" and process.wait() == 0

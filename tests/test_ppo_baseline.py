@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import read_progress, run
+from learners import read_progress, refusal, run
 from torch.distributions import Normal, kl_divergence
 
 import diffsim
@@ -90,9 +90,9 @@ def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
         return rollouts[-1]
 
     monkeypatch.setattr(ppo, "collect", recorded)
-    metrics = learner.roll_out()
+    learner.roll_out()
     (rollout,) = rollouts
-    assert rollout.terminated.any() and metrics["episodes/count"] == rollout.done.sum()
+    assert rollout.terminated.any()
     with torch.no_grad():
         value = returns.inverse(learner.actor_critic(normalizer(rollout.obs))[1])
         next_value = returns.inverse(learner.actor_critic(normalizer(rollout.next_obs))[1])
@@ -198,6 +198,5 @@ def test_symmetric_policies_are_paid(capsys: pytest.CaptureFixture[str]) -> None
         learner.update()
     assert asymmetry() < 0.5 * before
 
-    with pytest.raises(SystemExit):
-        parse(ppo.Args, ["--env", "hopper", "--symmetric"])
-    assert "--symmetric: task 'hopper' has no mirror image" in capsys.readouterr().err
+    message = "--symmetric: task 'hopper' has no mirror image"
+    assert message in refusal(lambda: parse(ppo.Args, ["--env", "hopper", "--symmetric"]), capsys)

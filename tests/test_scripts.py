@@ -24,7 +24,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from diffsim.training import graph, load_policy
-from diffsim.training.progress import COLUMNS, column
+from diffsim.training.directory import COLUMNS, column
 from diffsim.training.ranges import flag
 
 NOT_COMPARED = {"seconds"}

@@ -6,11 +6,10 @@ The physics knows nothing of this package.
 from __future__ import annotations
 
 from diffsim.training import distributed
-from diffsim.training.assess import evaluate_checkpoint, make_policy_env
 from diffsim.training.checkpoint import Learner, SavedPolicy, export_policy, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, command, fail
-from diffsim.training.evaluation import Evaluation, evaluate
+from diffsim.training.evaluation import Evaluation, evaluate, evaluate_checkpoint, make_policy_env
 from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.optimizer import ClippedAdam
@@ -28,41 +27,3 @@ from diffsim.training.ranges import (
 )
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run
-
-__all__ = [
-    "ClippedAdam",
-    "Count",
-    "Decay",
-    "Ensemble",
-    "EnsembleAdam",
-    "Evaluation",
-    "Finite",
-    "Flags",
-    "Fraction",
-    "Learner",
-    "Likeliest",
-    "Natural",
-    "NonNegative",
-    "ObsNormalizer",
-    "ParallelFlags",
-    "Positive",
-    "Repeats",
-    "ReplayBuffer",
-    "Run",
-    "SavedPolicy",
-    "SomeWidths",
-    "Transition",
-    "UsageError",
-    "Widths",
-    "command",
-    "distributed",
-    "evaluate",
-    "evaluate_checkpoint",
-    "export_policy",
-    "fail",
-    "load_policy",
-    "make_policy_env",
-    "moments",
-    "parse",
-    "parse_penalty",
-]

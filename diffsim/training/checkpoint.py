@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from diffsim.env import DiffEnv
 from diffsim.training.errors import fail
 from diffsim.training.layers import Likeliest, ObsNormalizer
+from diffsim.training.ranges import fits
 
 FORMAT = 2
 
@@ -135,48 +136,50 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
 
 def _check_structure(state: Mapping[str, Any]) -> None:
     """Raise a ValueError unless all that a checkpoint of this format holds is there, and of the right type."""
-
-    def check(name: str, holds: Callable[[Any], bool], words: str) -> None:
-        if name not in state or not holds(state[name]):
-            raise ValueError(f"{name} is missing" if name not in state else f"{name} is not {words}")
-
-    def is_count(x: Any) -> bool:
-        return type(x) is int and 0 <= x < 2**62
-
-    def is_number(x: Any) -> bool:
-        return type(x) in (int, float) and math.isfinite(x)
-
-    def is_named(x: Any, kind: type = object) -> bool:
-        return isinstance(x, dict) and all(isinstance(k, str) and isinstance(v, kind) for k, v in x.items())
-
-    def is_policy(x: Any) -> bool:
-        return (
-            is_named(x)
-            and is_named(x.get("weights"), Tensor)
-            and isinstance(x.get("layers"), list)
-            and all(isinstance(layer, list) and layer and layer[0] in LAYERS for layer in x["layers"])
-        )
-
-    def is_rank(x: Any) -> bool:
-        rng = x.get("rng") if is_named(x) else None
-        return isinstance(rng, Tensor) and rng.dtype == torch.uint8 and (x.get("env") is None or is_named(x["env"]))
-
-    check("script", lambda x: isinstance(x, str) and x.isprintable(), "the name of a script")
-    check("args", lambda x: is_named(x) and isinstance(x.get("env"), str), "the arguments of a run")
-    check("iteration", is_count, "a count")
-    check("policy", is_policy, "a policy")
-    if "modules" not in state:  # an exported policy
-        return
-    check("modules", is_named, "the state of a learner")
-    check("control_steps", is_count, "a count")
-    check("seconds", lambda x: is_number(x) and x >= 0, "a time")
-    check("totals", lambda x: is_named(x, int), "counts by name")
-    check("episodes", lambda x: _is_list(x, lambda row: len(row) == 3 and all(map(is_number, row))), "sums of windows")
-    check("ranks", lambda x: bool(x) and _is_list(x, is_rank), "the states of the ranks")
+    for name, kind in (HELD if "modules" in state else POLICY).items():
+        if name not in state:
+            raise ValueError(f"{name} is missing")
+        if not fits(kind, state[name]) or not HOLDS[name](state[name]):
+            raise ValueError(f"{name} is not what a checkpoint holds")
 
 
-def _is_list(values: Any, holds: Callable[[Any], bool]) -> bool:
-    return isinstance(values, list) and all(holds(value) for value in values)
+def _is_count(number: int) -> bool:
+    return 0 <= number < 2**62
+
+
+def _is_policy(policy: dict[str, Any]) -> bool:
+    if not fits(list[list[Any]], policy.get("layers")) or not fits(dict[str, Tensor], policy.get("weights")):
+        return False
+    known = all(layer and layer[0] in LAYERS for layer in policy["layers"])
+    return known and all(w.layout == torch.strided and w.device.type == "cpu" for w in policy["weights"].values())
+
+
+def _is_rank(rank: dict[str, Any]) -> bool:
+    return fits(Tensor, rank.get("rng")) and rank["rng"].dtype == torch.uint8 and "env" in rank
+
+
+# What a checkpoint holds, of which type, and what more must be true of it. An exported policy holds less.
+POLICY: dict[str, Any] = {"script": str, "args": dict[str, Any], "iteration": int, "policy": dict[str, Any]}
+HELD: dict[str, Any] = POLICY | {
+    "modules": dict[str, Any],
+    "control_steps": int,
+    "seconds": float,
+    "totals": dict[str, int],
+    "episodes": list[tuple[float, float, float]],
+    "ranks": list[dict[str, Any]],
+}
+HOLDS: dict[str, Callable[[Any], bool]] = {
+    "script": str.isprintable,
+    "args": lambda args: isinstance(args.get("env"), str),
+    "iteration": _is_count,
+    "policy": _is_policy,
+    "modules": lambda _: True,
+    "control_steps": _is_count,
+    "seconds": lambda seconds: 0 <= seconds < math.inf,
+    "totals": lambda _: True,
+    "episodes": lambda rows: all(math.isfinite(number) for row in rows for number in row),
+    "ranks": lambda ranks: bool(ranks) and all(map(_is_rank, ranks)),
+}
 
 
 def load_policy(path: Path) -> SavedPolicy:
@@ -189,7 +192,11 @@ def load_policy(path: Path) -> SavedPolicy:
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
             network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
-        network.load_state_dict(state["policy"]["weights"], assign=True)
+            kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
+        weights = state["policy"]["weights"]
+        if any(weights[name].dtype != kind for name, kind in kinds.items()):
+            raise TypeError
+        network.load_state_dict(weights, assign=True)
     except (KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"])
@@ -201,8 +208,8 @@ def export_policy(path: Path, output: Path) -> None:
     _write(output, {name: state[name] for name in ("format", "script", "args", "iteration", "policy")})
 
 
-def restore(learner: Learner, state: Mapping[str, Any]) -> None:
-    """Load the weights and statistics of a checkpoint into a learner.
+def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:
+    """Load the weights and statistics of a checkpoint into a learner, and what it holds of an environment into that.
 
     Raises:
         ValueError: they are of other sizes.
@@ -210,6 +217,8 @@ def restore(learner: Learner, state: Mapping[str, Any]) -> None:
     try:
         for name, part in parts(learner).items():
             part.load_state_dict(state["modules"][name])
+        if env is not None:
+            env[0].load_state_dict(env[1])
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         why = f"{type(error).__name__} {' '.join(str(error).split())}"
         fail(f"the checkpoint does not fit the script as it is now: {why}")

@@ -1,16 +1,27 @@
-"""The directory of a run: whether it can be written, and that one process alone trains into it."""
+"""The directory of a run: who may write there; progress.csv, tensorboard and a progress bar."""
 
 from __future__ import annotations
 
+import csv
+import math
 import os
 import sys
 import tempfile
+from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NoReturn
+
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
 
 from diffsim.training.errors import fail
 
 if sys.platform != "win32":
     import fcntl
+
+# The first columns of every progress.csv.
+COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return", "eval_length", "eval_speed")
 
 
 def check_writable(directory: Path) -> None:
@@ -51,3 +62,125 @@ class Lock:
             self._descriptor = None
 
     __del__ = release
+
+
+class EpisodeStatistics:
+    """Mean return and length of the last finished episodes: of the newest windows that hold a hundred of them."""
+
+    def __init__(self) -> None:
+        self.windows: deque[tuple[float, float, float]] = deque()  # episodes finished, sums of return and of length
+
+    def add(self, count: float, total_return: float, total_length: float) -> None:
+        if count > 0:
+            self.windows.append((count, total_return, total_length))
+        while len(self.windows) > 1 and sum(window[0] for window in self.windows) - self.windows[0][0] >= 100:
+            self.windows.popleft()
+
+    def means(self) -> tuple[float, float]:
+        """NaN before the first episode's end."""
+        if not self.windows:
+            return math.nan, math.nan
+        count, total_return, total_length = (sum(column) for column in zip(*self.windows, strict=True))
+        return total_return / count, total_length / count
+
+
+class ProgressFile:
+    """progress.csv: a row per iteration, a column per scalar. Columns may join later; older rows leave them empty.
+
+    Args:
+        path: the file.
+        iteration: of a resumed run; rows of later iterations are dropped. 0 begins a new file.
+    """
+
+    def __init__(self, path: Path, iteration: int) -> None:
+        self.path, self.columns = path, list(COLUMNS)
+        rows: list[dict[str, str]] = []
+        if iteration > 0 and path.is_file():
+            with path.open(newline="") as file:
+                reader = csv.DictReader(file)
+                # A crash may leave rows of later iterations, and half of a line.
+                rows = [row for row in reader if None not in row.values() and int(row["iteration"]) <= iteration]
+                self.columns = list(reader.fieldnames or self.columns)
+        self._rewrite(rows)
+
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        """Replace the file in one step, and go on at its end."""
+        temporary = self.path.with_suffix(".csv.tmp")
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self.columns, restval="")
+            writer.writeheader()
+            writer.writerows(rows)
+        os.replace(temporary, self.path)
+        self._file = self.path.open("a", newline="")
+
+    def write(self, row: Mapping[str, float]) -> None:
+        if new := [name for name in row if name not in self.columns]:
+            self._file.close()
+            with self.path.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+            self.columns += new
+            self._rewrite(rows)
+        csv.DictWriter(self._file, self.columns, restval="").writerow(row)
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def column(scalar: str) -> str:
+    """The column of progress.csv for a scalar of tensorboard: eval/return -> eval_return."""
+    return scalar.removeprefix("charts/episodic_").replace("/", "_")
+
+
+class ProgressLog:
+    """The three of them for one run. Opened late, so that a run that fails at its start leaves nothing behind.
+
+    Args:
+        directory: where the files go.
+        iteration, control_steps: where a resumed run goes on; 0 at the start.
+        hyperparameters: logged as a table.
+        total: iterations in all.
+        quiet: no progress bar, no messages.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        iteration: int,
+        control_steps: int,
+        hyperparameters: Mapping[str, object],
+        total: int,
+        quiet: bool,
+    ) -> None:
+        self.file = ProgressFile(directory / "progress.csv", iteration)
+        self.tensorboard = SummaryWriter(str(directory), purge_step=control_steps + 1 if iteration else None)
+        table = "\n".join(f"|{name}|{value}|" for name, value in hyperparameters.items())
+        self.tensorboard.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}")
+        self.total, self.quiet = total, quiet
+        self.bar: tqdm[NoReturn] | None = None
+
+    def write(self, iteration: int, control_steps: int, seconds: float, scalars: Mapping[str, float]) -> None:
+        for key, value in scalars.items():
+            self.tensorboard.add_scalar(key, value, control_steps)
+        row = {"iteration": iteration, "control_steps": control_steps, "seconds": round(seconds, 3)}
+        self.file.write(row | {column(key): float(f"{value:.7g}") for key, value in scalars.items()})
+        if self.quiet:
+            return
+        if self.bar is None:  # after the first iteration, which compiled and says nothing about the rest
+            interval = 0.1 if sys.stdout.isatty() else 10.0
+            self.bar = tqdm(total=self.total, initial=iteration, file=sys.stdout, mininterval=interval, ncols=100)
+        self.bar.update(iteration - self.bar.n)
+        if "charts/episodic_return" in scalars:
+            self.bar.set_postfix_str(f"return {scalars['charts/episodic_return']:.1f}", refresh=False)
+
+    def message(self, text: str) -> None:
+        if not self.quiet:
+            tqdm.write(text, file=sys.stdout)
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+        try:
+            self.tensorboard.close()
+        finally:
+            self.file.close()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import os
+import re
 import sys
 import threading
 from collections.abc import Callable
@@ -40,7 +42,7 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
     """Make a script's main end the process with one line on stderr where its user is at fault.
 
     The exit code is 2 for an expected error and 130 for Ctrl-C. Other errors keep their traceback. Only the first rank
-    prints.
+    prints. A reader of stdout that has read enough, as `head` does, ends the script silently.
     """
 
     @functools.wraps(main)
@@ -48,16 +50,24 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
         report, threading.excepthook = threading.excepthook, _report_in_thread
         try:
             main(*args, **kwargs)
+        except BrokenPipeError:
+            pass
         except KeyboardInterrupt:
             _end("interrupted", 130)
         except EXPECTED as error:
             _end(error, 2)
-        except RuntimeError as error:
-            if "can't allocate memory" not in str(error):  # torch's words on a CPU
+        except (RuntimeError, MemoryError) as error:
+            wanted = re.search(r"can't allocate memory.* (\d+) bytes", str(error))  # torch's words on a CPU
+            if wanted is None and not isinstance(error, MemoryError):
                 raise
-            _end(error, 2)
+            size = f" for {float(wanted[1]) / 1e9:,.1f} GB more" if wanted else ""
+            _end(f"not enough memory{size}: choose smaller sizes", 2)
         finally:
             threading.excepthook = report
+            try:
+                sys.stdout.flush()
+            except BrokenPipeError:  # and no complaint when Python flushes once more at its end
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     return run
 

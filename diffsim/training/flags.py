@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
@@ -16,7 +16,7 @@ from diffsim.tasks import TASKS, HumanoidImitation
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
-from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, flag
+from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, fits, flag
 from diffsim.training.variation import parse_ranges
 from diffsim.view import render
 
@@ -209,8 +209,11 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     saved = checkpoint.load(path, kind.script())
     if given.resume and "modules" not in saved:
         fail(f"{path} holds a policy alone, which can be evaluated but not resumed")
-    if unknown := [flag(name) for name in saved["args"] if not hasattr(kind, name)]:
+    hints = get_type_hints(kind, include_extras=True)
+    if unknown := [flag(name) for name in saved["args"] if name not in hints or name.isupper()]:
         fail(f"{path} was written by a {kind.script()}.py with other flags: {', '.join(unknown)}")
+    if wrong := [name for name, value in saved["args"].items() if not fits(hints[name], value)]:
+        fail(f"{path} is damaged: {', '.join(map(flag, wrong))} of another type")
     defaults = kind(**saved["args"])
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained

@@ -82,6 +82,13 @@ class ClippedAdam:
         return {"adam": self.adam.state_dict()["state"], "lr": self.lr, "skipped": self.skipped}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Raises a ValueError where moments are missing or of another shape."""
+        shapes = {name: value.shape for name, value in state["adam"].get(0, {}).items()}
+        shape = self.vector.shape
+        if shapes and shapes != {"step": torch.Size(()), "exp_avg": shape, "exp_avg_sq": shape}:
+            raise ValueError("the state of an optimizer")
+        if not bool(state["skipped"].isfinite()):
+            raise ValueError("the count of skipped updates")
         self.adam.load_state_dict(self.adam.state_dict() | {"state": state["adam"]})
         self.adam.param_groups[0]["lr"] = self.lr  # not a copy of it
         self.lr.copy_(state["lr"])

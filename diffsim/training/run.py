@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -20,13 +20,11 @@ from torch import Tensor
 from diffsim.env import ActionError, DiffEnv
 from diffsim.sim.options import check_device
 from diffsim.training import checkpoint, distributed, graph
-from diffsim.training.assess import make_env, write_evaluation
 from diffsim.training.checkpoint import Learner
-from diffsim.training.directory import Lock, check_writable
+from diffsim.training.directory import EpisodeStatistics, Lock, ProgressLog, check_writable
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import Evaluation
+from diffsim.training.evaluation import Evaluation, make_env, write_evaluation
 from diffsim.training.flags import Flags, ParallelFlags, parse_penalty
-from diffsim.training.progress import EpisodeStatistics, ProgressLog
 from diffsim.training.variation import Variation, parse_ranges, soft_factors
 
 L = TypeVar("L", bound=Learner)
@@ -34,6 +32,10 @@ Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
 RANK_SEED = 1_000_003  # between the seeds of two ranks
+
+
+def is_due(iteration: int, every: int) -> bool:
+    return every > 0 and iteration % every == 0
 
 
 class Mark:
@@ -56,18 +58,21 @@ class Mark:
         return self.time - earlier.time
 
 
+Timing = tuple[str, Mark, Mark]  # name, begin, end
+
+
 @dataclass
 class Entry:
     """An iteration that is not written yet: the device may still work on it."""
 
     iteration: int
-    control_steps: int  # in all
+    steps: int  # control steps that it took
     names: list[str]
-    numbers: Tensor  # of the names, then the statistics of its episodes, then how many signals have arrived
+    numbers: Tensor  # of the names, then how many signals have arrived
     scalars: dict[str, float]  # that are known already
     begin: Mark
     end: Mark
-    timings: list[tuple[str, Mark, Mark]] = field(default_factory=list)
+    timings: list[Timing]
     evaluation: Evaluation | None = None
 
 
@@ -102,7 +107,6 @@ class Run:
         torch.set_num_threads(1)  # operations this small gain little from more; idle threads disturb the simulator's
         torch.manual_seed(args.seed)
         self.iteration, self.seconds, self.control_steps = 0, 0.0, 0
-        self._written_steps = 0
         self._saved = self._state["iteration"] if self._state else 0
         self.last = min(args.iterations, args.stop_after or args.iterations)
         self._totals, self._episodes = {f"sim/{name}": 0 for name in TOTALS}, EpisodeStatistics()
@@ -112,7 +116,7 @@ class Run:
         self._learner: Learner | None = None
         self._log: ProgressLog | None = None
         self._pending: Entry | None = None
-        self._timings: list[tuple[str, Mark, Mark]] = []
+        self._timings: list[Timing] = []
         self._evaluation: tuple[int, Evaluation] | None = None
         self._scalars: dict[str, float] = {}
         self._mark = Mark(self.device)
@@ -126,14 +130,14 @@ class Run:
         """This rank's share of the training environments, with its own random start states."""
         self._samples = num_envs * horizon
         seed = self.args.seed + distributed.rank() * RANK_SEED
-        args, options = self.args, dict[str, Any]()
-        if isinstance(args, ParallelFlags):
-            options["factors"] = args.contact == "firm" or bool(args.randomise)
-        self._env = make_env(args, num_envs // distributed.size(), horizon, seed, **options)
-        if isinstance(args, ParallelFlags) and options["factors"]:
-            begin, end = (share * args.iterations for share in args.anneal) if args.contact == "firm" else (0.0, 0.0)
-            start = soft_factors(self._env.scene, parse_penalty(args.penalty))
-            self._variation = Variation(self._env, start, parse_ranges(args.randomise), (begin, end), args.redraw, seed)
+        args, size = self.args, num_envs // distributed.size()
+        if not isinstance(args, ParallelFlags) or not (args.contact == "firm" or args.randomise):
+            self._env = make_env(args, size, horizon, seed)
+            return self._env
+        self._env = make_env(args, size, horizon, seed, factors=True)
+        begin, end = (share * args.iterations for share in args.anneal) if args.contact == "firm" else (0.0, 0.0)
+        start = soft_factors(self._env.scene, parse_penalty(args.penalty))
+        self._variation = Variation(self._env, start, parse_ranges(args.randomise), (begin, end), args.redraw, seed)
         return self._env
 
     def make_eval_env(self) -> DiffEnv:
@@ -148,15 +152,11 @@ class Run:
         if rank > 0:
             torch.manual_seed(self.args.seed + rank * RANK_SEED)
         if state := self._state:
-            checkpoint.restore(learner, state)
             own = state["ranks"][rank]
-            if self._env is not None:
-                self._env.load_state_dict(own["env"])
+            checkpoint.restore(learner, state, (self._env, own["env"]) if self._env is not None else None)
             self._random_numbers().set_state(own["rng"])
-            self.iteration, self.seconds, self.control_steps = (
-                state[name] for name in ("iteration", "seconds", "control_steps")
-            )
-            self._written_steps = self.control_steps
+            self.iteration, self.seconds = state["iteration"], state["seconds"]
+            self.control_steps = state["control_steps"]
             self._totals |= state["totals"]
             self._episodes.windows.extend(state["episodes"])
         return learner
@@ -188,8 +188,7 @@ class Run:
         return due
 
     def _evaluates(self) -> bool:
-        every = self.args.eval_every
-        return self.iteration == self.args.iterations or (every > 0 and self.iteration % every == 0)
+        return self.iteration == self.args.iterations or is_due(self.iteration, self.args.eval_every)
 
     def __iter__(self) -> Iterator[int]:
         self._open()
@@ -221,13 +220,11 @@ class Run:
         signals = torch.full((), float(len(self._signals)), device=self.device)
         numbers = distributed.average(torch.stack([*tensors.values(), signals])).to("cpu", non_blocking=True)
         scalars = {name: float(value) for name, value in metrics.items() if not isinstance(value, Tensor)}
-        previous, begin, end = self._pending, self._mark, Mark(self.device)
-        self.control_steps += self._samples if control_steps is None else control_steps
-        entry = self.iteration, self.control_steps, list(tensors), numbers, scalars, begin, end, self._timings
-        self._pending = Entry(*entry)
+        previous, end = self._pending, Mark(self.device)
+        steps = self._samples if control_steps is None else control_steps
+        self._pending = Entry(self.iteration, steps, list(tensors), numbers, scalars, self._mark, end, self._timings)
         self._start_clock(end)
-        if previous is not None:  # the device works on this iteration while the one before is written
-            self._write(previous)
+        self._write(previous)  # while the device works on this one
 
     def log_evaluation(self, evaluation: Evaluation) -> None:
         """Take the evaluation of the iteration that was logged last."""
@@ -248,27 +245,25 @@ class Run:
         self._mark, self._timings = mark or Mark(self.device), []
 
     def _end_iteration(self) -> None:
-        every = self.args.save_every
-        saving = self.iteration == self.last or (every > 0 and self.iteration % every == 0)
+        saving = self.iteration == self.last or is_due(self.iteration, self.args.save_every)
         if self.device.type == "cpu" or self._evaluates() or saving or self._stopping:
-            self._flush()
+            self._write(self._pending)
+            self._pending = None
         if saving or self._stopping:
             self._save()
         if saving or self._evaluates():
             self._start_clock()
 
-    def _flush(self) -> None:
-        entry, self._pending = self._pending, None
-        if entry is not None:
-            self._write(entry)
-
-    def _write(self, entry: Entry) -> None:
-        """Write an iteration that the device has finished."""
+    def _write(self, entry: Entry | None) -> None:
+        """Wait until the device has finished an iteration, if there is one, and write it."""
+        if entry is None:
+            return
         entry.end.wait()
         ranks, (*numbers, signals) = distributed.size(), entry.numbers.tolist()
         self._stopping = self._stopping or signals > 0
-        seconds, steps = entry.end.since(entry.begin), entry.control_steps - self._written_steps
-        self.seconds, self._written_steps = self.seconds + seconds, entry.control_steps
+        seconds = entry.end.since(entry.begin)
+        self.seconds += seconds
+        self.control_steps += entry.steps
         scalars = dict(zip(entry.names, numbers, strict=True)) | entry.scalars
         if "episodes" in scalars:
             self._episodes.add(*(ranks * scalars.pop(name) for name in ("episodes", "return", "length")))
@@ -277,14 +272,14 @@ class Run:
             scalars |= self._totals
             if self._episodes.windows:
                 scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
-        scalars |= {"charts/SPS": steps / seconds, "time/total": seconds}
+        scalars |= {"charts/SPS": entry.steps / seconds, "time/total": seconds}
         scalars |= {name: end.since(begin) for name, begin, end in entry.timings}
         self._scalars = scalars
         if entry.evaluation is not None:
             self.message(f"iteration {entry.iteration}: {entry.evaluation}")
         if self._log is not None:
             with self._writing():
-                self._log.write(entry.iteration, entry.control_steps, self.seconds, scalars)
+                self._log.write(entry.iteration, self.control_steps, self.seconds, scalars)
 
     # Files and signals -----------------------------------------------------------------------------------------------
 
@@ -310,21 +305,18 @@ class Run:
             self._handlers[number] = signal.signal(number, self._receive)
         if not self.writes:
             return
+        args, directory, arguments = self.args, self.directory, dataclasses.asdict(self.args)
         with self._writing():
-            self._open_files()
+            directory.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire(directory)
+            (directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
+            if args.track:
+                import wandb
 
-    def _open_files(self) -> None:
-        self.directory.mkdir(parents=True, exist_ok=True)
-        self._lock.acquire(self.directory)
-        arguments = dataclasses.asdict(self.args)
-        (self.directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
-        if self.args.track:
-            import wandb
-
-            options = dict(name=self.directory.name, dir=self.directory, config=arguments, sync_tensorboard=True)
-            wandb.init(project="diffsim", **options)
-        start = self.directory, self.iteration, self.control_steps
-        self._log = ProgressLog(*start, arguments, self.args.iterations, self.args.quiet)
+                options = dict(name=directory.name, dir=directory, config=arguments, sync_tensorboard=True)
+                wandb.init(project="diffsim", **options)
+            start = directory, self.iteration, self.control_steps
+            self._log = ProgressLog(*start, arguments, args.iterations, args.quiet)
 
     def _receive(self, number: int, _frame: FrameType | None) -> None:
         """Stop after the present iteration; a second time at once, as Ctrl-C does elsewhere."""
@@ -349,9 +341,9 @@ class Run:
             fail(f"iteration {self.iteration}: weight {name} is not finite; {self._kept()}")
 
     def _random_numbers(self) -> torch.Generator:
-        return (
-            torch.cuda.default_generators[self.device.index] if self.device.type == "cuda" else torch.default_generator
-        )
+        if self.device.type == "cuda":
+            return torch.cuda.default_generators[self.device.index]
+        return torch.default_generator
 
     def _save(self) -> None:
         assert self._learner is not None

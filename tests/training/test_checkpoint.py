@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import math
+import operator
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,8 @@ from learners import SCRIPTS, refusal
 from torch import nn
 
 import diffsim
+import shac
+from diffsim.tasks.imitation.clip import Clip
 from diffsim.training import load_policy, parse
 from diffsim.training.checkpoint import FORMAT, load, restore, save
 
@@ -126,6 +131,58 @@ def test_weights_are_compared_before_layers_are_built(tmp_path: Path, capsys: py
     for layers in ([["Linear", 10**9, 10**9]], [["Linear", "2", 1]], [["Linear"]], [["LayerNorm", -1]]):
         torch.save(state | {"policy": state["policy"] | {"layers": layers}}, path)
         assert "its policy's weights do not fit its layers" in refusal(lambda: load_policy(path), capsys)
+
+
+@pytest.mark.parametrize(
+    "weight", [torch.zeros(1, 2).double(), torch.zeros(1, 2).to_sparse(), torch.zeros(1, 2, device="meta"), None]
+)
+def test_weights_of_another_kind_are_refused(weight: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "checkpoint.pt"
+    save(path, "shac", Tiny(), STATE)
+    state = torch.load(path)
+    state["policy"]["weights"]["0.weight"] = weight
+    torch.save(state, path)
+    assert f"{path} is not a whole checkpoint: " in refusal(lambda: load_policy(path), capsys)
+
+
+@pytest.mark.parametrize(
+    ("places", "value"),
+    [
+        ("args critic_hidden", (b"x",)),
+        ("args substeps", torch.Size([3])),
+        ("args target_alpha", None),
+        ("args initial_log_std", 0),
+        ("args integrator", "explicit"),
+        ("args check", 1),
+        ("ranks 0 env", None),
+        ("ranks 0 env qpos", math.nan),
+        ("ranks 0 env qvel", torch.zeros(0)),
+        ("ranks 0 env task", "ant"),
+        ("ranks 0 env generator", math.inf),
+        ("modules critic_optimizer adam 0", []),
+        ("modules critic_optimizer adam 0 exp_avg", None),
+        ("modules critic_optimizer adam 0 exp_avg_sq", torch.zeros(3)),
+        ("modules critic_optimizer skipped", torch.tensor(math.inf)),
+        ("modules critic_optimizer", None),
+    ],
+)
+def test_what_a_run_cannot_resume_is_one_line(
+    places: str, value: Any, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = torch.load(tiny_run / "checkpoint.pt")
+    *path, last = (int(place) if place.isdigit() else place for place in places.split())
+    functools.reduce(operator.getitem, path, state)[last] = value
+    torch.save(state, damaged := tmp_path / "checkpoint.pt")
+    refusal(lambda: shac.main(["--resume", str(damaged), "--iterations", "3", "--quiet"]), capsys)
+
+
+def test_a_damaged_clip_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, qpos = tmp_path / "checkpoint.pt", torch.zeros(9, 30, dtype=torch.float64)
+    for wrong in (dict(qpos=None), dict(loop=1.0), dict(qpos=qpos.float()), dict(qpos=qpos / 0), dict(name="\x1b")):
+        clip = Clip("walk", qpos, True)
+        vars(clip).update(wrong)
+        save(path, "shac", Tiny(), STATE | {"args": {"env": "humanoid_imitation", "clip": clip}})
+        assert f"{path} is not a whole checkpoint: " in refusal(lambda: load(path), capsys)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

@@ -16,9 +16,9 @@ from learners import ROOT, SCRIPTS, assert_same, refusal, run
 import shac
 from diffsim.env import DiffEnv
 
-# Eight windows of cartpole: the last one holds time-outs and resets.
+# Three windows of cartpole: the last one holds time-outs and resets.
 SETTING = (
-    "--env cartpole --num-envs 4 --horizon 32 --iterations 8 --eval-every 0 --eval-episodes 1 --quiet --threads 1 "
+    "--env cartpole --num-envs 4 --horizon 84 --iterations 3 --eval-every 0 --eval-episodes 1 --quiet --threads 1 "
     "--device cpu"
 ).split()
 
@@ -58,7 +58,7 @@ def test_ranks_share_weights_and_statistics_and_have_states_of_their_own(directo
     assert_same(first, second)
     assert_same(first, {key: checkpoint[key] for key in first})
     assert checkpoint["episodes"][0][0] == 4  # two of each rank
-    (one, other), samples = checkpoint["ranks"], 8 * 32 * 4
+    (one, other), samples = checkpoint["ranks"], 3 * 84 * 4
     assert not torch.equal(one["env"]["qpos"], other["env"]["qpos"]) and not torch.equal(one["rng"], other["rng"])
     assert len(one["env"]["qpos"]) == 2
     actor = first["modules"]["actor_critic" if name == "ppo_baseline" else "actor"]

@@ -22,7 +22,7 @@ import bptt
 import shac
 from diffsim.env import DiffEnv
 from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, evaluate, parse
-from diffsim.training.progress import COLUMNS
+from diffsim.training.directory import COLUMNS
 
 # Iterations of a few milliseconds.
 TINY = "--env cartpole --num-envs 2 --horizon 8 --eval-episodes 1 --device cpu".split()

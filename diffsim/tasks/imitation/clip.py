@@ -7,6 +7,7 @@ import zipfile
 import zlib
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -41,6 +42,15 @@ class Clip:
     """
 
     def __init__(self, name: str, qpos: Tensor, loop: bool) -> None:
+        self.name, self.qpos, self.loop = name, qpos, loop
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """From a checkpoint. Raises a ValueError where it is damaged."""
+        name, qpos, loop = (state.get(key) for key in ("name", "qpos", "loop"))
+        if not (isinstance(name, str) and name.isprintable() and isinstance(loop, bool) and isinstance(qpos, Tensor)):
+            raise ValueError("a clip without its name, its qpos or whether it is a loop")
+        if qpos.dtype != torch.float64 or qpos.ndim != 2 or len(qpos) < SHORTEST or not bool(qpos.isfinite().all()):
+            raise ValueError(f"clip {name!r}: its qpos are no motion")
         self.name, self.qpos, self.loop = name, qpos, loop
 
     def __str__(self) -> str:

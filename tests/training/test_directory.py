@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from diffsim.training.progress import COLUMNS, EpisodeStatistics, ProgressFile, ProgressLog, column
+from diffsim.training.directory import COLUMNS, EpisodeStatistics, ProgressFile, ProgressLog, column
 
 
 def read(path: Path) -> list[dict[str, str]]:
