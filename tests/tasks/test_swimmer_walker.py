@@ -21,6 +21,7 @@ REAL = torch.float64
 def test_scenes(name: str, links: int, motors: int, mass: float) -> None:
     scene, task = task_scene(name), TASKS[name]()
     assert (scene.nv, scene.nu, scene.floating) == (links, motors, False)
+    assert task.integration("default") == Integration("semi_implicit", task.substeps)
     assert ("drag" in scene.features) == (name == "swimmer") and ("contact" in scene.features) == (name == "walker")
     assert scene.mj_model.body_mass.sum() == pytest.approx(mass, rel=1e-3)
     qpos, qvel = task.reset(torch.rand(4, task.num_random))
