@@ -27,10 +27,12 @@ import tyro
 from numpy.typing import NDArray
 
 from diffsim import DiffEnv
-from diffsim.training import SavedPolicy, command, evaluate, fail, load_policy, make_policy_env
+from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED
 from diffsim.view import render, web
 from diffsim.view.screen import Window
+
+DRAWN = "control_steps", "seconds", "return", "eval_return"  # columns of progress.csv
 
 
 @dataclass
@@ -84,18 +86,19 @@ class Args:
 def main(argv: Sequence[str] | None = None) -> None:
     args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
     args.check()
+    torch.set_num_threads(1)  # operations this small gain nothing from more
     try:
         if args.plot:
             plot([path if path.is_dir() else path.parent for path in args.paths], args.plot)
         if args.video or args.web or args.viewer:
-            path = args.paths[0]
-            show(load_policy(path / "checkpoint.pt" if path.is_dir() else path), args)
+            show(args)
     except (OSError, RuntimeError, ValueError) as error:
         fail(error)
 
 
-def show(saved: SavedPolicy, args: Args) -> None:
-    torch.set_num_threads(1)  # operations this small gain nothing from more
+def show(args: Args) -> None:
+    path = args.paths[0]
+    saved = load_policy(path / "checkpoint.pt" if path.is_dir() else path)
     changes: dict[str, Any] = {} if args.substeps is None else {"substeps": args.substeps}
     task, name = saved.args["env"], f"{saved.script}.py, iteration {saved.iteration}"
     if args.viewer:
@@ -129,15 +132,8 @@ def play(env: DiffEnv, policy: torch.nn.Module, seed: int) -> None:
             window.show(env.qpos[0], env.qvel[0], action[0])
 
 
-# The curves -----------------------------------------------------------------------------------------------------------
-
-
 def plot(directories: Sequence[Path], output: Path) -> None:
-    """Return against control steps and seconds: a line for training, dots for evaluations of the policy alone.
-
-    Raises:
-        OSError, RuntimeError, ValueError: what is missing to draw or to write.
-    """
+    """Return against control steps and seconds: a line for training, dots for evaluations of the policy alone."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -145,10 +141,10 @@ def plot(directories: Sequence[Path], output: Path) -> None:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     for number, directory in enumerate(directories):
-        columns = read_progress(directory / "progress.csv")
-        for axis, x in zip(axes, ("control_steps", "seconds"), strict=True):
-            axis.plot(columns[x], columns["return"], color=f"C{number}", label=directory.resolve().name)
-            axis.plot(columns[x], columns["eval_return"], "o", color=f"C{number}", markersize=4)
+        progress = read_progress(directory / "progress.csv")
+        for axis, x in zip(axes, DRAWN[:2], strict=True):
+            axis.plot(progress[x], progress["return"], color=f"C{number}", label=directory.resolve().name)
+            axis.plot(progress[x], progress["eval_return"], "o", color=f"C{number}", markersize=4)
             axis.set_xlabel(x.replace("_", " "))
             axis.grid(alpha=0.3)
             axis.spines[["top", "right"]].set_visible(False)
@@ -163,12 +159,11 @@ def read_progress(path: Path) -> dict[str, NDArray[np.float64]]:
     """The columns that are drawn, NaN where a row has no value."""
     if not path.is_file():
         fail(f"no such file: {path}; --plot takes directories of runs")
-    names = ("control_steps", "seconds", "return", "eval_return")
     with path.open(newline="") as file:
-        rows = [[float(row.get(name) or "nan") for name in names] for row in csv.DictReader(file)]
+        rows = [*csv.DictReader(file)]
     if not rows:
         fail(f"{path} holds no iteration yet")
-    return dict(zip(names, np.array(rows).T, strict=True))
+    return {name: np.array([float(row.get(name) or "nan") for row in rows]) for name in DRAWN}
 
 
 if __name__ == "__main__":

@@ -99,11 +99,11 @@ def collect(args: Args, learner: str, env: str) -> None:
 
 
 def curves(args: Args, learner: str, env: str) -> list[Curve]:
-    """The curve of each seed from this machine's csv file, else from another machine's, without the seconds."""
+    """The curve of each seed from this machine's csv file, else from another one's (a GPU's first), without seconds."""
     seeds: dict[str, list[dict[str, str]]] = {}
     rows = args.read(name := f"{learner}_{env}")
     if not rows and args.directory.parent == common.RESULTS:
-        paths = sorted(common.RESULTS.glob(f"*/{name}.csv"))
+        paths = sorted(common.RESULTS.glob(f"*/{name}.csv"), key=lambda path: (path.parent.name == "cpu", path))
         rows = [row | {"seconds": ""} for path in paths[:1] for row in read_csv(path)]
     for row in rows:
         seeds.setdefault(row["seed"], []).append(row)

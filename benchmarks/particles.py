@@ -3,9 +3,9 @@
     python benchmarks/particles.py                       a bandit with two equal peaks; ten minutes of a CPU
     python benchmarks/particles.py --run <directory>     a run of pfpn.py instead, trained with --log-particles
 
-Writes bandit.csv (each policy's actions near the peaks), bandit_density.csv and particles.csv (locations and weights
-of the first seed's particles, or of the run's), a picture of each, and with --update-results the table of docs/pfpn.md.
-PPO trains all policies with one setting. The Gaussian's standard deviation begins at 0.37.
+Writes bandit.csv (each policy's actions near the peaks), particles.csv and particles.png (locations and weights of the
+first seed's particles, or of the run's), and with --update-results the table of docs/pfpn.md. PPO trains all
+policies with one setting. The Gaussian's standard deviation begins at 0.37.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PEAKS, NEAR = (-0.25, 0.75), 0.15
 POLICIES = ("pfpn", "gaussian", "gmm", "discrete")
 SETTING = "--env ant --device cpu --horizon 1 --hidden 1 --minibatch-size 256 --epochs 4 --lr 3e-3 --log-particles 0"
 CASES = {"0": (150, 500), "0.2": (150, 500)}  # entropy's weight: iterations of 256 actions each
-SAMPLES, BINS = 20_000, 50  # actions of a trained policy, and of their histogram
+SAMPLES = 20_000  # actions of a trained policy
 POINTS = 60  # iterations kept of particles.csv
 CASE = ("policy", "entropy's weight", "iterations")
 Rows = list[dict[str, object]]
@@ -96,7 +96,7 @@ def paths(log: Sequence[dict[str, str]]) -> Rows:
 
 
 def measure(args: Args) -> None:
-    rows, densities = Rows(), Rows()
+    rows = Rows()
     for policy, (entropy, marks) in product(POLICIES, CASES.items()):
         runs = [learn(policy, entropy, seed) for seed in args.seeds]
         if (policy, entropy) == (POLICIES[0], max(CASES)):
@@ -104,10 +104,6 @@ def measure(args: Args) -> None:
         for mark in marks:
             case = dict[str, object](zip(CASE, (policy, entropy, mark), strict=True))
             each = [drawn[mark] for drawn, _ in runs]
-            for seed, x in zip(args.seeds, each, strict=True):
-                heights, edges = np.histogram(x.numpy(), BINS, (-1, 1), density=True)
-                for place, height in zip((edges[:-1] + edges[1:]) / 2, heights, strict=True):
-                    densities.append(case | {"seed": seed, "action": f"{place:.2f}", "density": f"{height:.3f}"})
             near = [[((x - peak).abs() < NEAR).double().mean().item() for x in each] for peak in PEAKS]
             both = sum(min(pair) > 0.1 for pair in zip(*near, strict=True))
             shares = {f"near {peak}": " ".join(f"{x:.2f}" for x in own) for peak, own in zip(PEAKS, near, strict=True)}
@@ -115,7 +111,6 @@ def measure(args: Args) -> None:
             rows.append(case | shares | {"both": f"{both} of {len(each)}", "mean reward": f"{mean:.2f}"})
             print("  " + ", ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
     args.write("bandit", rows)
-    args.write("bandit_density", densities)
 
 
 def table(rows: Sequence[dict[str, str]]) -> str:
@@ -127,29 +122,19 @@ def table(rows: Sequence[dict[str, str]]) -> str:
     return markdown(list(found.values()))
 
 
-def group(rows: Sequence[dict[str, str]], *names: str) -> dict[str, list[dict[str, str]]]:
-    """The rows by their values in some columns."""
-    found: dict[str, list[dict[str, str]]] = {}
-    for row in rows:
-        found.setdefault(", ".join(row[name] for name in names), []).append(row)
-    return found
-
-
-def panel(rows: Sequence[dict[str, str]], each: str, x: str, y: str, title: str) -> Panel:
-    """A line for each value of a column."""
-    points = [np.array([(float(row[x]), float(row[y])) for row in own]).T for own in group(rows, each).values()]
-    return Panel([Line(own[0], own[1], f"C{k % 10}-", width=0.8) for k, own in enumerate(points)], title, x, y)
-
-
 def draw(args: Args) -> None:
-    cases, actions = group(args.read("bandit_density"), *CASE), group(args.read("particles"), "action")
-    ends = [f"{entropy}, {marks[k]}" for k, (entropy, marks) in zip((0, -1), CASES.items(), strict=True)]
-    shown = [[f"{policy}, {end}" for policy in POLICIES] for end in ends]
-    densities = [[panel(cases.get(name, ()), "seed", "action", "density", name) for name in row] for row in shown]
-    if cases:
-        plot(args.picture("bandit"), densities)
-    places = ("location", "weight")
-    grid = [[panel(own, "particle", "iteration", y, f"action {k}") for k, own in actions.items()] for y in places]
+    """A line for each particle, against iterations: its location and its weight."""
+    actions: dict[str, dict[str, list[dict[str, str]]]] = {}
+    for row in args.read("particles"):
+        actions.setdefault(row["action"], {}).setdefault(row["particle"], []).append(row)
+    grid = list[list[Panel]]()
+    for y in ("location", "weight"):
+        panels = list[Panel]()
+        for action, particles in actions.items():
+            points = [np.array([(float(row["iteration"]), float(row[y])) for row in own]) for own in particles.values()]
+            lines = [Line(x[:, 0], x[:, 1], f"C{k % 10}-", width=0.8) for k, x in enumerate(points)]
+            panels.append(Panel(lines, f"action {action}", "iteration", y))
+        grid.append(panels)
     plot(args.picture("particles"), grid)
 
 
@@ -162,8 +147,7 @@ def main(args: Args) -> None:
     elif not args.draw_only:
         measure(args)
     draw(args)
-    picture = f"![Densities of the actions]({args.link('bandit')})"
-    args.publish("bandit", f"{table(args.read('bandit'))}\n{picture}\n", "pfpn.md")
+    args.publish("bandit", table(args.read("bandit")), "pfpn.md")
 
 
 if __name__ == "__main__":

@@ -1,26 +1,21 @@
-"""What is installed and what is missing; a demonstration; small copies of policies.
-
-python -m diffsim                                  tasks, devices, versions, and hints about usual troubles
-python -m diffsim demo [TASK] [--output FILE]      film a policy that comes with the package; needs no display
-python -m diffsim check ROBOT.xml                  what of an MJCF file is used, approximated and refused
-python -m diffsim export CHECKPOINT OUTPUT         the policy of a checkpoint alone, in a small file
-"""
+"""What is installed and what is missing, without a command: tasks, devices, versions, hints about usual troubles."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import shutil
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
 
 import torch
+import tyro
 import warp as wp
+from tyro.conf import Positional
 
 from diffsim import TASKS, SceneError, load_scene, startup
 from diffsim.robot.report import report as report_robot
@@ -36,25 +31,11 @@ DEMO_SECONDS = 4.0  # of it
 @command
 def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(prog="python -m diffsim", description=__doc__, formatter_class=raw)
-    commands = parser.add_subparsers(dest="command", metavar="{demo,check,export}")
-    film = commands.add_parser("demo", help="film a policy that comes with the package")
-    film.add_argument("task", nargs="?", default="ant", help="which task (default: ant)")
-    film.add_argument("--output", type=Path, default=Path("demo.mp4"), help=".mp4 or .gif (default: demo.mp4)")
-    robot = commands.add_parser("check", help="say what of an MJCF file is used, approximated and refused")
-    robot.add_argument("robot", type=Path)
-    copy = commands.add_parser("export", help="write the policy of a checkpoint alone")
-    copy.add_argument("checkpoint", type=Path)
-    copy.add_argument("output", type=Path)
-    args = parser.parse_args(argv)
+    argv = sys.argv[1:] if argv is None else argv
+    commands: dict[str, Callable[..., object]] = {"demo": demo, "check": check, "export": export}
     try:
-        if args.command == "demo":
-            demo(args.task, args.output)
-        elif args.command == "check":
-            check(args.robot)
-        elif args.command == "export":
-            export(args.checkpoint, args.output)
+        if argv:
+            tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="python -m diffsim", description=__doc__)
         else:
             print(report())
     except BrokenPipeError:
@@ -63,8 +44,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         fail(error)
 
 
-def demo(task: str, output: Path) -> None:
-    """Film the task's policy; the kernel of the gradient is not compiled, for nothing is differentiated."""
+def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None:
+    """Film a policy that comes with the package, as .mp4 or .gif; needs no display."""
     if task not in TASKS:
         fail(f"unknown task {task!r}: choose from {', '.join(TASKS)}")
     policy = POLICIES / f"{task}.pt"
@@ -80,8 +61,8 @@ def demo(task: str, output: Path) -> None:
     print(f"video: {evaluation.save_video(output, DEMO_SECONDS)}")
 
 
-def check(robot: Path) -> None:
-    """Print what the simulator makes of an MJCF file; exit code 1 if it refuses the file."""
+def check(robot: Positional[Path]) -> None:
+    """Say what of an MJCF file is used, approximated and refused; exit code 1 if it is refused."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the report has them all
@@ -91,12 +72,11 @@ def check(robot: Path) -> None:
         sys.exit(1)
 
 
-def export(checkpoint: Path, output: Path) -> None:
-    """Write the policy of a checkpoint alone; an existing file is replaced, anything else is refused."""
+def export(checkpoint: Positional[Path], output: Positional[Path]) -> None:
+    """Write the policy of a checkpoint alone, in a small file."""
     with render.whole_file(output) as part:
         export_policy(checkpoint, part)
-    saved = load_policy(output)
-    size = output.stat().st_size / 1e3
+    saved, size = load_policy(output), output.stat().st_size / 1e3
     print(f"{output}: {saved.args['env']}, {saved.script}.py, iteration {saved.iteration}, {size:.0f} kB")
 
 
@@ -121,10 +101,8 @@ def describe_tasks() -> list[str]:
 
 
 def describe_machine() -> dict[str, str]:
-    devices = [f"cpu, {available_cores()} cores"]
-    for k in range(torch.cuda.device_count()):
-        properties = torch.cuda.get_device_properties(k)
-        devices.append(f"cuda:{k}, {properties.name}, {properties.total_memory / 2**30:.0f} GiB")
+    gpus = [torch.cuda.get_device_properties(k) for k in range(torch.cuda.device_count())]
+    devices = [f"cuda:{k}, {gpu.name}, {gpu.total_memory / 2**30:.0f} GiB" for k, gpu in enumerate(gpus)]
     packages = ("torch", "warp-lang", "mujoco", "gymnasium", "numpy")
     try:
         drawing = render.check_opengl()
@@ -133,7 +111,7 @@ def describe_machine() -> dict[str, str]:
     return {
         "diffsim": f"{_version('diffsim')}, {files('diffsim')}",
         "versions": ", ".join([f"python {platform.python_version()}", *(f"{p} {_version(p)}" for p in packages)]),
-        "devices": "; ".join(devices),
+        "devices": "; ".join([f"cpu, {available_cores()} cores", *devices]),
         "kernels": _kernel_cache(),
         "OpenGL": drawing,
     }
@@ -151,9 +129,8 @@ def _kernel_cache() -> str:
         folder = startup.check_kernel_cache()
     except ValueError:
         return "none"
-    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
-    kernels = sum(1 for path in folder.iterdir() if path.is_dir())
-    return f"{folder}, {kernels} kernels, {sum(sizes) / 1e6:.0f} MB"
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return f"{folder}, {sum(path.is_dir() for path in folder.iterdir())} kernels, {size / 1e6:.0f} MB"
 
 
 def find_troubles() -> list[str]:

@@ -29,8 +29,8 @@ def incline(degrees: float, start: float = 1.0) -> Array:
     Raises:
         ValueError: a slope that is not within -90 and 90 degrees, or start not finite.
     """
-    slope = _slope("degrees", degrees)
-    return _profile(start, [1.0], [slope])
+    _check("start", start, "be finite")
+    return np.array([[start - 1.0, 0.0], [start, 0.0], [start + 1.0, _slope(degrees)]])
 
 
 def step(height: float, start: float = 1.0) -> Array:
@@ -39,11 +39,9 @@ def step(height: float, start: float = 1.0) -> Array:
     Raises:
         ValueError: an argument that is not finite, or no height.
     """
-    if not _finite(height) or height == 0:
-        raise ValueError(f"height is {height!r}, must be finite and not 0")
-    profile = _profile(start, [0.0, 1.0], [0.0, 0.0])
-    profile[2:, 1] = height
-    return profile
+    _check("height", height, "be finite and not 0", but=0)
+    _check("start", start, "be finite")
+    return np.array([[start - 1.0, 0.0], [start, 0.0], [start, height], [start + 1.0, height]], np.float64)
 
 
 def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float = 50.0, start: float = 1.0) -> Array:
@@ -62,15 +60,17 @@ def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float 
     """
     if not is_real(seed) or not float(seed).is_integer() or seed < 0:
         raise ValueError(f"seed is {seed!r}, must be an integer of at least 0")
-    for name, value in (("segment", segment), ("length", length)):
-        if not _finite(value) or value <= 0:
-            raise ValueError(f"{name} is {value!r}, must be positive and finite")
-    steepest = abs(_slope("degrees", degrees))
+    _check("segment", segment, "be positive and finite", above=0)
+    _check("length", length, "be positive and finite", above=0)
+    _check("start", start, "be finite")
+    steepest = abs(_slope(degrees))
     if not 0.5 < length / segment <= MOST_SEGMENTS:
         raise ValueError(f"length is {length!r}, must be 1 to {MOST_SEGMENTS} segments of {segment!r}")
     count = round(length / segment)
     angles = np.random.default_rng(int(seed)).uniform(-1.0, 1.0, count) * math.atan(steepest)
-    return _profile(start, [segment] * count + [1.0], [*np.tan(angles), 0.0])
+    x = [-1.0, 0.0, *np.cumsum([segment] * count + [1.0])]
+    z = [0.0, 0.0, *np.cumsum([*(segment * np.tan(angles)), 0.0])]
+    return np.stack([start + np.array(x), z], 1)
 
 
 class Elevation:
@@ -144,21 +144,13 @@ def root(scene: Scene) -> tuple[float, Array, Array]:
     return float(place[0]), along, up
 
 
-def _profile(start: float, runs: list[float], slopes: list[float]) -> Array:
-    """Level before x = start, where z = 0; then segments of these lengths along x and these slopes."""
-    if not _finite(start):
-        raise ValueError(f"start is {start!r}, must be finite")
-    rises = np.multiply(runs, slopes)
-    x, z = (np.concatenate([[0.0, 0.0], np.cumsum(steps)]) for steps in (runs, rises))
-    x[0] = -1.0
-    return np.stack([start + x, z], 1)
-
-
-def _slope(name: str, degrees: float) -> float:
-    if not _finite(degrees) or not -90 < degrees < 90:
-        raise ValueError(f"{name} is {degrees!r}, must lie between -90 and 90")
+def _slope(degrees: float) -> float:
+    _check("degrees", degrees, "lie between -90 and 90", above=-90, below=90)
     return math.tan(math.radians(degrees))
 
 
-def _finite(value: object) -> bool:
-    return is_real(value) and math.isfinite(value)  # type: ignore[arg-type]
+def _check(
+    name: str, value: object, wanted: str, above: float = -math.inf, below: float = math.inf, but: float = math.nan
+) -> None:
+    if not is_real(value) or not above < value < below or value == but:  # type: ignore[operator]
+        raise ValueError(f"{name} is {value!r}, must {wanted}")

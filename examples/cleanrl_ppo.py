@@ -5,10 +5,8 @@
 
 The script makes `gym.vector.SyncVectorEnv` of functions that make and wrap one environment each, for gymnasium 0.29.
 This file runs it with `make_envs` in that place: all environments as one batch, under the same wrappers, with the infos
-of gymnasium 0.29. To edit a copy of the script, write `envs = make_envs(args.env_id, args.num_envs, args.gamma)` there.
+of gymnasium 0.29. In a copy of the script, write `envs = make_envs(args.env_id, args.num_envs, args.gamma)` instead.
 """
-
-from __future__ import annotations
 
 import argparse
 import runpy
@@ -43,14 +41,10 @@ class CleanRLVectorEnv(VectorWrapper):
 
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[np.float32], Any, Any, Any, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.env.step(actions)
-        old_info = {}
-        if "episode" in info:
-            columns = info["episode"]
-            episodes = [{key: column[i] for key, column in columns.items()} for i in range(self.num_envs)]
-            old_info["final_info"] = [
-                {"episode": episode} if done else None for episode, done in zip(episodes, info["_episode"], strict=True)
-            ]
-        return self.normalize(obs), reward, terminated, truncated, old_info
+        episodes: list[Any] = [None] * self.num_envs
+        for i in np.flatnonzero(info.get("_episode", ())):
+            episodes[i] = {"episode": {key: column[i] for key, column in info["episode"].items()}}
+        return self.normalize(obs), reward, terminated, truncated, {"final_info": episodes} if any(episodes) else {}
 
 
 def make_envs(env_id: str, num_envs: int, gamma: float) -> VectorEnv[Any, Any, Any]:

@@ -6,8 +6,6 @@ The loss is the squared distance to the goal over two seconds, and its gradient 
 of the simulation. No reward, no critic and no exploration noise are needed.
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import torch

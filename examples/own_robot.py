@@ -1,16 +1,12 @@
-"""A robot and a task of your own, trained by SHAC: everything that is needed, from the MJCF to the policy.
+"""A robot and a task of your own, trained by SHAC: all that is needed beside own_robot.xml.
 
     python examples/own_robot.py
 
-The robot is a bar on two legs in the plane y = 0. Its task is to walk forward. The algorithm is that of shac.py.
+The robot is a bar on two legs in the plane y = 0. It learns to walk forward, by the algorithm of shac.py.
 """
-
-from __future__ import annotations
 
 import sys
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
 import torch
 import tyro
@@ -22,36 +18,6 @@ from diffsim.training import Evaluation, evaluate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from shac import SHAC, Args  # noqa: E402
-
-MJCF = """
-<mujoco model="walker_bar">
-  <custom><numeric name="mu" data="0.9"/></custom>
-  <default>
-    <geom type="capsule" size=".05" density="1000" contype="1" conaffinity="0"/>
-    <joint axis="0 -1 0" damping="3" armature=".1"/>
-    <motor ctrlrange="-1 1" gear="60"/>
-  </default>
-  <worldbody>
-    <geom name="ground" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
-    <body name="bar" pos="0 0 .6">
-      <camera name="track" mode="trackcom" pos="0 -2.5 .2" xyaxes="1 0 0 0 .12 1"/>
-      <joint name="x" type="slide" axis="1 0 0" damping="0" armature="0"/>
-      <joint name="z" type="slide" axis="0 0 1" damping="0" armature="0"/>
-      <joint name="pitch" axis="0 1 0" damping="0" armature="0"/>
-      <geom fromto="-.4 0 0 .4 0 0"/>
-      <body name="hind" pos="-.4 0 0">
-        <joint name="hind" range="-60 60"/>
-        <geom fromto="0 0 0 0 0 -.5"/>
-      </body>
-      <body name="fore" pos=".4 0 0">
-        <joint name="fore" range="-60 60"/>
-        <geom fromto="0 0 0 0 0 -.5"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="hind"/><motor joint="fore"/></actuator>
-</mujoco>
-"""
 
 
 class WalkForward(Task):
@@ -78,13 +44,11 @@ def train(iterations: int = 150, num_envs: int = 64, seed: int = 1) -> list[Eval
     """Evaluations of the policy without noise, every 25 iterations."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    with TemporaryDirectory() as folder:
-        (file := Path(folder) / "robot.xml").write_text(MJCF)
-        scene = diffsim.load_scene(file)
-    networks: dict[str, Any] = dict(actor_hidden=(64, 32), critic_hidden=(64, 64), critic_lr=2e-3, target_alpha=0.2)
-    args = Args(iterations=iterations, num_envs=num_envs, **networks)
-    env = diffsim.DiffEnv(WalkForward(), scene, num_envs, seed=seed, horizon=args.horizon)
+    scene = diffsim.load_scene(Path(__file__).with_suffix(".xml"))
+    env = diffsim.DiffEnv(WalkForward(), scene, num_envs, seed=seed, horizon=Args.horizon)
     eval_env, evaluations = diffsim.DiffEnv(WalkForward(), scene, num_envs=16), []
+    args = Args(iterations=iterations, num_envs=num_envs, actor_hidden=(64, 32), critic_hidden=(64, 64))
+    args.critic_lr, args.target_alpha = 2e-3, 0.2
     shac = SHAC(args, env)
     for iteration in range(iterations):
         if iteration % 25 == 0:

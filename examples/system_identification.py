@@ -2,13 +2,10 @@
 
     python examples/system_identification.py
 
-`Simulator.factors` gives gradients in constants of contact and limits, all masses and all motors, but not in the mass
-of one link or the damping of joints. Three unknowns do not need gradients: Gauss-Newton takes a finite difference per
-unknown, which is one more simulator of the same batch. "Measured" is another simulation with constants that the fit
-does not see, plus noise.
+`Simulator.factors` has no gradient in the mass of one link or the damping of joints. Three unknowns do not need any:
+Gauss-Newton takes a finite difference per unknown, which is one more simulator of the same batch. "Measured" is another
+simulation with constants that the fit does not see, plus noise.
 """
-
-from __future__ import annotations
 
 import dataclasses
 from importlib.resources import files

@@ -5,8 +5,6 @@
 Several random guesses are improved at once. One backward pass gives each the gradient of its cost in all its commands.
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import torch

@@ -49,7 +49,7 @@ def test_trajectory_optimisation() -> None:
 
 
 def test_learned_controller() -> None:
-    distances = load("learned_controller").train(num_envs=16, iterations=50)
+    distances = load("learned_controller").train(num_envs=8, iterations=35)
     assert np.mean(distances[-5:]) < 0.3 * np.mean(distances[:5])
 
 

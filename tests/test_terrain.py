@@ -11,7 +11,7 @@ import reference
 import torch
 from scenes import BALL, PENDULUM, acting_states, parse, run, task_scene, unit
 from test_accuracy import source
-from test_gradient import check_gradients, gradients
+from test_gradient import check_gradients
 
 import diffsim
 from diffsim.planning.system import System
@@ -50,7 +50,7 @@ def pressed(scene: Scene, x: np.ndarray, rng: np.random.Generator):
 
 def everywhere(rng: np.random.Generator) -> np.ndarray:
     """Places on the hills, most of them near a vertex."""
-    return np.concatenate([rng.uniform(-1.5, 3.5, 16), *(rng.uniform(x - 0.05, x + 0.05, 6) for x in HILLS[:, 0])])
+    return np.concatenate([rng.uniform(-1.5, 3.5, 8), *(rng.uniform(x - 0.05, x + 0.05, 3) for x in HILLS[:, 0])])
 
 
 def hopping(vertices: np.ndarray, count: int, rng: np.random.Generator):
@@ -81,13 +81,13 @@ def test_steps_of_a_ball_are_the_references(ball, rng):
     runs = np.diff(HILLS, axis=0)
     slopes = np.stack([-runs[:, 1], runs[:, 0]], 1) / np.linalg.norm(runs, axis=1, keepdims=True)
     between = ~np.isclose(normals[:, None], slopes, atol=1e-6).all(2).any(1)
-    assert between.sum() > 5  # in valleys and on ridges
+    assert between.sum() > 3  # in valleys and on ridges
 
 
 def test_steps_of_the_hopper_are_the_references(rng):
     """Each on a profile of its own."""
-    profiles = np.stack([HILLS + [0.1 * k, 0.0] for k in range(16)])
-    scene, states = hopping(HILLS, 16, rng)
+    profiles = np.stack([HILLS + [0.1 * k, 0.0] for k in range(8)])
+    scene, states = hopping(HILLS, 8, rng)
     check_steps(scene.with_terrain(profiles), states, Integration(substeps=8))
 
 
@@ -111,14 +111,11 @@ def test_gradients_across_a_ridge_and_a_valley_are_those_of_differences(ball, rn
     check_gradients(ball, states, rng, integration=IMPLICIT)
 
 
-@pytest.mark.parametrize("vertices", [PLANE, np.stack([np.linspace(-9, 9, 40), np.zeros(40)], 1)])
-def test_a_level_terrain_is_the_plane(vertices, rng):
-    flat = parse(BALL)
-    states = pressed(flat.with_terrain(PLANE), np.linspace(-3, 3, 32), rng)
-    w = [np.arange(1.0, 8.0), np.arange(1.0, 7.0)]
-    ends = [run(scene, *states, 4, integration=IMPLICIT) for scene in (flat, flat.with_terrain(vertices))]
-    slopes = [gradients(scene, states, w, integration=IMPLICIT) for scene in (flat, flat.with_terrain(vertices))]
-    for value, expected in zip((*ends[1], *slopes[1]), (*ends[0], *slopes[0]), strict=True):
+def test_a_level_terrain_is_the_plane(rng):
+    flat, vertices = parse(BALL), np.stack([np.linspace(-9, 9, 40), np.zeros(40)], 1)
+    states = pressed(flat.with_terrain(PLANE), np.linspace(-3, 3, 16), rng)
+    plane, level = (run(scene, *states, 4, integration=IMPLICIT) for scene in (flat, flat.with_terrain(vertices)))
+    for value, expected in zip(level, plane, strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-11, atol=1e-11)
 
 

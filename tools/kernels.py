@@ -6,6 +6,7 @@ python tools/kernels.py ant --num-envs 1024        what follows the task goes to
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections import defaultdict
 from collections.abc import Callable
@@ -16,7 +17,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 import diffsim
-from diffsim.training import fail, graph
+from diffsim.training import graph
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import shac  # noqa: E402
@@ -28,12 +29,10 @@ capture = graph.capture
 
 def profiled(function: Half, device: torch.device, env: diffsim.DiffEnv | None) -> Half:
     """graph.capture, whose twelfth call prints a table of its kernels."""
-    replay, calls = capture(function, device, env), 0
+    replay, calls = capture(function, device, env), itertools.count(1)
 
     def call() -> dict[str, torch.Tensor]:
-        nonlocal calls
-        calls += 1
-        if calls != ITERATION:
+        if next(calls) != ITERATION:
             return replay()
         with profile(activities=[ProfilerActivity.CUDA]) as record:
             result = replay()
@@ -52,10 +51,6 @@ def profiled(function: Half, device: torch.device, env: diffsim.DiffEnv | None) 
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2 or sys.argv[1] not in diffsim.TASKS:
-        fail(f"give a task: {', '.join(diffsim.TASKS)}")
-    if not torch.cuda.is_available():
-        fail("PyTorch sees no CUDA GPU here, and on a CPU there are no graphs")
     graph.capture = profiled  # type: ignore[assignment]
     stop = ["--stop-after", str(LAST), "--eval-every", "0", "--quiet", "--run-dir", mkdtemp()]
-    shac.main(["--env", sys.argv[1], "--device", "cuda", *stop, *sys.argv[2:]])
+    shac.main(["--env", *(sys.argv[1:] or ["hopper"]), "--device", "cuda", *stop])

@@ -24,27 +24,26 @@ SHORTEST = 0.3  # s
 
 def cycle(qpos: Tensor, shortest: int, longest: int) -> tuple[Tensor, float]:
     """Frames (P + 1, nq) of qpos (T, nq) whose ends are closest, and how far apart these are (RMS)."""
-    best, found = float("inf"), (0, 0)
+    best = float("inf"), 0, 0
     for period in range(shortest, longest + 1):
         error = tangent(qpos[:-period], qpos[period:])[:, 2:].square().mean(-1)
         error = error.unfold(0, 3, 1).mean(-1)  # the frames before and after, too: the velocities
-        if (least := error.min().item()) < best:
-            best, found = least, (int(error.argmin()) + 1, period)
-    start, period = found
-    return qpos[start : start + period + 1], best**0.5
+        best = min(best, (error.min().item(), int(error.argmin()) + 1, period))
+    gap, start, period = best
+    return qpos[start : start + period + 1], gap**0.5
 
 
 def close(qpos: Tensor) -> Tensor:
     """The last frame made equal to the first but in x, the difference spread evenly over the cycle."""
-    share = torch.linspace(0.0, 1.0, len(qpos), dtype=qpos.dtype).unsqueeze(1)
     gap = qpos[:1] - qpos[-1:]
     gap[:, 0] = 0.0
-    closed = qpos + share * gap  # the quaternions' ends are close, so that normalising is enough
+    closed = qpos + torch.linspace(0.0, 1.0, len(qpos), dtype=qpos.dtype)[:, None] * gap
     closed[:, :2] -= closed[:1, :2].clone()
-    closed[:, 3:7] /= closed[:, 3:7].norm(dim=1, keepdim=True)
+    closed[:, 3:7] /= closed[:, 3:7].norm(dim=1, keepdim=True)  # enough, as the quaternions' ends are close
     return closed
 
 
+@command
 def record(policy: Positional[Path], output: Positional[Path], seconds: float = 1.0, episodes: int = 8) -> None:
     """Write a clip of the episode of median return.
 
@@ -71,10 +70,5 @@ def record(policy: Positional[Path], output: Positional[Path], seconds: float = 
     print(f"{output}: {len(clip)} frames, {speed:.2f} m/s, ends {seam:.1e} apart (RMS, m and rad), {size:.1f} kB")
 
 
-@command
-def main() -> None:
-    tyro.cli(record, description=__doc__)
-
-
 if __name__ == "__main__":
-    main()
+    tyro.cli(record, description=__doc__)

@@ -24,9 +24,11 @@ CARRIERS = 4  # contact points that share the weight of a robot that has more
 FIRMNESS = 2.0  # times what solref asks for
 REBOUND = 2.0  # s/m, k_d / k_n at a dampratio of 1: the ground stops pushing what leaves at half a metre a second
 LIMIT_REBOUND = 4.0  # s/m or s/rad, d_limit / k_limit likewise
-# Contact points of a geom, by its type
+# Where a geom's contact points are, by its type: along its axes, in half lengths
 POINTS = {
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")): n for shape, n in (("SPHERE", 1), ("CAPSULE", 2), ("BOX", 8))
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): np.zeros((1, 3)),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]),
+    int(mujoco.mjtGeom.mjGEOM_BOX): np.array([[x, y, z] for y in (-1, 1) for x in (-1, 1) for z in (-1, 1)]),
 }
 
 
@@ -60,13 +62,11 @@ def floating(m: mujoco.MjModel) -> bool:
     return bool((m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
 
 
-def is_motor(m: mujoco.MjModel, a: int) -> bool:
-    """Whether an actuator's force is its control times a constant."""
-    return bool(
-        m.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_NONE
-        and m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
-        and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
-    )
+def motors(m: mujoco.MjModel) -> NDArray[np.bool_]:
+    """(actuators,) whose force is their control times a constant."""
+    still, unbiased = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
+    found: NDArray[np.bool_] = still & unbiased & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
+    return found
 
 
 def disabled_flags(m: mujoco.MjModel) -> set[str]:
@@ -191,11 +191,17 @@ def limit_constants(m: mujoco.MjModel) -> tuple[Array, Array]:
     return k_limit, LIMIT_REBOUND * k_limit * np.array([rate.damping_ratio for rate in rates])
 
 
-def mass_matrix(m: mujoco.MjModel) -> Array:
-    """(nv, nv) in the reference pose, as all inertias here; armature included."""
+def at_rest(m: mujoco.MjModel) -> mujoco.MjData:
+    """Where everything is in the reference pose."""
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
     mujoco.mj_comPos(m, data)
+    return data
+
+
+def mass_matrix(m: mujoco.MjModel) -> Array:
+    """(nv, nv) in the reference pose, as all inertias here; armature included."""
+    data = at_rest(m)
     mujoco.mj_makeM(m, data)
     matrix = np.eye(m.nv)
     for row, unit in zip(matrix, np.eye(m.nv), strict=True):
@@ -209,9 +215,7 @@ def mobilities(m: mujoco.MjModel, points: Sequence[tuple[int, Array]]) -> Array:
     Args:
         points: (body, position in the world).
     """
-    data = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, data)
-    mujoco.mj_comPos(m, data)
+    data = at_rest(m)
     jacobians = np.zeros((len(points), 3, m.nv))
     for jacobian, (body, position) in zip(jacobians, points, strict=True):
         mujoco.mj_jac(m, data, jacobian, None, position, body)

@@ -13,19 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.constants import (
+    POINTS,
     PairLaw,
+    at_rest,
     contact_constants,
     disabled_flags,
     floating,
     ground_pairs,
-    is_motor,
     limit_constants,
     mobilities,
+    motors,
     numeric,
     pair_law,
     text,
 )
-from diffsim.robot.refuse import check_actuators, obstacles
+from diffsim.robot.refuse import obstacles, overflows
 from diffsim.robot.report import approximations, troubles
 from diffsim.robot.scene import Array, Scene, SceneError
 
@@ -50,14 +52,19 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     except ValueError as error:
         raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
     _obey_flags(model)
-    if found := obstacles(model):
-        lines = found if len(found) == 1 else [f"{len(found)} things keep it from being simulated:", *found]
-        raise SceneError(f"{file.name}: " + "\n  ".join(lines))
+    _refuse(file, obstacles(model))
     scene = _Reader(model, file).scene()
-    check_actuators(scene)
+    _refuse(file, overflows(scene))
     for sentence in troubles(scene):
         warnings.warn(f"{file.name}: {sentence}", stacklevel=2)
     return dataclasses.replace(scene, approximations=approximations(scene))
+
+
+def _refuse(file: Path, found: list[str]) -> None:
+    if len(found) > 1:
+        found = [f"{len(found)} things keep it from being simulated:", *found]
+    if found:
+        raise SceneError(f"{file.name}: " + "\n  ".join(found))
 
 
 def _obey_flags(m: mujoco.MjModel) -> None:
@@ -243,7 +250,7 @@ class _Reader:
     def _muscle(self, a: int, constant: float) -> tuple[float, list[float]]:
         """Force per activation, and the numbers of the Hill-type model; constant: length of the path within links."""
         m, strength, gain = self.m, self._numeric("muscle_strength", 1.0), self.m.actuator_gainprm[a, :9]
-        if is_motor(m, a):
+        if motors(m)[a]:
             return -strength * m.actuator_gear[a, 0] * gain[0], [np.nan] * 9
         start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
         scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
@@ -268,9 +275,7 @@ class _Reader:
 
     def _contacts(self, mass: float, slide: NDArray[np.bool_]) -> dict[str, Any]:
         m = self.m
-        data = mujoco.MjData(m)
-        mujoco.mj_kinematics(m, data)
-        pairs = ground_pairs(m)
+        data, pairs = at_rest(m), ground_pairs(m)
         spheres = self._outer_spheres([sphere for _, geom in pairs for sphere in self._spheres(geom)], slide)
         points = []  # the lowest one of each sphere in the reference pose
         for sphere in spheres:
@@ -301,15 +306,11 @@ class _Reader:
         }
 
     def _spheres(self, geom: int) -> list[Sphere]:
-        m, kind, size = self.m, mujoco.mjtGeom, self.m.geom_size[geom]
+        m, size = self.m, self.m.geom_size[geom]
         link, rotation, position = self.body[m.geom_bodyid[geom]]
         axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
-        if m.geom_type[geom] == kind.mjGEOM_SPHERE:
-            return [Sphere(link, centre, size[0], geom)]
-        if m.geom_type[geom] == kind.mjGEOM_CAPSULE:
-            return [Sphere(link, centre + s * size[1] * axes[:, 2], size[0], geom) for s in (-1.0, 1.0)]
-        signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
-        return [Sphere(link, centre + axes @ (s * size), 0.0, geom) for s in signs]
+        half, radius = (size, 0.0) if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX else (size[1], size[0])
+        return [Sphere(link, centre + axes @ (point * half), radius, geom) for point in POINTS[m.geom_type[geom]]]
 
     def _outer_spheres(self, spheres: list[Sphere], slide: NDArray[np.bool_]) -> list[Sphere]:
         """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""

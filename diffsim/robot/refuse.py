@@ -6,8 +6,7 @@ Each check lists reasons with a mask of the elements that they hold for.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import mujoco
@@ -17,18 +16,19 @@ from numpy.typing import ArrayLike, NDArray
 from diffsim.robot.constants import (
     POINTS,
     asked,
+    at_rest,
     disabled_flags,
     enabled_flags,
     floating,
     ground_pairs,
-    is_motor,
     label,
     mass_matrix,
+    motors,
     numeric,
     pair_law,
     text,
 )
-from diffsim.robot.scene import MUSCLE_MODELS, PENALTY_CONSTANTS, Array, Scene, SceneError
+from diffsim.robot.scene import MUSCLE_MODELS, PENALTY_CONSTANTS, Array, Scene
 
 Kind, Joint = mujoco.mjtObj, mujoco.mjtJoint
 Mask = NDArray[np.bool_]
@@ -40,6 +40,22 @@ OBEYED = {"constraint", "contact", "damper", "equality", "frictionloss", "gravit
 METHODS = {"autoreset", "clampctrl", "eulerdamp", "filterparent", "island", "midphase", "multiccd", "nativeccd"}
 METHODS |= {"refsafe", "sensor", "warmstart"}
 EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", "nativeccd", "sleep"}
+
+# Attributes of elements that are not simulated, and the arrays that are not 0 where one is set.
+UNSIMULATED = {
+    Kind.mjOBJ_JOINT: {"actuatorfrcrange": "jnt_actfrclimited"},
+    Kind.mjOBJ_TENDON: {
+        f"{field} of a tendon": f"tendon_{field}"
+        for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited", "springyield")
+    },
+    Kind.mjOBJ_ACTUATOR: {
+        "forcerange": "actuator_forcelimited",
+        "damping": "actuator_damping actuator_dampingpoly",
+        "armature": "actuator_armature",
+        "delay": "actuator_delay actuator_history",
+    },
+    Kind.mjOBJ_GEOM: {"adhesion": "geom_adhesion", "surfacevel": "geom_surfacevel"},
+}
 
 MASSES = (1e-4, 1e6)  # kg, of a whole robot
 MOST_POINTS = 10_000  # of contact; 20 s to read
@@ -62,27 +78,23 @@ def obstacles(m: mujoco.MjModel) -> list[str]:
         except UnicodeDecodeError as error:
             name = names[: error.end].rpartition(b"\0")[2] + names[error.end :].partition(b"\0")[0]
             return [f"names must be in UTF-8, and {name.decode('latin-1')!r} is not; save the file in that encoding"]
-    lines: dict[tuple[str, str], dict[str, None]] = {}
-    for check in (*NUMBERS, *ELEMENTS):
-        for kind, name, why in check(m):
-            lines.setdefault((kind, why), {})[name] = None
-    return [f"{kind} {', '.join(names)}: {why}" for (kind, why), names in lines.items()]
+    return _lines(obstacle for check in (*NUMBERS, *ELEMENTS) for obstacle in check(m))
 
 
-def check_actuators(scene: Scene) -> None:
-    """That single precision holds the actuators' forces, which are products of the file's numbers.
-
-    Raises:
-        SceneError: it does not.
-    """
+def overflows(scene: Scene) -> list[str]:
+    """Likewise of actuators whose forces, products of the file's numbers, single precision does not hold."""
     muscle = np.zeros(scene.nu, bool)
     muscle[scene.segment_muscle] = "hill" in scene.features
     numbers = np.column_stack((scene.gear, scene.motor_bias, np.where(muscle[:, None], scene.hill, 0.0)))
-    for a in np.flatnonzero(~_finite(numbers).all(1)).tolist():
-        name = label(scene.mj_model, Kind.mjOBJ_ACTUATOR, a)
-        raise SceneError(
-            f"{Path(scene.path).name}: actuator {name}: its force is beyond single precision, {GREATEST:.2g} N at most"
-        )
+    why = f"its force is beyond single precision, {GREATEST:.2g} N at most"
+    return _lines(_where(scene.mj_model, Kind.mjOBJ_ACTUATOR, {why: ~_finite(numbers).all(1)}))
+
+
+def _lines(found: Iterable[Obstacle]) -> list[str]:
+    lines: dict[tuple[str, str], dict[str, None]] = {}
+    for kind, name, why in found:
+        lines.setdefault((kind, why), {})[name] = None
+    return [f"{kind} {', '.join(names)}: {why}" for (kind, why), names in lines.items()]
 
 
 def _where(
@@ -99,9 +111,9 @@ def _name(kind: mujoco.mjtObj) -> str:
     return str(kind).rsplit("mjOBJ_", 1)[-1].lower()
 
 
-def _any(m: mujoco.MjModel, *fields: str) -> Mask:
-    """(n,) of which elements one of these fields is set, some of which only newer versions of MuJoCo have."""
-    there = [np.asarray(getattr(m, field)) for field in fields if hasattr(m, field)]
+def _any(m: mujoco.MjModel, fields: str) -> Mask:
+    """(n,) of which elements one of these arrays is not 0; some of them only newer versions of MuJoCo have."""
+    there = [np.asarray(getattr(m, field)) for field in fields.split() if hasattr(m, field)]
     masks = [values.any(tuple(range(1, values.ndim))) for values in there]
     return np.logical_or.reduce(masks) if masks else np.zeros(1, bool)
 
@@ -142,11 +154,10 @@ def _not_finite(m: mujoco.MjModel) -> Iterator[Obstacle]:
 
 def _negative(m: mujoco.MjModel) -> Iterator[Obstacle]:
     signed = {Kind.mjOBJ_JOINT: ("armature", "damping", "stiffness"), Kind.mjOBJ_GEOM: ("friction", "solmix")}
-    for kind, fields in signed.items():
-        for field in fields:
-            values = _numbers(m)[kind][field]
-            least = values.min(tuple(range(1, values.ndim)))
-            yield from _where(m, kind, {field + " is {least:g}, must not be negative": least < 0}, least=least)
+    for kind, field in ((kind, field) for kind, fields in signed.items() for field in fields):
+        values = _numbers(m)[kind][field]
+        least = values.min(tuple(range(1, values.ndim)))
+        yield from _where(m, kind, {field + " is {least:g}, must not be negative": least < 0}, least=least)
     for field in ("density", "viscosity"):
         if getattr(m.opt, field) < 0:
             yield Obstacle("option", field, f"{getattr(m.opt, field):g}, must not be negative")
@@ -208,7 +219,7 @@ def _options(m: mujoco.MjModel) -> Iterator[Obstacle]:
     yield from _where(m, Kind.mjOBJ_ACTUATOR, {"its group is in actuatorgroupdisable; remove the actuator": off})
 
 
-def _whole_elements(m: mujoco.MjModel) -> Iterator[Obstacle]:
+def _unsimulated(m: mujoco.MjModel) -> Iterator[Obstacle]:
     touch = not disabled_flags(m) & {"constraint", "contact"}
     for kind, present, what in (
         (Kind.mjOBJ_EQUALITY, m.eq_active0, "equality constraints"),
@@ -217,6 +228,9 @@ def _whole_elements(m: mujoco.MjModel) -> Iterator[Obstacle]:
         (Kind.mjOBJ_PLUGIN, np.ones(m.nplugin), "plugins"),
     ):
         yield from _where(m, kind, {f"{what} are not simulated": present})
+    for kind, attributes in UNSIMULATED.items():
+        rules = {f"{attribute} is not simulated": _any(m, fields) for attribute, fields in attributes.items()}
+        yield from _where(m, kind, rules)
 
 
 def _bodies(m: mujoco.MjModel) -> Iterator[Obstacle]:
@@ -246,7 +260,6 @@ def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
     plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
     curved = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(_any(m, "dof_dampingpoly"))])
     rules = {
-        "actuatorfrcrange is not simulated": m.jnt_actfrclimited,
         "damping and stiffness are linear here, one number each": curved | _any(m, "jnt_stiffnesspoly"),
         "springs that yield are not simulated": _any(m, "jnt_springyield") | plastic,
         "frictionloss is not simulated": m.dof_frictionloss[dof],
@@ -272,9 +285,6 @@ def _tendons(m: mujoco.MjModel) -> Iterator[Obstacle]:
     why = "only spatial tendons through sites, without pulleys or wrapping geoms"
     yield from _where(m, Kind.mjOBJ_TENDON, {why: ~spatial})
     yield from _where(m, Kind.mjOBJ_SITE, {"a muscle of a floating robot cannot hold on to the world": held & world})
-    fields = "stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited", "springyield"
-    rules = {f"{field} of a tendon is not simulated": _any(m, f"tendon_{field}") for field in fields}
-    yield from _where(m, Kind.mjOBJ_TENDON, rules)
 
 
 ON_JOINT = "motors with a gear and a ctrlrange on a hinge, a slide or one axis of a ball joint"
@@ -282,56 +292,48 @@ ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors 
 
 
 def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    every = range(len(m.actuator_trntype))  # a PID has several of nu controls
-    tendon = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
-    motor, pulls, turns = (np.array([f(m, a) for a in every], bool) for f in (is_motor, _pulls, _turns))
-    low, high = m.actuator_ctrlrange[: len(every)].T
+    count = len(m.actuator_trntype)  # a PID has several of nu controls
+    tendon, motor = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, motors(m)
+    pulls, turns = _pulls(m, count), _turns(m)
+    low, high = m.actuator_ctrlrange[:count].T
     hill = text(m, "muscle_model", "linear") == "hill"
-    idle = tendon & ~motor & (m.actuator_gainprm[: len(every), 2] < 0) & (m.actuator_acc0[: len(every)] <= 0)
+    idle = tendon & ~motor & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
     rules = {
         f"only {ON_TENDON}": tendon & ~pulls,
         f"only {ON_JOINT}, or muscles on tendons": ~tendon & ~turns,
         "muscle_model 'hill' needs a <muscle>": tendon & motor & hill,
         "its force follows from what it moves, and it moves nothing; give force": pulls & idle,
-        "forcerange is not simulated": m.actuator_forcelimited,
         "ctrlrange {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
-        "damping is not simulated": _any(m, "actuator_damping", "actuator_dampingpoly"),
-        "armature is not simulated": _any(m, "actuator_armature"),
-        "delay is not simulated": _any(m, "actuator_delay", "actuator_history"),
     }
     yield from _where(m, Kind.mjOBJ_ACTUATOR, rules, low=low, high=high)
 
 
-def _turns(m: mujoco.MjModel, a: int) -> bool:
-    """A motor of a hinge, of a slide or of one axis of a ball joint."""
-    if m.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or not is_motor(m, a):
-        return False
-    kind = m.jnt_type[m.actuator_trnid[a, 0]]
-    if kind == Joint.mjJNT_BALL:
-        return bool(np.count_nonzero(m.actuator_gear[a, :3]) <= 1)
-    return bool(kind != Joint.mjJNT_FREE)
+def _turns(m: mujoco.MjModel) -> Mask:
+    """Motors of a hinge, of a slide or of one axis of a ball joint."""
+    turns = motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    found = np.flatnonzero(turns)
+    kind, axes = m.jnt_type[m.actuator_trnid[found, 0]], np.count_nonzero(m.actuator_gear[found, :3], axis=1)
+    turns[found] = np.where(kind == Joint.mjJNT_BALL, axes <= 1, kind != Joint.mjJNT_FREE)
+    return turns
 
 
-def _pulls(m: mujoco.MjModel, a: int) -> bool:
+def _pulls(m: mujoco.MjModel, count: int) -> Mask:
     """A <muscle>, or a motor that can only shorten its tendon."""
-    low, high = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (0.0, 1.0)
-    if is_motor(m, a):
-        scale = -m.actuator_gear[a, 0] * m.actuator_gainprm[a, 0]
-        return bool(min(scale * low, scale * high) >= 0)
-    return bool(
-        m.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_MUSCLE
-        and m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE
-        and m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_MUSCLE
-        and np.array_equal(m.actuator_gainprm[a, :9], m.actuator_biasprm[a, :9])
-        and m.actuator_gear[a, 0] == 1
-        and 0 <= low < high <= 1
+    gain, gear = m.actuator_gainprm[:count, :9], m.actuator_gear[:count, 0]
+    limited = m.actuator_ctrllimited[:count, None] != 0
+    low, high = np.where(limited, m.actuator_ctrlrange[:count], (0.0, 1.0)).T
+    shortens = (-gear * gain[:, 0] * low >= 0) & (-gear * gain[:, 0] * high >= 0)
+    muscle = (
+        (m.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE)
+        & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE)
+        & (m.actuator_biastype == mujoco.mjtBias.mjBIAS_MUSCLE)
+        & (gain == m.actuator_biasprm[:count, :9]).all(1)
     )
+    return np.where(motors(m), shortens, muscle & (gear == 1) & (0 <= low) & (low < high) & (high <= 1))
 
 
 def _contacts(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    data = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, data)
-    pairs = ground_pairs(m)
+    data, pairs = at_rest(m), ground_pairs(m)
     touching = np.zeros(m.ngeom, bool)
     touching[[ground for ground, _ in pairs]] = True
     plane, only_drawn = m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, "; set contype and conaffinity to 0 if only drawn"
@@ -340,26 +342,24 @@ def _contacts(m: mujoco.MjModel) -> Iterator[Obstacle]:
     one_plane = f"contact is simulated with one ground plane only{only_drawn}"
     rules = {one_plane: touching & other, "the ground plane must be horizontal": touching & ~other & tilted}
     yield from _where(m, Kind.mjOBJ_GEOM, rules)
-    points = sum(POINTS.get(m.geom_type[geom], 0) for _, geom in pairs)
+    points = sum(len(POINTS.get(m.geom_type[geom], ())) for _, geom in pairs)
     if points > MOST_POINTS:
         yield Obstacle("contact", f"{points} points", f"at most {MOST_POINTS} are simulated{only_drawn}")
         return
     laws = {geom: pair_law(m, ground, geom) for ground, geom in pairs}
-    has_mu = mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, "mu") >= 0 or all(law.condim == 1 for law in laws.values())
-    for geom, law in laws.items():
-        wrong = _wrong(law.solref)
-        reasons = {
-            f"only spheres, capsules and boxes may touch the ground{only_drawn}": m.geom_type[geom] not in POINTS,
-            f"condim {law.condim}: torsional and rolling friction are not simulated; condim 3 is": law.condim > 3,
-            "condim 1: frictionless beside geoms with friction is not simulated; <numeric> 'mu' is for all": (
-                law.condim == 1 and not has_mu
-            ),
-            f"solref {wrong}": wrong,
-        }
-        for why in (why for why, holds in reasons.items() if holds):
-            yield Obstacle("geom", label(m, Kind.mjOBJ_GEOM, geom), why)
-    rules = {f"{field} is not simulated": _any(m, f"geom_{field}") for field in ("adhesion", "surfacevel")}
-    yield from _where(m, Kind.mjOBJ_GEOM, rules)
+    geoms = list(laws)
+    condim, wrong, shaped = np.zeros(m.ngeom, int), np.full(m.ngeom, "", "U80"), np.ones(m.ngeom, bool)
+    condim[geoms] = [law.condim for law in laws.values()]
+    wrong[geoms] = [_wrong(law.solref) for law in laws.values()]
+    shaped[geoms] = np.isin(m.geom_type[geoms], list(POINTS))
+    smooth = (condim == 1) & (mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, "mu") < 0) & (condim > 1).any()
+    rules = {
+        f"only spheres, capsules and boxes may touch the ground{only_drawn}": ~shaped,
+        "condim {condim}: torsional and rolling friction are not simulated; condim 3 is": condim > 3,
+        "condim 1: frictionless beside geoms with friction is not simulated; <numeric> 'mu' is for all": smooth,
+        "solref {wrong}": wrong != "",
+    }
+    yield from _where(m, Kind.mjOBJ_GEOM, rules, condim=condim, wrong=wrong)
 
 
 def _wrong(solref: ArrayLike) -> str:
@@ -371,4 +371,4 @@ def _wrong(solref: ArrayLike) -> str:
 
 
 NUMBERS = _not_finite, _negative, _masses, _names
-ELEMENTS = _options, _whole_elements, _bodies, _joints, _tendons, _actuators, _contacts
+ELEMENTS = _options, _unsimulated, _bodies, _joints, _tendons, _actuators, _contacts

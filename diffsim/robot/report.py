@@ -14,9 +14,9 @@ from diffsim.robot.constants import (
     PairLaw,
     asked,
     ground_pairs,
-    is_motor,
     label,
     mass_matrix,
+    motors,
     numeric,
     pair_law,
     recovery,
@@ -132,7 +132,7 @@ def _ground(scene: Scene) -> list[str]:
     sentences += _one_law_for_all(scene, [pair_law(m, *pair) for pair in pairs])
     if margin := max(m.geom_margin[list(pair)].max() for pair in pairs):
         sentences.append(f"Geoms touch where they are, not at their margin of up to {margin:g} m.")
-    if inside := sum(POINTS[m.geom_type[geom]] for _, geom in pairs) - scene.ncontact:
+    if inside := sum(len(POINTS[m.geom_type[geom]]) for _, geom in pairs) - scene.ncontact:
         sentences.append(f"Contact points that lie inside others in every pose are left out: {inside}.")
     return sentences
 
@@ -173,7 +173,7 @@ def _actuators(scene: Scene) -> list[str]:
     free = [label(m, Kind.mjOBJ_ACTUATOR, a) for a in np.flatnonzero(m.actuator_ctrllimited == 0).tolist()]
     if free:
         sentences.append(f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {', '.join(free)}.")
-    if not all(is_motor(m, a) for a in range(m.nu)):
+    if not motors(m).all():
         sentences.append("A control sets the activation of a <muscle> at once.")
         if scene.muscle_model != "hill":
             sentences.append("A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves.")

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
 # Constants of contact (Eq. 3) and limits (Eq. 4), with their units. <custom><numeric name="k_n" data="2e4"/></custom>
-# in the MJCF sets one, penalty.py those that the file does not name.
+# in the MJCF sets one, constants.py those that the file does not name.
 PENALTY_CONSTANTS = {
     "k_n": "N/m",
     "k_d": "N s/m^2",
@@ -48,29 +48,7 @@ class Scene:
     frame sits at its joint's anchor: R = R_parent rotation Rot(axis, q - q_ref). A ball joint makes three links in a
     row, all in the frame of the body that it turns and about one axis of it each; only the last has mass.
 
-    Attributes (nlink rows each unless said):
-        parent: index of the parent link (the base's own is 0).
-        slide: True where the joint is a slide.
-        ball: 0, 1, 2 for the three links of a ball joint, -1 elsewhere.
-        rotation, position: (3, 3) and (3,), the frame in the parent's frame at the reference configuration.
-        axis: (3,) unit joint axis in the link's frame.
-        joint_ref: q at the reference configuration (MJCF `ref`).
-        mass, com, inertia: kg, (3,) m in the link's frame, (3, 3) kg m^2 about the centre of mass, link axes.
-        armature, damping, stiffness, spring_ref, lower, upper: of the joint; bounds are infinite where unlimited.
-        k_limit, d_limit: stiffness and damping of the joint's limits (Eq. 4).
-        motor_link, gear, motor_bias: (nu,) joint force = gear * ctrl + motor_bias for ctrl in [-1, 1] over ctrlrange.
-            Of a muscle the link is 0, and this is the maximum force times the activation.
-        segment_link, segment_position, segment_muscle: (ns, 2), (ns, 2, 3), (ns,) the pieces of the muscles' paths that
-            join two links: the links, the end points in their frames, and whose path it is; sorted by links.
-        hill: (nu, 9) numbers of the Hill-type model (kernels/hill.py), NaN where not a <muscle>.
-        muscle_model: "linear" (the paper's: force = maximum force times activation) or "hill".
-        contact_link, contact_position, contact_radius: (nc,), (nc, 3), (nc,) spheres that may touch the ground.
-        body_link, body_com: (nbody,), (nbody, 3) of each body of the MJCF the link that it is part of, -1 for what a
-            floating scene's world holds, and its centre of mass in that link's frame.
-        k_n, k_d, k_t, mu: stiffness, damping and friction of contact (Eq. 3).
-        density, viscosity: of the fluid around the robot, kg/m^3 and kg/(m s).
-        terrain: None, or the ground in the plane's place: (1 or num_envs, K, 2) vertices, see with_terrain.
-        approximations: what the file asks for and is simulated only roughly, a sentence each.
+    Arrays have nlink rows unless said.
     """
 
     name: str
@@ -79,47 +57,49 @@ class Scene:
     floating: bool
     nq: int
     nv: int
-    parent: Index
-    slide: NDArray[np.bool_]
-    ball: Index
-    rotation: Array
-    position: Array
-    axis: Array
-    joint_ref: Array
-    mass: Array
-    com: Array
-    inertia: Array
+    parent: Index  # the parent link; the base's own is 0
+    slide: NDArray[np.bool_]  # whether the joint is a slide
+    ball: Index  # 0, 1, 2 for the three links of a ball joint, -1 elsewhere
+    rotation: Array  # (3, 3) and
+    position: Array  # (3,) m, the frame in the parent's frame at the reference configuration
+    axis: Array  # (3,) unit joint axis in the link's frame
+    joint_ref: Array  # q at the reference configuration (MJCF `ref`)
+    mass: Array  # kg
+    com: Array  # (3,) m, in the link's frame
+    inertia: Array  # (3, 3) kg m^2 about the centre of mass, link axes
     armature: Array
     damping: Array
     stiffness: Array
     spring_ref: Array
-    lower: Array
+    lower: Array  # bounds of the joint, infinite where unlimited
     upper: Array
-    k_limit: Array
-    d_limit: Array
-    motor_link: Index
-    gear: Array
-    motor_bias: Array
-    segment_link: Index
-    segment_position: Array
-    segment_muscle: Index
-    hill: Array
-    muscle_model: str
-    contact_link: Index
-    contact_position: Array
-    contact_radius: Array
-    body_link: Index
-    body_com: Array
+    k_limit: Array  # stiffness and
+    d_limit: Array  # damping of the joint's limits (Eq. 4)
+    motor_link: Index  # (nu,) whose joint has a force of gear * ctrl + motor_bias for ctrl in [-1, 1] over ctrlrange;
+    gear: Array  # (nu,)
+    motor_bias: Array  # (nu,) of a muscle the link is 0, and that is the maximum force times the activation
+    # Pieces of the muscles' paths that join two links, sorted by links
+    segment_link: Index  # (ns, 2)
+    segment_position: Array  # (ns, 2, 3) the end points in the links' frames
+    segment_muscle: Index  # (ns,) whose path it is
+    hill: Array  # (nu, 9) numbers of the Hill-type model (kernels/hill.py), NaN where not a <muscle>
+    muscle_model: str  # "linear" (the paper's: force = maximum force times activation) or "hill"
+    # Spheres that may touch the ground
+    contact_link: Index  # (nc,)
+    contact_position: Array  # (nc, 3)
+    contact_radius: Array  # (nc,)
+    body_link: Index  # (nbody,) the link that each body of the MJCF is part of, -1 in the world of a floating scene
+    body_com: Array  # (nbody, 3) its centre of mass in that link's frame
     gravity: Array
     ground_height: float
-    k_n: float
+    k_n: float  # stiffness, damping and friction of contact (Eq. 3)
     k_d: float
     k_t: float
     mu: float
-    density: float = 0.0
-    viscosity: float = 0.0
-    terrain: Array | None = None
-    approximations: tuple[str, ...] = ()
+    density: float = 0.0  # kg/m^3, of the fluid around the robot
+    viscosity: float = 0.0  # kg/(m s)
+    terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
+    approximations: tuple[str, ...] = ()  # what the file asks for and is simulated only roughly, a sentence each
 
     def __post_init__(self) -> None:
         if self.muscle_model not in MUSCLE_MODELS:
@@ -289,22 +269,23 @@ def _check_terrain(vertices: ArrayLike) -> Array:
     except (TypeError, ValueError) as error:
         raise ValueError("terrain must be numbers in an array (K, 2) or (environments, K, 2)") from error
     shape = profiles.shape
-    if profiles.ndim == 2:
-        profiles = profiles[None]
+    profiles = profiles[None] if len(shape) == 2 else profiles
     if profiles.ndim != 3 or profiles.shape[2] != 2 or profiles.shape[1] < 2 or not len(profiles):
         raise ValueError(f"terrain has shape {shape}, must be (K, 2) or (environments, K, 2) with K of 2 or more")
     x, z = profiles[..., 0], profiles[..., 1]
-    run, flat = np.diff(x), np.diff(x) == 0
-    ends = np.zeros_like(flat)
-    ends[:, [0, -1]] = True
-    twice = flat & np.pad(flat, ((0, 0), (1, 0)))[:, :-1]
-    for wrong, why in (
-        (~(np.abs(profiles) <= np.finfo(np.float32).max).all(2), "is not finite"),
-        (run < 0, "has a larger x than the next one; x must ascend"),
-        (flat & (np.diff(z) == 0), "equals the next one"),
-        (flat & ends, "begins a wall at an end of the terrain, where it would go on for ever"),
-        (twice, "ends one wall and begins another; two vertices may share an x, not three"),
-    ):
+    wall = np.diff(x) == 0
+    faults = {
+        "is not finite": ~(np.abs(profiles) <= np.finfo(np.float32).max).all(2),
+        "has a larger x than the next one; x must ascend": np.diff(x) < 0,
+        "equals the next one": wall & (np.diff(z) == 0),
+        "begins a wall at an end of the terrain, where it would go on for ever": (
+            wall & np.isin(range(wall.shape[1]), (0, wall.shape[1] - 1))
+        ),
+        "ends one wall and begins another; two vertices may share an x, not three": (
+            wall & np.insert(wall, 0, False, axis=1)[:, :-1]
+        ),
+    }
+    for why, wrong in faults.items():
         if wrong.any():
             row, vertex = np.argwhere(wrong)[0]
             where = f" of environment {row}" if len(profiles) > 1 else ""

@@ -149,6 +149,18 @@ class Task:
         return torch.zeros_like(obs[..., 0], dtype=torch.bool)
 
 
+class Planar(Task):
+    """A robot of hinges and slides: observed is all of its state but where it is, the first `places` of qpos.
+
+    Tables 7 and 8: height and pitch (or yaw), joints, then the rates of x, height (or y), pitch and joints.
+    """
+
+    places: ClassVar[int] = 1
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        return torch.cat((qpos[..., self.places :], qvel), dim=-1)
+
+
 def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:
     """R_height of Eqs. 16-17 and 21-22: with D = clip(delta, -1, upper) [m], -200 D^2 below zero and slope D above."""
     return slope * delta.clamp(0.0, upper) - 200.0 * delta.clamp(-1.0, 0.0).square()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from diffsim.sim.integration import Integration
-from diffsim.tasks.base import Firm, Task
+from diffsim.tasks.base import Firm, Planar
 
 
-class HalfCheetah(Task):
+class HalfCheetah(Planar):
     """qpos = (x, height above 1 m, pitch, 6 joints) [m, rad]; action: 200 N m per joint."""
 
     name = "half_cheetah"
@@ -22,10 +21,6 @@ class HalfCheetah(Task):
     num_random = 18
     start = (0.0, -0.2) + (0.0,) * 16
     spread = (0.2,) * 9 + (0.5,) * 9
-
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """Table 7: height, pitch, 6 joints, then the rates of x, height, pitch and joints."""
-        return torch.cat((qpos[..., 1:], qvel), dim=-1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Eq. 14: v_x - 0.1 |a|^2."""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
 
 from diffsim.sim.integration import Integration
-from diffsim.tasks.base import Firm, Task, height_reward
+from diffsim.tasks.base import Firm, Planar, height_reward
 
 
-class Hopper(Task):
+class Hopper(Planar):
     """qpos = (x, height above 1.25 m, pitch, 3 joints) [m, rad]; action: 200 N m per joint."""
 
     name = "hopper"
@@ -25,10 +24,6 @@ class Hopper(Task):
     min_height = -0.45
     start = (0.0,) * 12
     spread = (0.1,) * 12
-
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """Table 8: height, pitch, 3 joints, then the rates of x, height, pitch and joints."""
-        return torch.cat((qpos[..., 1:], qvel), dim=-1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Eq. 15: R_v + R_height + R_angle - 0.1 |a|^2."""

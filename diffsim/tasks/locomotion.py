@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.base import Task
-from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections, signs
+from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
 
 FORWARD_VELOCITY = 5  # column of the observation: v_x
 
@@ -58,9 +58,10 @@ class Locomotion(Task):
         model = load_scene(str(files("diffsim") / "assets" / self.asset)).mj_model
         device, dtype = self._start.device, self._start.dtype
         qpos, qvel, action = reflections(model, self.sides, device, dtype)
-        root = signs((1.0, *PSEUDOVECTOR, 1.0, *VECTOR, *PSEUDOVECTOR), device, dtype)  # height to angular velocity
+        root = (1.0, *PSEUDOVECTOR, 1.0, *VECTOR, *PSEUDOVECTOR)  # height to angular velocity
         joints, rates = (Reflection(part.index[n:] - n, part.sign[n:]) for part, n in ((qpos, 7), (qvel, 6)))
-        seen = (root, joints, rates, signs((1.0, 1.0), device, dtype))  # as in observe
+        fixed = [Reflection.of(enumerate(signs), device, dtype) for signs in (root, (1.0, 1.0))]
+        seen = (fixed[0], joints, rates, fixed[1])  # as in observe
         return Mirror(qpos, qvel, action, Reflection.cat((*seen, action) if self.observe_action else seen))
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:

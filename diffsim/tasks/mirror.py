@@ -6,7 +6,7 @@ it keeps y and turns x and z round. Left and right joints, motors and muscles ch
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -39,6 +39,12 @@ class Reflection:
         return x.index_select(-1, self.index) * self.sign
 
     @staticmethod
+    def of(numbers: Iterable[tuple[int, float]], device: torch.device, dtype: torch.dtype) -> Reflection:
+        """Of numbers that come each from a place and with a sign."""
+        index, sign = zip(*numbers, strict=True)
+        return Reflection(torch.tensor(index, device=device), torch.tensor(sign, device=device, dtype=dtype))
+
+    @staticmethod
     def cat(parts: Sequence[Reflection]) -> Reflection:
         """Of numbers that stand one after the other."""
         index, start = [], 0
@@ -57,11 +63,6 @@ class Mirror(NamedTuple):
     obs: Reflection
 
 
-def signs(values: Sequence[float], device: torch.device, dtype: torch.dtype) -> Reflection:
-    """Of numbers that keep their places."""
-    return Reflection(torch.arange(len(values), device=device), torch.tensor(values, device=device, dtype=dtype))
-
-
 def reflections(
     model: mujoco.MjModel, sides: Sides, device: torch.device, dtype: torch.dtype
 ) -> tuple[Reflection, Reflection, Reflection]:
@@ -75,23 +76,15 @@ def reflections(
     Raises:
         ValueError: a joint or an actuator has no partner of the other side's name, or its axis is another one.
     """
-    qpos, qvel, action = (np.zeros((2, n)) for n in (model.nq, model.nv, model.nu))  # rows: index, sign
-    joints = [model.joint(k).name for k in range(model.njnt)]
-    actuators = [model.actuator(k).name for k in range(model.nu)]
-    turns = np.ones(model.njnt)  # sign of a hinge's angle or of a slide's length
-    for joint, name in enumerate(joints):
-        partner = joints.index(_image(name, joints, sides))
+    qpos, qvel, action = (list[tuple[int, float]]() for _ in range(3))  # from where, sign
+    for joint, partner in enumerate(_partners([model.joint(k).name for k in range(model.njnt)], sides)):
         positions, rates = _joint_signs(model, joint, partner)
-        turns[joint] = rates[0]
-        for table, address, values in ((qpos, model.jnt_qposadr, positions), (qvel, model.jnt_dofadr, rates)):
-            place = slice(address[partner], address[partner] + len(values))
-            table[:, place] = np.arange(address[joint], address[joint] + len(values)), values
-    for k, name in enumerate(actuators):
-        pulls = model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_TENDON
-        sign = 1.0 if pulls else turns[model.actuator_trnid[k, 0]]
-        action[:, actuators.index(_image(name, actuators, sides))] = k, sign
-    tensors = ((torch.tensor(index).long(), torch.tensor(sign)) for index, sign in (qpos, qvel, action))
-    first, second, third = (Reflection(index.to(device), sign.to(device, dtype)) for index, sign in tensors)
+        qpos += enumerate(positions, int(model.jnt_qposadr[partner]))
+        qvel += enumerate(rates, int(model.jnt_dofadr[partner]))
+    for motor, partner in enumerate(_partners([model.actuator(k).name for k in range(model.nu)], sides)):
+        pulls = model.actuator_trntype[motor] == mujoco.mjtTrn.mjTRN_TENDON
+        action.append((partner, 1.0 if pulls else qvel[model.jnt_dofadr[model.actuator_trnid[motor, 0]]][1]))
+    first, second, third = (Reflection.of(numbers, device, dtype) for numbers in (qpos, qvel, action))
     return first, second, third
 
 
@@ -109,15 +102,20 @@ def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Seque
     return (sign,), (sign,)
 
 
-def _image(name: str, names: Sequence[str], sides: Sides) -> str:
-    """The name on the other side, or the same one if it is of no side."""
-    image = name
+def _partners(names: Sequence[str], sides: Sides) -> list[int]:
+    """Where the other side's name of each is; its own place if it is of no side."""
+    images = [_image(name, sides) for name in names]
+    for name, image in zip(names, images, strict=True):
+        if image not in names:
+            raise ValueError(f"{name!r} has no mirror image: there is no {image!r}")
+    return [names.index(image) for image in images]
+
+
+def _image(name: str, sides: Sides) -> str:
     for pair in sides:
         for side, other in (pair, pair[::-1]):
-            if image == name and name.startswith(side):
-                image = other + name.removeprefix(side)
-            elif image == name and name.endswith(side):
-                image = name.removesuffix(side) + other
-    if image not in names:
-        raise ValueError(f"{name!r} has no mirror image: there is no {image!r}")
-    return image
+            if name.startswith(side):
+                return other + name.removeprefix(side)
+            if name.endswith(side):
+                return name.removesuffix(side) + other
+    return name

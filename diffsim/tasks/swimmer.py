@@ -5,13 +5,12 @@ It has no reward of its own here but the paper's: the squared error of velocity,
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from diffsim.tasks.base import Task
+from diffsim.tasks.base import Planar
 
 
-class Swimmer(Task):
+class Swimmer(Planar):
     """qpos = (x, y, yaw, 2 joints) [m, rad]; action: 200 N m per joint."""
 
     name = "swimmer"
@@ -21,10 +20,7 @@ class Swimmer(Task):
     num_random = 10
     start = (0.0,) * 10
     spread = (0.1,) * 10
-
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """All of the state but where it is: yaw, 2 joints, then the rates of x, y, yaw and joints."""
-        return torch.cat((qpos[..., 2:], qvel), dim=-1)
+    places = 2
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """-(v_x - 2)^2 - 1e-4 |a|^2."""

@@ -5,13 +5,12 @@ It has no reward of its own here but the paper's: squared errors of velocity and
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from diffsim.tasks.base import Task
+from diffsim.tasks.base import Planar
 
 
-class Walker(Task):
+class Walker(Planar):
     """qpos = (x, height above 1.4 m, pitch, 6 joints) [m, rad]; action: 150 N m per joint."""
 
     name = "walker"
@@ -21,10 +20,6 @@ class Walker(Task):
     num_random = 18
     start = (0.0,) * 18
     spread = (0.1,) * 18
-
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """All of the state but x: height, pitch, 6 joints, then the rates of x, height, pitch and joints."""
-        return torch.cat((qpos[..., 1:], qvel), dim=-1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """-(v_x - 1.2)^2 - 10 (height - 1.4)^2 - 1e-4 |a|^2."""

@@ -13,9 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import mujoco
@@ -39,7 +37,7 @@ REMEDY = "no OpenGL to draw with: apt install libegl1 libgl1 libgl1-mesa-dri (or
 
 
 class Renderer:
-    """Draws a scene, or an MJCF file, one configuration at a time.
+    """Draws a scene, one configuration at a time.
 
     Args:
         scene: what is drawn.
@@ -54,45 +52,33 @@ class Renderer:
     """
 
     def __init__(
-        self,
-        scene: Scene | str | os.PathLike[str],
-        width: int = 640,
-        height: int = 480,
-        camera: str | None = None,
-        fast: bool | None = None,
+        self, scene: Scene, width: int = 640, height: int = 480, camera: str | None = None, fast: bool | None = None
     ) -> None:
-        loaded = scene.mj_model if isinstance(scene, Scene) else mujoco.MjModel.from_xml_path(os.fspath(scene))
-        self.model = model = copy.copy(loaded)
-        self._terrain = scene.terrain if isinstance(scene, Scene) else None
-        self._material = -1 if self._terrain is None else hide_planes(model)
+        self.model, self._material = drawable(scene)
+        self._terrain = scene.terrain
         self.width, self.height = check_size(width, height)
-        self._view = _camera(model, camera)
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._view, size = _camera(self.model, camera), self.model.vis.global_
+        size.offwidth, size.offheight = width, height
         self._window = _gl_context(width, height)
         self._fast = _is_software() if fast is None else fast
         if self._fast:
-            lower_quality(model)
-        self._data, self._option, self._perturb = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
-        self._scene, self._area = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        if self._fast:
-            self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+            lower_quality(self.model)
+        self._data, self._option, self._perturb = mujoco.MjData(self.model), mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._scene, self._area = mujoco.MjvScene(self.model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] &= not self._fast
+        self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
 
     def draw(self, qpos: ArrayLike, ctrl: ArrayLike | None = None, profile: int = 0) -> Frame:
-        """The frame (height, width, 3) of one configuration.
+        """The frame (height, width, 3) of one configuration qpos (nq,).
 
         Args:
-            qpos: (nq,).
             ctrl: (nu,) in [-1, 1]; colours muscles by their activation, blue at rest, red at full force.
             profile: of which environment's terrain, if each has its own.
-
-        Raises:
-            ValueError: an argument of another shape.
         """
         model, data = self.model, self._data
-        data.qpos[:] = _check("qpos", qpos, (model.nq,))
+        data.qpos[:] = _check("qpos", qpos, model.nq)
         if ctrl is not None:
-            colour_muscles(model, _check("ctrl", ctrl, (model.nu,)))
+            colour_muscles(model, _check("ctrl", ctrl, model.nu))
         # All that a picture depends on, without the contacts and matrices of mj_forward.
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
             stage(model, data)
@@ -109,6 +95,12 @@ class Renderer:
         mujoco.mjr_readPixels(frame, None, self._area, self._context)
         return np.ascontiguousarray(frame[::-1])  # OpenGL's first row is the lowest
 
+    def draw_all(self, qpos: ArrayLike, ctrl: ArrayLike | None = None) -> Iterator[Frame]:
+        """The frames of configurations qpos (T, nq), with ctrl (T, nu), one after the other."""
+        qpos = _check("qpos", qpos, len(np.atleast_1d(qpos)), self.model.nq)
+        colours = itertools.repeat(None) if ctrl is None else _check("ctrl", ctrl, len(qpos), self.model.nu)
+        return map(self.draw, qpos, colours)
+
     def close(self) -> None:
         """Free what OpenGL holds; a second call does nothing."""
         if self._window is not None:
@@ -124,12 +116,21 @@ class Renderer:
         self.close()
 
 
-def hide_planes(model: mujoco.MjModel) -> int:
-    """Leave a model's planes undrawn; returns the material of the first, or -1."""
+def _check(name: str, value: ArrayLike, *shape: int) -> NDArray[np.float64]:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
+    return array
+
+
+def drawable(scene: Scene) -> tuple[mujoco.MjModel, int]:
+    """A copy of a scene's model, without planes if there is a terrain, and the material of the first plane, or -1."""
+    model = copy.copy(scene.mj_model)
     planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     material = int(model.geom_matid[planes[0]]) if len(planes) else -1
-    model.geom_matid[planes], model.geom_rgba[planes] = -1, 0.0
-    return material
+    if scene.terrain is not None:
+        model.geom_matid[planes], model.geom_rgba[planes] = -1, 0.0
+    return model, material
 
 
 def add_terrain(scene: mujoco.MjvScene, profile: NDArray[np.float64], material: int) -> None:
@@ -155,174 +156,6 @@ def colour_muscles(model: mujoco.MjModel, ctrl: ArrayLike) -> None:
     model.tendon_rgba[model.actuator_trnid[muscles, 0]] = force * FULL_FORCE + (1 - force) * AT_REST
 
 
-def render_frames(
-    scene: Scene | str | os.PathLike[str],
-    qpos: ArrayLike,
-    width: int = 640,
-    height: int = 480,
-    camera: str | None = None,
-    ctrl: ArrayLike | None = None,
-    fast: bool | None = None,
-) -> NDArray[np.uint8]:
-    """Draw each of the configurations qpos (T, nq), with muscles coloured by ctrl (T, nu); see Renderer.
-
-    Returns:
-        Frames (T, height, width, 3).
-
-    Raises:
-        ValueError, RuntimeError: as Renderer does; qpos or ctrl has another shape.
-    """
-    with Renderer(scene, width, height, camera, fast) as renderer:
-        return np.stack([*_draw_all(renderer, qpos, ctrl)])
-
-
-def film(
-    path: str | os.PathLike[str],
-    scene: Scene,
-    qpos: ArrayLike,
-    control_dt: float,
-    ctrl: ArrayLike | None = None,
-    size: tuple[int, int] = VIDEO_SIZE,
-) -> Path:
-    """Film a motion at true speed, with at most 30 frames/s; see save_video.
-
-    Args:
-        path: of an .mp4 or a .gif.
-        scene: what moves.
-        qpos, ctrl: (T, nq) and (T, nu), one row per control step.
-        control_dt: s of a control step.
-        size: width and height in pixels.
-    """
-    check_video(path, size)
-    stride = max(1, math.ceil(1 / (VIDEO_FPS * control_dt) - 1e-6))
-    qpos = np.asarray(qpos)[::stride]
-    ctrl = None if ctrl is None else np.asarray(ctrl)[::stride]
-    with Renderer(scene, *size) as renderer:
-        return save_video(path, _draw_all(renderer, qpos, ctrl), 1 / (stride * control_dt))
-
-
-def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float) -> Path:
-    """Write frames (height, width, 3) as .mp4 (H.264) or .gif, which plays at true speed.
-
-    A gif holds its delays in hundredths of a second and browsers want at least two of them: frames beyond 50 per second
-    are left out, and delays differ by a hundredth where they must.
-
-    Returns:
-        The file written.
-
-    Raises:
-        ValueError: no frames, another suffix, or an mp4 whose width or height is not a multiple of 16.
-        OSError: the file cannot be written.
-        RuntimeError: the encoder is missing.
-    """
-    frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
-        raise ValueError("a video needs at least one frame")
-    path = check_video(path, first.shape[1::-1])
-    with whole_file(path) as part:
-        (_write_gif if path.suffix == ".gif" else _write_mp4)(part, itertools.chain([first], frames), fps)
-    return path
-
-
-@contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A file to write, which takes the place of path once it is complete. If writing fails, path stays as it was.
-
-    Raises:
-        OSError: path is no regular file, or cannot be written; its message names path.
-    """
-    path = Path(path).resolve()
-    part = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
-        if path.exists() and not path.is_file():
-            raise OSError("it is no regular file")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        os.replace(part, path)
-    except OSError as error:
-        raise OSError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            part.unlink()
-
-
-def check_size(width: int, height: int) -> tuple[int, int]:
-    """The size of a picture; raises ValueError unless it can be drawn."""
-    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
-        raise ValueError(f"width and height of a picture are 1 to {LARGEST} pixels, not {width} x {height}")
-    return width, height
-
-
-def check_video(path: str | os.PathLike[str], size: Sequence[int] = VIDEO_SIZE) -> Path:
-    """The path, if a video of this name and size can be encoded here; raises what save_video does."""
-    path = Path(path)
-    if path.suffix not in (".mp4", ".gif"):
-        raise ValueError(f"a video ends in .mp4 or .gif, not {path.suffix!r}")
-    width, height = check_size(*size)
-    if path.suffix == ".gif":
-        if find_spec("PIL") is None:
-            raise RuntimeError("a .gif needs pillow: pip install pillow")
-        return path
-    if find_spec("imageio_ffmpeg") is None:
-        raise RuntimeError("an .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg")
-    if width % BLOCK or height % BLOCK:
-        raise ValueError(f"width and height of an .mp4 are multiples of {BLOCK}; {width} x {height} are not")
-    from imageio_ffmpeg import get_ffmpeg_exe
-
-    try:
-        get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise RuntimeError("no ffmpeg to write an .mp4: pip install --force-reinstall imageio-ffmpeg") from error
-    return path
-
-
-def _write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> None:
-    from imageio_ffmpeg import get_ffmpeg_exe
-
-    height, width, _ = (first := next(frames)).shape
-    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {Fraction(fps).limit_denominator()} -i -"
-    # faststart: browsers begin to play before they have loaded all of it.
-    target = "-vcodec libx264 -pix_fmt yuv420p -crf 15 -preset veryfast -movflags +faststart"
-    command = [get_ffmpeg_exe(), "-y", "-v", "error", *source.split(), *target.split(), os.fspath(path)]
-    with TemporaryFile() as log:
-        with suppress(BrokenPipeError), subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as ffmpeg:
-            assert ffmpeg.stdin
-            for frame in itertools.chain([first], frames):
-                ffmpeg.stdin.write(frame.tobytes())
-        if ffmpeg.returncode or not path.is_file() or path.stat().st_size == 0:
-            log.seek(0)
-            said = log.read().decode(errors="replace").strip().rpartition("\n")[2]
-            raise OSError(f"ffmpeg fails: {said or f'exit status {ffmpeg.returncode}'}")
-
-
-def _write_gif(path: Path, frames: Iterator[Frame], fps: float) -> None:
-    from PIL import Image
-
-    stride = math.ceil(fps / 50 - 1e-6)
-    images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
-    times = [round(100 * k * stride / fps) for k in range(len(images) + 1)]  # hundredths of a second
-    delays = [10 * (b - a) for a, b in itertools.pairwise(times)]  # ms
-    images[0].save(path, save_all=True, append_images=images[1:], duration=delays, loop=0)
-
-
-def _draw_all(renderer: Renderer, qpos: ArrayLike, ctrl: ArrayLike | None) -> Iterator[Frame]:
-    qpos = np.asarray(qpos, dtype=np.float64)
-    if qpos.ndim != 2:
-        raise ValueError(f"qpos must have shape (T, {renderer.model.nq}), not {qpos.shape}")
-    if ctrl is not None:
-        ctrl = _check("ctrl", ctrl, (len(qpos), renderer.model.nu))
-    for t, row in enumerate(qpos):
-        yield renderer.draw(row, None if ctrl is None else ctrl[t])
-
-
-def _check(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
-    return array
-
-
 def _camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera:
     names, view = [model.camera(i).name for i in range(model.ncam)], mujoco.MjvCamera()
     if name is not None and name not in names:
@@ -330,8 +163,8 @@ def _camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera:
     if name is None and "track" not in names:
         mujoco.mjv_defaultFreeCamera(model, view)
         view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
-        return view
-    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name or "track")
+    else:
+        view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name or "track")
     return view
 
 
@@ -365,6 +198,115 @@ def _add_shadows(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvSc
         mujoco.mjv_initGeom(shadow, shape.type, shape.size, place, (project @ shape.mat).ravel(), SHADOW)
         shadow.size[:] = shape.size  # which it takes for that of a model, written in another order
         scene.ngeom += 1
+
+
+# Videos ---------------------------------------------------------------------------------------------------------------
+
+
+def film(
+    path: str | os.PathLike[str],
+    scene: Scene,
+    qpos: ArrayLike,
+    control_dt: float,
+    ctrl: ArrayLike | None = None,
+    size: tuple[int, int] = VIDEO_SIZE,
+) -> Path:
+    """Film qpos (T, nq) and ctrl (T, nu), a row per control step [s], at true speed with at most 30 frames/s.
+
+    See save_video; size is width and height in pixels.
+    """
+    check_video(path, size)
+    stride = max(1, math.ceil(1 / (VIDEO_FPS * control_dt) - 1e-6))
+    shown = None if ctrl is None else np.asarray(ctrl)[::stride]
+    with Renderer(scene, *size) as renderer:
+        return save_video(path, renderer.draw_all(np.asarray(qpos)[::stride], shown), 1 / (stride * control_dt))
+
+
+def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float) -> Path:
+    """Write frames (height, width, 3) as .mp4 (H.264) or .gif, which plays at true speed; returns the file.
+
+    Raises:
+        ValueError: no frames, another suffix, or an mp4 whose width or height is not a multiple of 16.
+        OSError: the file cannot be written.
+        RuntimeError: there is no encoder.
+    """
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError("a video needs at least one frame")
+    path = check_video(path, first.shape[1::-1])
+    with whole_file(path) as part:
+        _encode(part, itertools.chain([first], frames), fps, "x".join(map(str, first.shape[1::-1])))
+    return path
+
+
+def check_size(width: int, height: int) -> tuple[int, int]:
+    """The size of a picture; raises ValueError unless it can be drawn."""
+    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
+        raise ValueError(f"width and height of a picture are 1 to {LARGEST} pixels, not {width} x {height}")
+    return width, height
+
+
+def check_video(path: str | os.PathLike[str], size: Sequence[int] = VIDEO_SIZE) -> Path:
+    """The path, if a video of this name and size can be encoded here; raises what save_video does."""
+    path, (width, height) = Path(path), check_size(*size)
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"a video ends in .mp4 or .gif, not {path.suffix!r}")
+    if path.suffix == ".mp4" and (width % BLOCK or height % BLOCK):
+        raise ValueError(f"width and height of an .mp4 are multiples of {BLOCK}; {width} x {height} are not")
+    _ffmpeg()
+    return path
+
+
+def _ffmpeg() -> str:
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise RuntimeError("no ffmpeg to write videos: pip install --force-reinstall imageio-ffmpeg") from error
+
+
+def _encode(path: Path, frames: Iterable[Frame], fps: float, size: str) -> None:
+    """As imageio_ffmpeg.write_frames does, which neither sees that ffmpeg fails nor keeps what it says."""
+    if path.suffix == ".gif":  # its delays are hundredths of a second, and browsers want at least two of them
+        stride = math.ceil(fps / 50 - 1e-6)
+        frames, fps = itertools.islice(frames, 0, None, stride), fps / stride
+        target = "-lavfi split[a][b];[a]palettegen[colours];[b][colours]paletteuse=dither=none -loop 0"
+    else:  # faststart: browsers begin to play before they have loaded all of it
+        target = "-vcodec libx264 -pix_fmt yuv420p -crf 15 -preset veryfast -movflags +faststart"
+    source = f"-f rawvideo -pix_fmt rgb24 -s {size} -r {Fraction(fps).limit_denominator()} -i -"
+    command = [_ffmpeg(), "-y", "-v", "error", *source.split(), *target.split(), os.fspath(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        assert ffmpeg.stdin
+        with suppress(BrokenPipeError):  # why, stderr says
+            for frame in frames:
+                ffmpeg.stdin.write(frame.tobytes())
+        said = ffmpeg.communicate()[1].decode(errors="replace").strip().rpartition("\n")[2]
+    if ffmpeg.returncode:
+        raise OSError(f"ffmpeg fails: {said or f'exit status {ffmpeg.returncode}'}")
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A file to write, which takes the place of path once it is complete. If writing fails, path stays as it was.
+
+    Raises:
+        OSError: path is no regular file, or cannot be written; its message names path.
+    """
+    path = Path(path).resolve()
+    part = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        if path.exists() and not path.is_file():
+            raise OSError("it is no regular file")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        os.replace(part, path)
+    except OSError as error:
+        raise OSError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink()
 
 
 # OpenGL ---------------------------------------------------------------------------------------------------------------

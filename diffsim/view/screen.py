@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import sys
 import threading
@@ -47,7 +46,7 @@ class Screen:
         if mode not in get_args(RenderMode):
             raise ValueError(f"unknown render_mode {mode!r}; choose from {', '.join(get_args(RenderMode))}")
         self._scene, self._mode, self._fps = scene, mode, fps
-        self._drawer: render.Renderer | Window | None = None
+        self._drawer: Any = None  # a Renderer or a Window
 
     def show(self, qpos: NDArray[np.floating[Any]]) -> Frames | None:
         """Frames of the configurations qpos (N, nq), or None once the first one is in the window.
@@ -57,15 +56,13 @@ class Screen:
         """
         if self._mode == "rgb_array":
             self._drawer = self._drawer or render.Renderer(self._scene, *render.VIDEO_SIZE)
-        elif self._drawer is None:
-            try:
-                self._drawer = Window(self._scene, 1 / self._fps)
-            except RuntimeError as error:
-                raise RuntimeError(f"render_mode 'human' opens a window, but {error}; take 'rgb_array'") from error
-        if isinstance(self._drawer, Window):
-            self._drawer.show(qpos[0])
-            return None
-        return tuple(self._drawer.draw(row, profile=k) for k, row in enumerate(qpos))
+            return tuple(self._drawer.draw(row, profile=k) for k, row in enumerate(qpos))
+        try:
+            self._drawer = self._drawer or Window(self._scene, 1 / self._fps)
+        except RuntimeError as error:
+            raise RuntimeError(f"render_mode 'human' opens a window, but {error}; take 'rgb_array'") from error
+        self._drawer.show(qpos[0])
+        return None
 
     def close(self) -> None:
         """Free what draws, and close the window, if there is one."""
@@ -93,10 +90,9 @@ class Window:
         software = render.check_display()
         import mujoco.viewer
 
-        self.model = model = copy.copy(scene.mj_model)
+        self.model, material = model, _ = render.drawable(scene)
         if software:
             render.lower_quality(model)
-        material = -1 if scene.terrain is None else render.hide_planes(model)
         self.data = mujoco.MjData(model)
         self.speed, self.paused, self.restart = 1.0, False, False
         self._control_dt, self._due = control_dt, time.perf_counter()
@@ -141,18 +137,15 @@ class Window:
 
     def forces(self) -> NDArray[np.float64]:
         """(nbody, 6) by which keys and mouse push in the next control step, as Simulator.forces has them."""
-        model, data, mouse = self.model, self.data, self._handle.perturb
+        mass, mouse = self.model.body_mass, self._handle.perturb
         with self._handle.lock():
-            data.xfrc_applied[:] = 0
+            self.data.xfrc_applied[:] = 0
             if mouse.select > 0 and mouse.active:
-                mujoco.mjv_applyPerturbForce(model, data, mouse)
-                pull, most = (
-                    np.linalg.norm(data.xfrc_applied[mouse.select, :3]),
-                    MAX_PULL * GRAVITY * model.body_mass.sum(),
-                )
-                data.xfrc_applied *= min(1.0, most / max(pull, 1e-9))  # else a robot that runs away is torn back
-            forces = data.xfrc_applied.copy()
-        forces[:, :3] += np.outer(model.body_mass, self._push / self._control_dt)
+                mujoco.mjv_applyPerturbForce(self.model, self.data, mouse)
+            forces = self.data.xfrc_applied.copy()
+        pull = np.linalg.norm(forces[mouse.select, :3])  # limited: a robot that runs away is not torn back
+        forces *= min(1.0, MAX_PULL * GRAVITY * mass.sum() / max(pull, 1e-9))
+        forces[:, :3] += np.outer(mass, self._push / self._control_dt)
         self._push = np.zeros(3)
         return forces
 

@@ -32,13 +32,10 @@ def write_page(
     title: str = "",
     caption: str = "",
 ) -> Path:
-    """Write a page that plays qpos (T, nq), with muscles coloured by ctrl (T, nu) in [-1, 1].
+    """Write a page that plays qpos (T, nq), with muscles coloured by ctrl (T, nu) in [-1, 1]; returns the file.
 
-    Args:
-        path: of the .html.
-        scene: what moves. Meshes are drawn as their boxes, muscles straight from point to point.
-        qpos, ctrl: one row per control step of control_dt seconds.
-        title, caption: text of the page; a caption may have several lines.
+    A row is a control step of control_dt [s]; the path ends in .html. The page says title and caption, which may have
+    several lines. Meshes are drawn as their boxes, muscles straight from point to point.
 
     Raises:
         ValueError: another suffix.
@@ -58,30 +55,21 @@ def write_page(
 
 def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike | None = None) -> dict[str, Any]:
     """What the page draws: shapes once, and of every frame the pose of each body and the activation of each muscle."""
-    model = scene.mj_model
-    qpos = np.asarray(qpos, dtype=np.float64)
-    stride = 1 + qpos.shape[0] * model.nbody * 28 // MAX_BYTES
+    model, qpos = scene.mj_model, np.asarray(qpos, dtype=np.float64)
+    stride = 1 + len(qpos) * model.nbody * 28 // MAX_BYTES
     poses, track = _poses(model, qpos[::stride])
     muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
     activation = np.zeros((len(poses), len(muscles)))
     if ctrl is not None:
         activation = (np.asarray(ctrl, dtype=np.float64)[::stride, muscles].clip(-1, 1) + 1) / 2
-    planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-    rgba = np.where(
-        model.geom_matid[:, None] < 0, model.geom_rgba, model.mat_rgba[model.geom_matid] if model.nmat else 0
-    )
-    shown = np.flatnonzero(~planes & (model.geom_group < HIDDEN_GROUP) & (rgba[:, 3] > 0))
-    geoms = [
-        _shape(
-            mujoco.mjtGeom(model.geom_type[k]).name.removeprefix("mjGEOM_").lower(),
-            int(model.geom_bodyid[k]),
-            model.geom_size[k],
-            model.geom_pos[k],
-            model.geom_quat[k],
-            rgba[k],
-        )
-        for k in shown
-    ]
+    planes, painted = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, model.geom_matid >= 0
+    rgba = model.geom_rgba.copy()
+    rgba[painted] = model.mat_rgba[model.geom_matid[painted]]
+    geoms = []
+    for k in np.flatnonzero(~planes & (model.geom_group < HIDDEN_GROUP) & (rgba[:, 3] > 0)):
+        kind = mujoco.mjtGeom(model.geom_type[k]).name.removeprefix("mjGEOM_").lower()
+        kind, body = kind if kind in SHAPES else "box", model.geom_bodyid[k]
+        geoms.append(_shape(kind, body, model.geom_size[k], model.geom_pos[k], model.geom_quat[k], rgba[k]))
     for size, centre, rotation in [] if scene.terrain is None else slabs(scene.terrain[0]):  # the first profile
         mujoco.mju_mat2Quat(quat := np.empty(4), rotation.ravel())
         geoms.append(_shape("box", 0, size, centre, quat, GROUND))
@@ -115,11 +103,9 @@ def _poses(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> tuple[NDArray[np
     return poses, track
 
 
-def _shape(kind: str, body: int, *places: ArrayLike) -> dict[str, Any]:
-    """A shape on a body, with its size, pos, quat and rgba."""
-    names = ("size", "pos", "quat", "rgba")
-    numbers = {name: _rounded(values) for name, values in zip(names, places, strict=True)}
-    return {"type": kind if kind in SHAPES else "box", "body": body, **numbers}
+def _shape(kind: str, body: int, size: ArrayLike, pos: ArrayLike, quat: ArrayLike, rgba: ArrayLike) -> dict[str, Any]:
+    numbers = {"size": size, "pos": pos, "quat": quat, "rgba": rgba}
+    return {"type": kind, "body": int(body)} | {name: _rounded(values) for name, values in numbers.items()}
 
 
 def _muscle(model: mujoco.MjModel, tendon: int) -> dict[str, Any]:

@@ -160,6 +160,14 @@ FREE = ["ant", "humanoid", "humanoid_mtu"]
 TARGET = {"ant": 10_000.0, "humanoid": 200.0, "humanoid_mtu": 10_000.0}  # m
 SEES_ACTION = ["ant", "humanoid"]
 LEG_START = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0]  # of a muscle-driven leg: hip, knee, ankle, toes
+START = {  # qpos, unperturbed
+    "cartpole": [0, -math.pi],
+    "hopper": [0] * 6,
+    "half_cheetah": [0, -0.2, *[0] * 7],
+    "ant": [0, 0, 0.75, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1],
+    "humanoid": [0, 0, 1.35, 1, 0, 0, 0, *[0] * 21],
+    "humanoid_mtu": [0, 0, 1, 1, 0, 0, 0, *LEG_START, *LEG_START],
+}
 PRINTED = {"rtol": 2e-4, "atol": 6e-5}  # the tables have four digits
 
 every_task = pytest.mark.parametrize("name", list(LINKS))
@@ -277,23 +285,17 @@ def test_muscles_of_the_mtu_humanoid() -> None:
     fibre = scene.hill[:, 1] * data.ten_length + scene.hill[:, 2]
     np.testing.assert_allclose(np.unique(fibre.round(3)), [0.667, 0.8])
     # The two legs are mirror images.
-    sides = {name: [model.actuator(f"{side}_{name[2:]}") for side in "LR"] for name in muscle_names(model, "L_")}
-    assert len(sides) == 76
-    for left, right in sides.values():
-        np.testing.assert_allclose(left.gainprm, right.gainprm)
-
-
-def muscle_names(model: mujoco.MjModel, start: str) -> list[str]:
-    return [model.actuator(i).name for i in range(model.nu) if model.actuator(i).name.startswith(start)]
+    names = {model.actuator(k).name for k in range(model.nu)}
+    assert len(left := [name for name in names if name.startswith("L_")]) == 76
+    for name in left:
+        np.testing.assert_allclose(model.actuator(name).gainprm, model.actuator(f"R_{name[2:]}").gainprm)
 
 
 def test_inertias_are_those_of_the_geoms() -> None:
     """An ant's leg lies along (1, 1, 0): its true inertia is not diagonal, unlike the benchmark's."""
     model = load("ant")
     leg = model.body("leg_1")
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, leg.iquat)
-    axes = axes.reshape(3, 3)
+    axes = matrix(leg.iquat)
     expected = [[0.0686, -0.045, 0], [-0.045, 0.0686, 0], [0, 0, 0.1136]]
     np.testing.assert_allclose(axes @ np.diag(leg.inertia) @ axes.T, expected, rtol=1e-3, atol=5e-5)
 
@@ -471,24 +473,12 @@ def test_gradients(name: str, rng: np.random.Generator) -> None:
 # Resets
 
 
-def middle(name: str, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    task = TASKS[name](dtype=dtype)
-    return task.reset(torch.full((2, task.num_random), 0.5, dtype=dtype))
-
-
 @every_task
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_middle_of_the_draw_is_the_unperturbed_start(name: str, dtype: torch.dtype) -> None:
-    qpos, qvel = middle(name, dtype)
-    start = {
-        "cartpole": [0, -math.pi],
-        "hopper": [0] * 6,
-        "half_cheetah": [0, -0.2, *[0] * 7],
-        "ant": [0, 0, 0.75, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1],
-        "humanoid": [0, 0, 1.35, 1, 0, 0, 0, *[0] * 21],
-        "humanoid_mtu": [0, 0, 1, 1, 0, 0, 0, *LEG_START, *LEG_START],
-    }[name]
-    assert torch.equal(qpos, torch.tensor([start] * 2, dtype=dtype))
+    task = TASKS[name](dtype=dtype)
+    qpos, qvel = task.reset(torch.full((2, task.num_random), 0.5, dtype=dtype))
+    assert torch.equal(qpos, torch.tensor([START[name]] * 2, dtype=dtype))
     assert torch.equal(qvel, torch.zeros_like(qvel))
 
 
@@ -497,13 +487,8 @@ def plain_draws(name: str, q: Array, v: Array) -> Array:
     if name not in FREE:
         size_q = {"cartpole": math.pi / 2, "hopper": 0.05, "half_cheetah": 0.1}[name]
         size_v = {"cartpole": 0.25, "hopper": 0.05, "half_cheetah": 0.25}[name]
-        start = {"cartpole": [0, -math.pi], "hopper": [0] * 6, "half_cheetah": [0, -0.2, *[0] * 7]}[name]
-        return np.concatenate([(q - start) / size_q, v / size_v])
-    start, joints = {
-        "ant": ([0, 0, 0.75], [0, 1, 0, -1, 0, -1, 0, 1]),
-        "humanoid": ([0, 0, 1.35], [0] * 21),
-        "humanoid_mtu": ([0, 0, 1.0], LEG_START * 2),
-    }[name]
+        return np.concatenate([(q - START[name]) / size_q, v / size_v])
+    start, joints = np.split(np.delete(START[name], range(3, 7)), [3])
     angular, turn = np.zeros(3), np.zeros(3)
     mujoco.mju_rotVecQuat(angular, v[3:6], q[3:7])  # body to world
     mujoco.mju_quat2Vel(turn, q[3:7], 1.0)

@@ -9,13 +9,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-import scenes
 import torch
 from learners import SCRIPTS
 from numpy.typing import NDArray
 
 import diffsim
-from diffsim import Scene, Simulator, load_scene
+from diffsim import Scene, load_scene
 from diffsim.training import Evaluation, evaluate, evaluation, load_policy
 from diffsim.view import gait
 from diffsim.view.gait import Gait
@@ -206,17 +205,6 @@ def test_peak_joint_speed_of_hinges_and_balls() -> None:
 
 
 # Depth ----------------------------------------------------------------------------------------------------------------
-
-
-def test_a_resting_ball_is_as_deep_as_the_contact_law_says(tmp_path: Path) -> None:
-    (tmp_path / "ball.xml").write_text(scenes.BALL)
-    scene = load_scene(tmp_path / "ball.xml")
-    sim = Simulator(scene, 1, dtype=torch.float64)
-    qpos, qvel = torch.tensor(scene.qpos0)[None], torch.zeros(1, 6, dtype=torch.float64)
-    qpos[:, 2] = 0.1
-    for _ in range(200):
-        qpos, qvel = sim.step(qpos, qvel, torch.zeros(1, 0, dtype=torch.float64))
-    assert gait.trace(scene, qpos.numpy()).depth.item() == pytest.approx(2 * 9.81 / scene.k_n, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["half_cheetah", "humanoid", "humanoid_mtu"])

@@ -122,48 +122,42 @@ def read_clip(source: str | Path) -> Clip:
         if str(source) not in shipped():
             raise ValueError(f"no such clip: {source}; give an .npz file or one of {', '.join(shipped())}")
         path = shipped()[str(source)]
+
+    def require(holds: object, why: str) -> None:
+        if not holds:
+            raise ValueError(f"clip {path}{why}")
+
     content = _load(path)
-    if "qpos" not in content:
-        raise ValueError(f"clip {path} has no qpos (frames, nq)")
-    if ("fps" in content) == ("dt" in content):
-        raise ValueError(f"clip {path} needs its rate: either fps [1/s] or dt [s]")
+    require("qpos" in content, " has no qpos (frames, nq)")
+    require(("fps" in content) != ("dt" in content), " needs its rate: either fps [1/s] or dt [s]")
     for key, value in content.items():
-        if value.dtype.kind not in "biuf" or (key != "qpos" and value.size != 1):
-            wanted = "real numbers" if key == "qpos" else "one real number"
-            raise ValueError(f"clip {path}: {key} is {value.dtype} {value.shape}, must be {wanted}")
-    qpos = torch.tensor(content["qpos"].astype(np.float64))
-    numbers = {key: float(value.item()) for key, value in content.items() if key != "qpos"}
+        wanted = "real numbers" if key == "qpos" else "one real number"
+        fits = value.dtype.kind in "biuf" and (key == "qpos" or value.size == 1)
+        require(fits, f": {key} is {value.dtype} {value.shape}, must be {wanted}")
+    qpos = torch.tensor(content.pop("qpos").astype(np.float64))
+    numbers = {key: float(value.item()) for key, value in content.items()}
     loop = numbers.get("loop", 1.0)
-    if loop not in (0.0, 1.0):
-        raise ValueError(f"clip {path}: loop is {loop:g}, must be true or false")
+    require(loop in (0.0, 1.0), f": loop is {loop:g}, must be true or false")
     dt = numbers["dt"] if "dt" in numbers else 1.0 / (numbers["fps"] or np.nan)
-    if not 0 < dt < math.inf:
-        raise ValueError(f"clip {path}: a frame takes {dt:g} s; the rate must be positive and finite")
-    if qpos.ndim != 2 or qpos.shape[1] < 8:
-        raise ValueError(f"clip {path}: qpos is {tuple(qpos.shape)}, must be (frames, nq)")
-    far = ~((qpos[:, :3].abs() <= FARTHEST).all(1) & (qpos[:, 3:].abs() <= FASTEST).all(1))
-    if bool(far.any()):
-        why = (
-            f"qpos is not finite or too large in frame {int(far.nonzero()[0])}; at most {FARTHEST:g} m from the origin"
-        )
-        raise ValueError(f"clip {path}: {why}")
+    require(0 < dt < math.inf, f": a frame takes {dt:g} s; the rate must be positive and finite")
+    require(qpos.ndim == 2 and qpos.shape[-1] >= 8, f": qpos is {tuple(qpos.shape)}, must be (frames, nq)")
+    near = (qpos[:, :3].abs() <= FARTHEST).all(1) & (qpos[:, 3:].abs() <= FASTEST).all(1)
+    first = [*near.tolist(), False].index(False)
+    most = f"at most {FARTHEST:g} m from the origin"
+    require(near.all(), f": qpos is not finite or too large in frame {first}; {most}")
     norm = qpos[:, 3:7].norm(dim=1, keepdim=True)
-    if bool((norm < 0.5).any()):
-        raise ValueError(f"clip {path}: columns 3 to 6 of qpos must be the root's quaternion wxyz, and one is near 0")
+    why = ": columns 3 to 6 of qpos must be the root's quaternion wxyz, and one is near 0"
+    require((norm >= 0.5).all(), why)
     frames = (len(qpos) - 1) * dt / CONTROL_DT
-    if not SHORTEST - 1.5 <= frames <= LONGEST:
-        why = f"too {'long' if frames > LONGEST else 'short'}: {frames + 1:.0f} frames at 60 Hz, must be"
-        raise ValueError(f"clip {path} is {why} {SHORTEST} to {LONGEST}")
+    why = f"too {'long' if frames > LONGEST else 'short'}: {frames + 1:.0f} frames at 60 Hz"
+    require(SHORTEST - 1.5 <= frames <= LONGEST, f" is {why}, must be {SHORTEST} to {LONGEST}")
     qpos[:, 3:7] /= norm
     clip = Clip(path.stem, _resample(qpos, round(frames) + 1), bool(loop))
-    if (speed := float(clip.velocity().abs().max())) > FASTEST:
-        raise ValueError(f"clip {path} moves at up to {speed:.2g} m/s or rad/s, must be at most {FASTEST:g}")
+    speed = float(clip.velocity().abs().max())
+    require(speed <= FASTEST, f" moves at up to {speed:.2g} m/s or rad/s, must be at most {FASTEST:g}")
     gap, step = (tangent(a, b)[..., 2:].abs().max() for a, b in (clip.qpos[[0, -1]], (clip.qpos[:-1], clip.qpos[1:])))
-    if loop and gap > SEAM * step:
-        raise ValueError(
-            f"clip {path} is a loop, but its last frame differs from its first by up to {gap:.2g} (m, rad); "
-            "end it where the next round begins, or add loop=False"
-        )
+    why = f"its last frame differs from its first by up to {gap:.2g} (m, rad); end it where the next round begins"
+    require(not loop or gap <= SEAM * step, f" is a loop, but {why}, or add loop=False")
     return clip
 
 

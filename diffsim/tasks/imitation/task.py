@@ -6,8 +6,6 @@ import math
 from importlib.resources import files
 from typing import ClassVar
 
-import mujoco
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,14 +42,16 @@ class HumanoidImitation(Task):
         self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
     ) -> None:
         super().__init__(device, dtype)
-        model = load_scene(str(files("diffsim") / "assets" / self.asset)).mj_model
+        scene = load_scene(str(files("diffsim") / "assets" / self.asset))
+        model, trunk = scene.mj_model, scene.contact_link == 0
         self.clip = read_clip(self.default_clip) if clip is None else clip
         self.clip.check(model)
         self._kinematics = Kinematics(model, device, dtype)
         geoms = [model.geom(name).id for name in END_EFFECTORS]
         self._bodies = torch.tensor(model.geom_bodyid[geoms] - 1, device=device, dtype=torch.int64)
         self._points = torch.tensor(model.geom_pos[geoms], device=device, dtype=dtype)
-        self._trunk, self._radii = (torch.tensor(x, device=device, dtype=dtype) for x in _spheres(model, body=1))
+        self._trunk = torch.tensor(scene.contact_position[trunk], device=device, dtype=dtype)
+        self._radii = torch.tensor(scene.contact_radius[trunk], device=device, dtype=dtype)
 
         self.period = len(self.clip)
         self._qpos, self._qvel = self.clip.qpos[: self.period].to(device, dtype), self.clip.velocity(self.control_dt)
@@ -133,16 +133,3 @@ class HumanoidImitation(Task):
         arms = (rotations.index_select(-3, self._bodies) * self._points.unsqueeze(-2)).sum(-1)
         ends = positions.index_select(-2, self._bodies) + arms
         return ends.flatten(-2), self._kinematics.centre(positions, rotations)
-
-
-def _spheres(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (K, 3) in the body's frame and radii (K,) of its spheres and of the ends of its capsules, m."""
-    centres, radii = list[np.ndarray](), list[float]()
-    for geom in np.flatnonzero(model.geom_bodyid == body):
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-        radius, half = model.geom_size[geom, :2]
-        ends = (-half, half) if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else (0.0,)
-        centres += [model.geom_pos[geom] + end * turn.reshape(3, 3)[:, 2] for end in ends]
-        radii += [radius] * len(ends)
-    return np.array(centres), np.array(radii)
