@@ -447,12 +447,16 @@ class Search:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         for name in self.NUMBERS:
+            if type(state[name]) is not type(getattr(self, name)):
+                raise ValueError(f"{name} is {state[name]!r}")
             setattr(self, name, state[name])
         device = self.system.device
         for name in ("guides", "adapted"):
             setattr(self, name, [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[name]])
         self.lessons, self.student = tuple(t.to(device) for t in state["lessons"]), state["student"].to(device)
         self.rng.set_state(state["rng"])
+        if any(guide.x.shape[-1] != self.system.nx or len(guide.u) != self.args.horizon for guide in self.guides):
+            raise ValueError("a guide is of another robot or horizon")
 
 
 # The policy -----------------------------------------------------------------------------------------------------------
