@@ -509,7 +509,7 @@ class Policy(nn.Module):
         normalizer = ObsNormalizer(len(self.observed))
         normalizer.mean, normalizer.std = self.obs_mean, self.obs_std
         w1, b1, w2, b2 = (w.view(shape) for w, shape in zip(self.theta.split(self.sizes), self.shapes, strict=True))
-        layers = nn.Linear(*w1.mT.shape), nn.Linear(*w2.mT.shape)
+        layers = [nn.utils.skip_init(nn.Linear, *w.mT.shape) for w in (w1, w2)]  # draws no random numbers
         parts = (w1 * self.observed, b1), (self.u_std.unsqueeze(1) * w2, self.u_std * b2 + self.u_mean)
         for layer, (weight, bias) in zip(layers, parts, strict=True):
             layer.weight, layer.bias = nn.Parameter(weight), nn.Parameter(bias)
