@@ -197,9 +197,10 @@ def load_policy(path: Path) -> SavedPolicy:
             if task := TASKS.get(state["args"]["env"]):
                 network(torch.empty(1, task.obs_dim))
         weights = state["policy"]["weights"]
-        if any(weights[name].dtype != kind for name, kind in kinds.items()):
+        if any(w.layout != torch.strided or w.is_meta or not w.is_floating_point() for w in weights.values()):
             raise TypeError
-        network.load_state_dict(weights, assign=True)
+        # A searched policy is in float64.
+        network.load_state_dict({name: w.to(kinds[name]) for name, w in weights.items()}, assign=True)
     except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers or its task")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"])

@@ -134,7 +134,7 @@ def test_weights_are_compared_before_layers_are_built(tmp_path: Path, capsys: py
 
 
 @pytest.mark.parametrize(
-    "weight", [torch.zeros(1, 2).double(), torch.zeros(1, 2).to_sparse(), torch.zeros(1, 2, device="meta"), None]
+    "weight", [torch.zeros(1, 2).long(), torch.zeros(1, 2).to_sparse(), torch.zeros(1, 2, device="meta"), None]
 )
 def test_weights_of_another_kind_are_refused(weight: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "checkpoint.pt"
