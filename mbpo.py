@@ -31,7 +31,7 @@ from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags, parse
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
+from diffsim.training.ranges import Count, Few, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # Policies and values: as SAC's, from Table 3 of the SHAC paper. Rollout lengths: MBPO's released settings.
@@ -70,9 +70,9 @@ class Args(ParallelFlags):
     """control steps of each environment with random actions before anything is learnt"""
     buffer_size: Count = 1_000_000
     """real transitions that are kept, over all environments"""
-    models: Repeats = 7
+    models: Few = 7
     """networks of the ensemble"""
-    elites: Repeats = 5
+    elites: Few = 5
     """of which so many, those that predict held-out transitions best, make the rollouts"""
     model_hidden: Widths = (200, 200, 200, 200)
     """units of the models' hidden layers (per task)"""

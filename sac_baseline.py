@@ -27,7 +27,7 @@ from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags, parse
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
+from diffsim.training.ranges import Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # Table 3 of the SHAC paper; networks, seed steps, hopper and half_cheetah: its authors' released settings.
@@ -94,9 +94,9 @@ class Args(ParallelFlags):
     """control steps of each environment with random actions before the first update (per task)"""
     hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
-    critics: Repeats = 2
+    critics: Few = 2
     """value functions"""
-    critic_subset: Repeats = 2
+    critic_subset: Few = 2
     """the target is the least of so many, drawn anew for each update"""
     layer_norm: bool = False
     """normalize the critics' hidden layers, which steadies many updates on large batches"""

@@ -28,7 +28,7 @@ from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import ParallelFlags, parse
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
+from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
 
 # SHAC's networks; docs/sapo.md has what was measured with these settings, which are those of its best results.
 # fmt: off
@@ -73,11 +73,11 @@ class Args(ParallelFlags):
     """the policy's entropy is part of the reward"""
     state_std: bool = True
     """the standard deviation of the policy's noise depends on the state"""
-    critics: Repeats = 2
+    critics: Few = 2
     """value functions: the least of them makes the targets, their mean the actor's loss"""
     activation: Literal["elu", "silu"] = "silu"
     """nonlinearity of actor and critics (per task)"""
-    population: Repeats = 1
+    population: Few = 1
     """members that learn side by side, each in its share of the environments, until one goes on (per task)"""
     selection: Fraction = 0.5
     """share of the iterations after which the best member goes on in all environments"""

@@ -34,7 +34,8 @@ def _whole(least: int, most: int) -> Range:
 
 Count = Annotated[int, _whole(1, 10**9)]
 Natural = Annotated[int, _whole(0, 10**9)]
-Repeats = Annotated[int, _whole(1, 10_000)]  # passes, networks: what takes time or memory one after the other
+Repeats = Annotated[int, _whole(1, 10_000)]  # what takes time one after the other
+Few = Annotated[int, _whole(1, 1_000)]  # networks side by side
 Width = Annotated[int, _whole(1, 16_384)]
 Finite = Annotated[float, Range("finite", math.isfinite)]
 Positive = Annotated[float, Range("positive", lambda value: value > 0)]

@@ -99,7 +99,7 @@ def save(args: flags.Flags, **further: object) -> Path:
             "--actor-hidden must be from 1 to 16,384, not 4611686018427387904",
         ),
         (sapo, "--actor-hidden", "--actor-hidden must be at least one number, not ()"),
-        (sapo, "--critics 2147483648", "--critics must be from 1 to 10,000, not 2147483648"),
+        (sapo, "--critics 2147483648", "--critics must be from 1 to 1,000, not 2147483648"),
         (sac_baseline, "--hidden", "--hidden must be at least one number, not ()"),
         (sac_baseline, "--target-entropy nan", "--target-entropy must be finite, not nan"),
         (sac_baseline, "--target-entropy inf", "--target-entropy must be finite, not inf"),
