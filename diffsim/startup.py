@@ -8,6 +8,7 @@ import importlib
 import os
 import shutil
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ import warp as wp
 ROOM = 16 * 2**20  # bytes that a kernel takes in Warp's cache at most; LLVM aborts the process when there are fewer
 # What Warp prints when it starts and nobody needs: pip installs a Warp that supports the Python at hand.
 NOISE = (b"Could not find or load the NVIDIA CUDA driver", b"Support for Python 3.10 is deprecated")
+_started, _starting = False, threading.Lock()
 _announced: set[str] = set()
 
 
@@ -80,10 +82,14 @@ def check_kernel_cache() -> Path:
     Raises:
         KernelCacheError: it cannot be written.
     """
+    global _started
     wanted = wp.config.kernel_cache_dir
     try:
-        with _without(*NOISE):
-            wp.init()
+        with _starting:  # stderr is the process's: two threads that hold it back would wait for each other
+            if not _started:
+                with _without(*NOISE):
+                    wp.init()
+                _started = True
         if not os.access(str(wp.config.kernel_cache_dir), os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:

@@ -34,7 +34,7 @@ def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
     folder = folder / "here"
     folder.mkdir(exist_ok=True)
     command = [sys.executable, "-c", program]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder, check=True)
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder, check=True, timeout=120)
 
 
 def test_threads_may_take_first_steps_and_a_damaged_cache_is_compiled_anew(tmp_path: Path) -> None:
