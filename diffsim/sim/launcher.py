@@ -25,6 +25,7 @@ MIN_WORK_PER_THREAD = 4_000
 # Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
+BLOCK, SMALL_BLOCK = 16, 8  # environments that a CPU steps at once, in vectors of float32
 building = threading.RLock()  # Warp crashes where two threads make, compile or load kernels
 
 
@@ -43,6 +44,7 @@ class Launcher:
 
     Attributes:
         spec: what the kernels were generated for.
+        num_blocks: how many blocks of spec.block environments there are, the last of which may not be full.
         nonfinite_gradients: see Simulator.
     """
 
@@ -55,7 +57,9 @@ class Launcher:
         elif division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         implicit = options.integration.integrator == "implicit"
-        self.spec = kernel_spec(scene, division, real, implicit, cuda, options.factors, options.forces)
+        block = 1 if cuda or self.dtype == torch.float64 or num_envs == 1 else BLOCK if num_envs >= BLOCK else SMALL_BLOCK
+        self.spec = kernel_spec(scene, division, real, implicit, cuda, options.factors, options.forces, block)
+        self.num_blocks = -(-num_envs // block)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
         with building:
             self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
@@ -64,9 +68,9 @@ class Launcher:
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
         work = num_envs * options.integration.substeps * scene.nlink
         wanted = 1 if cuda else options.threads or min(available_cores(), max(1, work // MIN_WORK_PER_THREAD))
-        count = min(wanted, num_envs)
-        bounds = [num_envs * k // count for k in range(count + 1)]
-        self._shares = list(zip(bounds, bounds[1:], strict=False))  # environments of each thread: first, end
+        count = min(wanted, self.num_blocks)
+        bounds = [self.num_blocks * k // count for k in range(count + 1)]
+        self._shares = list(zip(bounds, bounds[1:], strict=False))  # blocks of each thread: first, end
         self._pool = ThreadPoolExecutor(count - 1) if count > 1 else None
 
     def command(self, kernel: str, inputs: list[Any]) -> list[wp.Launch]:

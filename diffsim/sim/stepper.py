@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
+from diffsim.kernels.model import types
 from diffsim.sim.integration import Integration
 from diffsim.sim.launcher import Launcher, check_memory
 
@@ -144,8 +145,15 @@ class Stepper:
         widths = (spec.nq, spec.nv, spec.nv, spec.nfactor)
         numbers = count * sum(widths)
         check_memory("checkpoints", n, numbers * self._launcher.dtype.itemsize, self._launcher.device)
-        sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
-        return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
+        if spec.block == 1:
+            sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
+            return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
+        blocks = self._launcher.num_blocks
+        self._vectors = [torch.zeros(count, blocks, k, spec.block) for k in widths]  # arrays of the kernels' vectors
+        return [
+            wp.array(ptr=x.data_ptr(), dtype=types(spec).T, shape=x.shape[:-1], strides=[4 * s for s in x.stride()[:-1]])
+            for x in self._vectors
+        ]
 
 
 class ExtrapolatedStepper:
