@@ -79,7 +79,7 @@ def module_options(spec: KernelSpec) -> dict[str, Any]:
         preamble = PREAMBLE.replace("BLOCK", str(spec.block))
         options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=preamble)
         # Nothing but the module calls its functions, so that how they pass vectors is nobody else's matter.
-        options["cpu_compiler_flags"] = f"{wp.config.cpu_compiler_flags or '-march=native'} -Wno-psabi"
+        options["cpu_compiler_flags"] = f"{wp.config.cpu_compiler_flags or '-march=native'} -Wno-psabi -ffp-contract=fast"
     return options
 
 

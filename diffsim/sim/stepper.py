@@ -149,11 +149,15 @@ class Stepper:
             sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
             return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
         blocks = self._launcher.num_blocks
-        self._vectors = [torch.zeros(count, blocks, k, spec.block) for k in widths]  # arrays of the kernels' vectors
-        return [
-            wp.array(ptr=x.data_ptr(), dtype=types(spec).T, shape=x.shape[:-1], strides=[4 * s for s in x.stride()[:-1]])
-            for x in self._vectors
-        ]
+        return [array_of_vectors(torch.zeros(count, blocks, k, spec.block), types(spec).T) for k in widths]
+
+
+def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
+    """Warp's view of (..., block) float32 values: an array of what its kernels take for numbers of that dtype (wide.py)."""
+    strides = [stride * values.itemsize for stride in values.stride()[:-1]]
+    array = wp.array(ptr=values.data_ptr() or None, dtype=dtype, shape=values.shape[:-1], strides=strides, device="cpu")
+    array._tensor = values  # keeps the memory, as Warp's from_torch does
+    return array
 
 
 class ExtrapolatedStepper:
