@@ -23,8 +23,8 @@ from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
-from diffsim.kernels.wide import blocks
 from diffsim.kernels.terrain import terrain_contact
+from diffsim.kernels.wide import blocks
 
 
 @cache

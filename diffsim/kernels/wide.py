@@ -46,8 +46,8 @@ inline wide length(vec_t<3, wide> a) { return sqrt(a.c[0] * a.c[0] + a.c[1] * a.
 inline wide length(const quat_t<wide>& q) { return sqrt(dot(q, q)); }
 inline quat_t<wide> normalize(const quat_t<wide>& q)
 {
-    wide l = length(q), i = 1.0f / l, zero = 0.0f, one = 1.0f;
-    return quat_t<wide>(l > 0.0f ? q.x * i : zero, l > 0.0f ? q.y * i : zero, l > 0.0f ? q.z * i : zero, l > 0.0f ? q.w * i : one);
+    wide l = length(q), zero = 0.0f, one = 1.0f, i = l > zero ? one / l : zero;
+    return quat_t<wide>(q.x * i, q.y * i, q.z * i, l > zero ? q.w * i : one);
 }
 // The sine of x plus `quarters` right angles: reduction by Cody and Waite, polynomials of Cephes. Error below 1e-7 for
 // |x| < 8192, where one more step of the reduction would be needed.
@@ -60,7 +60,8 @@ inline wide turned_sin(wide x, int quarters)
     r = r - k * 7.54978995489188216e-8f;
     wide z = r * r;
     wide s = ((-1.9515295891e-4f * z + 8.3321608736e-3f) * z - 1.6666654611e-1f) * z * r + r;
-    wide c = ((2.443315711809948e-5f * z - 1.388731625493765e-3f) * z + 4.166664568298827e-2f) * z * z - 0.5f * z + 1.0f;
+    wide c = ((2.443315711809948e-5f * z - 1.388731625493765e-3f) * z + 4.166664568298827e-2f) * z * z;
+    c = c - 0.5f * z + 1.0f;
     wide f = (n & 1) != 0 ? c : s;
     return (n & 2) != 0 ? -f : f;
 }
@@ -73,13 +74,16 @@ inline wide tan(wide x) { return sin(x) / cos(x); }
 
 
 def module_options(spec: KernelSpec) -> dict[str, Any]:
+    """Warp's options of a kernel's module."""
     # On the CPU unrolling buys no speed and costs a second of compilation; a GPU keeps small matrices in registers.
     options: dict[str, Any] = {"enable_backward": False, "max_unroll": 6 if spec.env_last else 1}
     if spec.block > 1:
         preamble = PREAMBLE.replace("BLOCK", str(spec.block))
         options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=preamble)
-        # Nothing but the module calls its functions, so that how they pass vectors is nobody else's matter.
-        options["cpu_compiler_flags"] = f"{wp.config.cpu_compiler_flags or '-march=native'} -Wno-psabi -ffp-contract=fast"
+        # A product and a sum become one instruction where there is one, as on a GPU. How functions pass vectors differs
+        # between processors, of which clang warns; nobody but the module calls its functions.
+        target = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+        options["cpu_compiler_flags"] = f"{target} -ffp-contract=fast -Wno-psabi"
     return options
 
 

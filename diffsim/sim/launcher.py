@@ -17,7 +17,7 @@ from diffsim.kernels.lanes import Division, divide
 from diffsim.kernels.model import model_of
 from diffsim.kernels.spec import kernel_spec
 from diffsim.robot.scene import Scene
-from diffsim.sim.options import WARP_DTYPE, Options
+from diffsim.sim.options import BLOCKS, WARP_DTYPE, Options
 
 # Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
 # thread (about 1 ms) it saves nothing. A whole iteration of 64 ants takes 0.22 s with two threads, 0.26 s with one.
@@ -25,7 +25,6 @@ MIN_WORK_PER_THREAD = 4_000
 # Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
-BLOCK, SMALL_BLOCK = 16, 8  # environments that a CPU steps at once, in vectors of float32
 building = threading.RLock()  # Warp crashes where two threads make, compile or load kernels
 
 
@@ -57,7 +56,7 @@ class Launcher:
         elif division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         implicit = options.integration.integrator == "implicit"
-        block = 1 if cuda or self.dtype == torch.float64 or num_envs == 1 else BLOCK if num_envs >= BLOCK else SMALL_BLOCK
+        block = options.block or default_block(num_envs, options)
         self.spec = kernel_spec(scene, division, real, implicit, cuda, options.factors, options.forces, block)
         self.num_blocks = -(-num_envs // block)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
@@ -109,6 +108,13 @@ def default_division(scene: Scene, num_envs: int) -> Division:
     candidates = [divide(scene, groups * sharers, sharers) for groups in (1, 2, 4)]
     best = min(candidates, key=lambda division: (division.slots, division.threads_per_env))
     return best if best.threads_per_env * num_envs <= MAX_THREADS else divide(scene)
+
+
+def default_block(num_envs: int, options: Options) -> int:
+    """Of the numbers of environments that a thread can step at once, the fastest as measured in docs/performance.md."""
+    if torch.device(options.device).type == "cuda" or options.dtype == torch.float64 or num_envs == 1:
+        return 1
+    return max(block for block in BLOCKS if block <= max(num_envs, 8))
 
 
 def available_cores() -> int:

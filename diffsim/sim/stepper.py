@@ -153,10 +153,10 @@ class Stepper:
 
 
 def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
-    """Warp's view of (..., block) float32 values: an array of what its kernels take for numbers of that dtype (wide.py)."""
-    strides = [stride * values.itemsize for stride in values.stride()[:-1]]
-    array = wp.array(ptr=values.data_ptr() or None, dtype=dtype, shape=values.shape[:-1], strides=strides, device="cpu")
-    array._tensor = values  # keeps the memory, as Warp's from_torch does
+    """(..., block) float32 values as an array of vectors, which to Warp are numbers of that dtype (kernels.wide)."""
+    strides = tuple(stride * values.itemsize for stride in values.stride()[:-1])
+    array: Any = wp.array(ptr=values.data_ptr() or None, dtype=dtype, shape=values.shape[:-1], strides=strides)
+    array.tensor = values  # keeps the memory
     return array
 
 
