@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
+import math
 import os
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import mujoco
 import torch
@@ -39,12 +40,17 @@ import diffsim
 from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
 from diffsim.sim.launcher import available_cores
+from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
 from diffsim.training.evaluation import make_env
 
-Precision = Literal["float32", "float64"]
-DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
+KernelName = Literal["blocks", "scalar", "float64"]
+KERNELS: dict[KernelName, dict[str, Any]] = {
+    "blocks": {},  # float32; on a CPU in vectors of environments
+    "scalar": {"block": 1},
+    "float64": {"dtype": torch.float64},
+}
 PartName = Literal["physics", "scaling", "training", "time"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; the scaling table leaves out larger settings
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
@@ -57,7 +63,11 @@ class Args(ScriptFlags):
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
     scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
     horizons: tuple[Count, ...] = (1, 4, 8, 16, 32, 64, 128)  # horizons of the scaling table, at 64 environments
-    dtype: tuple[Precision, ...] = ("float32", "float64")  # precisions of the physics table
+    kernels: tuple[KernelName, ...] = (
+        "blocks",
+        "scalar",
+        "float64",
+    )  # those of the physics table, scalar on a CPU only
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
     script: str = "shac"  # script of the training table, in the repository's root, without .py
@@ -137,33 +147,38 @@ def mujoco_timer(scene: Scene, num_envs: int, substeps: int) -> Callable[[State]
 
 
 def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
-    """With all models of its muscles if a task has any, and without; beside MuJoCo."""
+    """Beside MuJoCo: with all models of its muscles and without, if a task has any; the hopper also on rough ground."""
     threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()} if args.device == "cpu" else {args.device: 1}
     default, whole = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs=1).scene
     scenes = {"": whole}
     if "muscle" in whole.features:
-        scenes = {model: dataclasses.replace(whole, muscle_model=model) for model in ("linear", "hill")}
-        scenes["none"] = whole.without("muscle")
+        scenes = {f"{kind} muscles": dataclasses.replace(whole, muscle_model=kind) for kind in ("linear", "hill")}
+        scenes["no muscles"] = whole.without("muscle")
+    if name == "hopper":
+        scenes["rough ground"] = whole.with_terrain(rough(0))
+    kernels = [kernel for kernel in args.kernels if args.device == "cpu" or kernel != "scalar"]
     for num_envs in args.num_envs:
         reference = "", "", "mj_step"
         competitors = {reference: mujoco_timer(whole, num_envs, default.substeps)}
-        for (muscles, scene), dtype, (place, count) in product(scenes.items(), args.dtype, threads.items()):
-            sim = simulator(scene, default, num_envs, DTYPES[dtype], device=args.device, threads=count)
-            competitors[muscles, dtype, place] = timer(sim)
+        for (scene_name, scene), kernel, (place, count) in product(scenes.items(), kernels, threads.items()):
+            sim = simulator(scene, default, num_envs, device=args.device, threads=count, **KERNELS[kernel])
+            competitors[scene_name, kernel, place] = timer(sim)
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
         per_substep = num_envs * default.substeps
         mj = times.pop(reference)["mj_step"] / per_substep
-        for (muscles, precision, place), t in times.items():
+        for (scene_name, kernel, place), t in times.items():
             forward, backward = t["forward"] / per_substep, t["backward"] / per_substep
+            scalar = times.get((scene_name, "scalar", place), {"forward": math.nan, "backward": math.nan})
             yield {
                 "task": name,
                 "environments": num_envs,
-                "precision": precision,
+                "scene": scene_name,
+                "kernel": kernel,
                 "device": place,
-                "muscles": muscles,
                 "forward (us/substep)": forward,
                 "backward (us/substep)": backward,
-                "backward/forward": backward / forward,
+                "forward/scalar": t["forward"] / scalar["forward"],
+                "backward/scalar": t["backward"] / scalar["backward"],
                 "mj_step, one core (us/substep)": mj,
                 "mj_step/forward": mj / forward,
             }
@@ -316,7 +331,7 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
 
 
 PARTS: dict[PartName, Part] = {
-    "physics": Part("speed_physics", measure_physics, ("task", "environments", "precision", "device", "muscles")),
+    "physics": Part("speed_physics", measure_physics, ("task", "environments", "scene", "kernel", "device")),
     "scaling": Part("speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique")),
     "training": Part("speed_training", measure_training, ("task", "environments", "device", "script")),
     "time": Part("time", measure_time, ("task",), "time", "experiments.md"),
