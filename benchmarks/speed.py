@@ -16,13 +16,13 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
-import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -31,6 +31,7 @@ from typing import Any, Literal, TypeVar
 
 import mujoco
 import torch
+import warp as wp
 from common import Panel, Part, TaskName, lines, measured, plot, run
 from motions import CONTROL_DT, shac, simulator
 from runner import ScriptFlags
@@ -39,7 +40,7 @@ from tables import ROOT, Row, read_csv
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
-from diffsim.sim.launcher import available_cores
+from diffsim.sim.launcher import Launcher, available_cores
 from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
@@ -93,8 +94,25 @@ def random_states(name: str, num_envs: int, count: int) -> list[State]:
     return states
 
 
+@contextmanager
+def kernel_time() -> Iterator[list[float]]:
+    """Seconds of each launch of kernels meanwhile; on a GPU, which does not wait for them, meaningless."""
+    seconds, launch = list[float](), Launcher.launch
+
+    def timed_launch(self: Launcher, command: list[wp.Launch]) -> None:
+        start = time.perf_counter()
+        launch(self, command)
+        seconds.append(time.perf_counter() - start)
+
+    Launcher.launch = timed_launch  # type: ignore[method-assign]
+    try:
+        yield seconds
+    finally:
+        Launcher.launch = launch  # type: ignore[method-assign]
+
+
 def timer(sim: Simulator) -> Callable[[State], Times]:
-    """Times one differentiated control step, forward and backward, as a learner sees it."""
+    """Times one differentiated control step, forward and backward, as a learner sees it, and of it the kernels."""
     synchronize = torch.cuda.synchronize if sim.device.type == "cuda" else lambda: None
 
     def time_step(state: State) -> Times:
@@ -102,12 +120,16 @@ def timer(sim: Simulator) -> Callable[[State], Times]:
         gradients = [torch.ones_like(x) for x in inputs[:2]]
         synchronize()
         start = time.perf_counter()
-        outputs = sim.step(*inputs)
+        with kernel_time() as forward:
+            outputs = sim.step(*inputs)
         synchronize()
         middle = time.perf_counter()
-        torch.autograd.grad(outputs, inputs, gradients)
+        with kernel_time() as backward:
+            torch.autograd.grad(outputs, inputs, gradients)
         synchronize()
-        return {"forward": 1e6 * (middle - start), "backward": 1e6 * (time.perf_counter() - middle)}
+        whole = {"forward": middle - start, "backward": time.perf_counter() - middle}
+        kernels = {"forward kernel": sum(forward), "backward kernel": sum(backward)}
+        return {what: 1e6 * seconds for what, seconds in (whole | kernels).items()}
 
     return time_step
 
@@ -167,21 +189,18 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
         per_substep = num_envs * default.substeps
         mj = times.pop(reference)["mj_step"] / per_substep
         for (scene_name, kernel, place), t in times.items():
-            forward, backward = t["forward"] / per_substep, t["backward"] / per_substep
-            scalar = times.get((scene_name, "scalar", place), {"forward": math.nan, "backward": math.nan})
-            yield {
+            scalar = times.get((scene_name, "scalar", place), {})
+            row: dict[str, object] = {
                 "task": name,
                 "environments": num_envs,
                 "scene": scene_name,
                 "kernel": kernel,
                 "device": place,
-                "forward (us/substep)": forward,
-                "backward (us/substep)": backward,
-                "forward/scalar": t["forward"] / scalar["forward"],
-                "backward/scalar": t["backward"] / scalar["backward"],
-                "mj_step, one core (us/substep)": mj,
-                "mj_step/forward": mj / forward,
             }
+            row |= {f"{what} (us/substep)": microseconds / per_substep for what, microseconds in t.items()}
+            ratios = {what: t[what] / scalar[what] for what in scalar if "kernel" in what}
+            row |= {f"{what}/scalar": ratio for what, ratio in ratios.items()}
+            yield row | {"mj_step, one core (us/substep)": mj, "mj_step/forward": mj * per_substep / t["forward"]}
 
 
 def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: int) -> list[float]:
