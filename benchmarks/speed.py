@@ -188,7 +188,7 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
         per_substep = num_envs * default.substeps
         mj = times.pop(reference)["mj_step"] / per_substep
-        for (scene_name, kernel, place), t in times.items():
+        for (scene_name, kind, place), t in times.items():
             scalar = times.get((scene_name, "scalar", place), {})
             row: dict[str, object] = {
                 "task": name,
