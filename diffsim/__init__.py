@@ -48,6 +48,7 @@ def make(
     substeps: int | None = None,
     integrator: str | None = None,
     theta: float | None = None,
+    passes: int | None = None,
     accuracy: Accuracy = "default",
     contact: Contact = "soft",
     penalty: Mapping[str, float] | None = None,
@@ -64,9 +65,10 @@ def make(
         seed, horizon: see DiffEnv.
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
             docs/accuracy.md has what each costs and how much it errs.
-        substeps, integrator, theta: each in place of the preset's, if given.
-        contact: "soft" (the paper's) or "firm" (as MuJoCo's): the constants of contact and limits and how they are
-            integrated; docs/transfer.md has what each costs and how much of a policy's speed is true.
+        substeps, integrator, theta, passes: each in place of the preset's, if given.
+        contact: "soft" (the paper's), "firm" (springs fitted to MuJoCo's motion) or "mujoco" (MuJoCo's own constraints,
+            see Integration): the laws of contact and limits and how they are integrated; docs/transfer.md has what the
+            first two cost and how much of a policy's speed is true.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
             of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
@@ -90,12 +92,15 @@ def make(
     else:
         raise ValueError(f"task {name!r} tracks no clip; {HumanoidImitation.name} does")
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
+    integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes)
+    if penalty and integration.integrator == "mujoco":
+        raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
     scene = scene.with_penalty(task.penalty(contact) | dict(penalty or {}))
     return DiffEnv(
         task,
         scene if terrain is None else scene.with_terrain(terrain),
         num_envs,
-        integration=task.integration(accuracy, contact).replaced(integrator, substeps, theta),
+        integration=integration,
         seed=seed,
         horizon=horizon,
         device=device,

@@ -61,9 +61,9 @@ def gradients(scene, states, weights, dtype=torch.float64, optional=None, **simu
     return [leaf.grad.double().numpy() for leaf in leaves]
 
 
-def differences(scene, states, weights, optional=None, **simulator):
+def differences(scene, states, weights, optional=None, scale=1.0, **simulator):
     """The same by central differences of fourth order, all in one batch; small steps, as contacts make corners."""
-    optional, steps = optional or {}, (1e-7, 1e-6, 1e-5, *(STEPS[name] for name in optional or {}))
+    optional, steps = optional or {}, (1e-7 * scale, 1e-6 * scale, 1e-5 * scale, *map(STEPS.get, optional or {}))
     rows, states = len(states[0]), [*states, *(x.reshape(len(x), -1) for x in optional.values())]
     sizes = [x.shape[1] for x in states]
     eps, splits = np.repeat(steps, sizes), np.cumsum(sizes)[:-1]

@@ -21,6 +21,7 @@ from functools import cache
 import warp as wp
 
 from diffsim.kernels.base import base_inertia
+from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
 from diffsim.kernels.exchange import lane_sums
@@ -43,10 +44,13 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     Model, Law, Place, law_of = t.Model, t.Law, kin.Place, environment_law(spec)
     join, momentum, load, link_of, qpos_adr = sp.join, sp.momentum, kin.load, kin.link_of, kin.qpos_adr
     contact, drag, force, joint = contact_law(spec), drag_law(spec), external_force(spec), joint_law(spec)
-    muscle, base = muscle_law(spec, adjoint=True), base_inertia(spec)
+    muscle, base, constraint = muscle_law(spec, adjoint=True), base_inertia(spec), constraint_law(spec)
+    CONSTRAINED, SOLVES, NV = spec.constrained, spec.solves, spec.nv
+    DAMPED = SOLVES > 1  # after the constraints are solved
     CONTACT, DRAG, TERRAIN, DRIVEN, MUSCLE, HILL, LIMIT = (
         name in spec.features for name in ("contact", "drag", "terrain", "motor", "muscle", "hill", "limit")
     )
+    LIMIT = LIMIT and not spec.constrained  # the penalty law
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     read, write, pick = block.read, block.write, block.pick
@@ -93,11 +97,24 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(DRAG):
             adj_w = adj_w - drag.drag_wrench(m, k, R, com, V)
             adj_v = adj_v + drag.drag_adjoint(m, k, R, com, V, W)
-        if wp.static(CONTACT):
+        if wp.static(CONTACT and not CONSTRAINED):
             adj_a, adj_v, adj_w, adj_p = contact.add_contacts_adjoint(
                 m, law, k, R, x, V, A, W, place, h, theta, adj_a, adj_v, adj_w, adj_p, adj_factors
             )
         return adj_a, adj_v, adj_w, adj_p
+
+    @wp.func
+    def damping_adjoint(m: Model, law: Law, k: int, R: mat3, x: vec3, D: vec6, W: vec6, adj_factors: t.array):
+        """The adjoints of D and W in W . I D, with I the inertia of one link."""
+        com = x + R * vec3(m.com[k])
+        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        adj_d = momentum(T(m.mass[k]), com, inertia, W)
+        adj_w = momentum(T(m.mass[k]), com, inertia, D)
+        if wp.static(VARIED):
+            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
+            adj_d = law.mass * adj_d
+            adj_w = law.mass * adj_w
+        return adj_d, adj_w
 
     @wp.func
     def hand_out(out: t.array2, e: int, column: int, drop: T, value: T):
@@ -187,6 +204,16 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             by_rate = wp.zeros(shape=NU, dtype=T)
             power = wp.zeros(shape=NU, dtype=T)
             path = wp.zeros(shape=NU, dtype=T)
+        if wp.static(CONSTRAINED):
+            B = wp.zeros(shape=SLOTS, dtype=vec6)  # as in the forward kernel, and its adjoint
+            adj_b = wp.zeros(shape=SLOTS, dtype=vec6)
+            rate = wp.zeros(shape=SLOTS, dtype=T)  # acceleration before damping
+        if wp.static(DAMPED):
+            W1 = wp.zeros(shape=SLOTS, dtype=vec6)  # lambda of the constraints' solve; W and lam are of the sum
+            lam1 = wp.zeros(shape=SLOTS, dtype=T)
+            D = wp.zeros(shape=SLOTS, dtype=vec6)  # what damping takes from B
+            adj_d = wp.zeros(shape=SLOTS, dtype=vec6)
+            adj_w1 = wp.zeros(shape=SLOTS, dtype=vec6)
         R[0] = wp.identity(3, dtype=T)
         end = row0 + substeps - 1
         if wp.static(NBALL > 0):
@@ -248,6 +275,13 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
                 A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v))
+                if wp.static(CONSTRAINED):
+                    B[0] = join(R[0] * wdot, vdot + vec3(m.gravity))
+                if wp.static(DAMPED):
+                    vdot1 = vec3(load(ck_a, row, NV, e), load(ck_a, row, NV + 1, e), load(ck_a, row, NV + 2, e))
+                    wdot1 = vec3(load(ck_a, row, NV + 3, e), load(ck_a, row, NV + 4, e), load(ck_a, row, NV + 5, e))
+                    D[0] = join(R[0] * wdot1, vdot1) - B[0]
+                    B[0] = B[0] + D[0]
             place = kin.place_links(m, at, n, q, R, x, S, place)
             for i in range(1, n):
                 k = at + i
@@ -259,39 +293,82 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 qdd = load(ck_a, row, VADR + link_of(m, k), e)
                 A[i] = A[p] + S[i] * qdd + wp.spatial_cross(V[turning], S[i] * qd[i])
                 W[i] = vec6()
-            # 2. lambda = -M^-1 g; on the way in, W holds the articulated bias force
-            W[0] = vec6()
-            for j in range(1, slots + 1):
-                i = slots - j
-                if wp.static(THREADS_PER_ENV > SHARERS):
-                    if i == TRUNK:
-                        sums.limbs.add_vectors(W)
-                if i > 0 and i < n:
+                if wp.static(CONSTRAINED):
+                    rate[i] = load(ck_a, row, (SOLVES - 1) * NV + VADR + link_of(m, k), e)
+                    B[i] = B[p] + S[i] * rate[i]
+                if wp.static(DAMPED):
+                    D[i] = D[p] + S[i] * (rate[i] - qdd)
+            # 2. lambda = -M^-1 g; on the way in, W holds the articulated bias force. Of the damping's solve first, whose
+            # forces the acceleration before it has moved by -J'HJ lambda; then of the constraints', W1, with M + J'HJ.
+            for solve in range(SOLVES):
+                factor_row = SOLVES * row + solve
+                if wp.static(DAMPED):
+                    for i in range(n):
+                        W1[i] = W[i]
+                        lam1[i] = lam[i]
+                        W[i] = vec6()
+                        u[i] = -h * gqd[i]
+                        if solve == 1:
+                            u[i] = T(0.0)
+                            if i > 0:
+                                held = constraint.joint_constraint(m, law, at + i, q[i], qd[i], rate[i], T(0.0))
+                                u[i] = -held[1] * lam[i]
+                    if wp.static(CONTACT):
+                        if solve == 1:
+                            for i in range(FIRST, n):
+                                W[i] = constraint.contact_response(m, law, at + i, R[i], x[i], V[i], B[i], W1[i], place)
+                            if wp.static(SHARERS > 1):
+                                sums.sharers.add_vectors(W)
+                else:
+                    W[0] = vec6()
+                for j in range(1, slots + 1):
+                    i = slots - j
+                    if wp.static(THREADS_PER_ENV > SHARERS):
+                        if i == TRUNK:
+                            sums.limbs.add_vectors(W)
+                    if i > 0 and i < n:
+                        p = m.parent[at + i]
+                        if wp.static(DAMPED):
+                            ui = u[i] - wp.dot(S[i], W[i])
+                        else:
+                            ui = -h * gqd[i] - wp.dot(S[i], W[i])
+                        u[i] = ui
+                        if wp.static(FLOATING) or p > 0:
+                            f0 = 7 * (link_of(m, at + i) - 1)
+                            Ui = vec6()
+                            for r in range(6):
+                                Ui[r] = load(ck_f, factor_row, f0 + r, e)
+                            W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, factor_row, f0 + 6, e))
+                if wp.static(FLOATING):
+                    force = join(R[0] * gw, gv) * (-h)
+                    if wp.static(DAMPED):
+                        force = force * T(1 - solve)
+                    W[0] = base.solve_base(ck_f, factor_row, e, force - W[0])
+                for i in range(1, n):
                     p = m.parent[at + i]
-                    ui = -h * gqd[i] - wp.dot(S[i], W[i])
-                    u[i] = ui
-                    if wp.static(FLOATING) or p > 0:
-                        f0 = 7 * (link_of(m, at + i) - 1)
-                        Ui = vec6()
-                        for r in range(6):
-                            Ui[r] = load(ck_f, row, f0 + r, e)
-                        W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, row, f0 + 6, e))
-            if wp.static(FLOATING):
-                W[0] = base.solve_base(ck_f, row, e, join(R[0] * gw, gv) * (-h) - W[0])
-            for i in range(1, n):
-                p = m.parent[at + i]
-                f0 = 7 * (link_of(m, at + i) - 1)
-                UW = T(0.0)
-                for r in range(6):
-                    UW = UW + load(ck_f, row, f0 + r, e) * W[p][r]
-                lam[i] = (u[i] - UW) * load(ck_f, row, f0 + 6, e)
-                W[i] = W[p] + S[i] * lam[i]
+                    f0 = 7 * (link_of(m, at + i) - 1)
+                    UW = T(0.0)
+                    for r in range(6):
+                        UW = UW + load(ck_f, factor_row, f0 + r, e) * W[p][r]
+                    lam[i] = (u[i] - UW) * load(ck_f, factor_row, f0 + 6, e)
+                    W[i] = W[p] + S[i] * lam[i]
+            if wp.static(DAMPED):
+                for i in range(n):
+                    both = W[i] + W1[i]
+                    W1[i] = W[i]
+                    W[i] = both
+                    lam[i] = lam[i] + lam1[i]
             # 3. the partial derivatives of phi, link by link
             for i in range(1, INERT + 1):
                 adj_a[i] = vec6()
                 adj_v[i] = vec6()
                 adj_w[i] = vec6()
                 adj_p[i] = vec6()
+                if wp.static(CONSTRAINED):
+                    adj_b[i] = vec6()
+                if wp.static(DAMPED):
+                    adj_d[i] = vec6()
+                    adj_w1[i] = vec6()
             for i in range(FIRST, n):
                 la, lv, lw, lp = link_adjoint(
                     m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, h, theta, adj_factors
@@ -300,6 +377,19 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 adj_v[i] = lv
                 adj_w[i] = lw
                 adj_p[i] = lp
+                if wp.static(CONSTRAINED and CONTACT):
+                    lv, lw, lp, l_twist = constraint.add_contacts_adjoint(
+                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, lv, lw, lp, adj_factors
+                    )
+                    adj_v[i] = lv
+                    adj_w[i] = lw
+                    adj_p[i] = lp
+                    adj_b[i] = l_twist
+                if wp.static(DAMPED):
+                    # Without damping W1 . I (A + D) takes the place of its part in W . I A.
+                    ld, lw1 = damping_adjoint(m, law, at + i, R[i], x[i], D[i], W1[i], adj_factors)
+                    adj_d[i] = ld
+                    adj_w1[i] = lw1
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, at, n, forces, e, R, x, W, adj_w, adj_p, adj_forces)
             if wp.static(MUSCLE):
@@ -312,6 +402,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 sums.sharers.add_vectors(adj_v)
                 sums.sharers.add_vectors(adj_w)
                 sums.sharers.add_vectors(adj_p)
+                if wp.static(CONSTRAINED):
+                    sums.sharers.add_vectors(adj_b)
+                if wp.static(DAMPED):
+                    sums.sharers.add_vectors(adj_d)
+                    sums.sharers.add_vectors(adj_w1)
             for j in range(1, slots + 1):
                 i = slots - j
                 if wp.static(THREADS_PER_ENV > SHARERS):
@@ -320,6 +415,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         sums.limbs.add_vectors(adj_v)
                         sums.limbs.add_vectors(adj_w)
                         sums.limbs.add_vectors(adj_p)
+                        if wp.static(CONSTRAINED):
+                            sums.limbs.add_vectors(adj_b)
+                        if wp.static(DAMPED):
+                            sums.limbs.add_vectors(adj_d)
+                            sums.limbs.add_vectors(adj_w1)
                 if i > 0 and i < n:
                     k = at + i
                     p = m.parent[k]
@@ -339,6 +439,12 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                             by = joint.limit_constants_gain(m, law, k, qi, qd[i], end_rate, theta * h)
                             adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - lam[i] * by[0]
                             adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - lam[i] * by[1]
+                    if wp.static(CONSTRAINED):
+                        of_held = constraint.joint_gain(m, law, k, q[i], qd[i], rate[i])
+                        gain = gain + vec2(of_held[0], of_held[1])
+                        if wp.static(VARIED):
+                            if m.carried[k] == 1:  # of the lanes that have the joint
+                                adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - lam[i] * of_held[2]
                     kv = gain[1]
                     if wp.static(IMPLICIT):
                         kv = kv + theta * h * gain[0]
@@ -351,6 +457,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         - wp.dot(adj_a[i], wp.spatial_cross(S[i], A[p]))
                         - lam[i] * gain[0]
                     )
+                    if wp.static(CONSTRAINED):
+                        gq[i] = gq[i] - wp.dot(adj_b[i], wp.spatial_cross(S[i], B[p]))
+                    if wp.static(DAMPED):
+                        gq[i] = gq[i] - wp.dot(adj_d[i], wp.spatial_cross(S[i], D[p]))
+                        gq[i] = gq[i] - wp.dot(adj_w1[i], wp.spatial_cross(S[i], W1[p]))
                     gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[turned], adj_a[i]), S[i]) - lam[i] * kv
                     gtau[i] = gtau[i] - lam[i]
                     if wp.static(NBALL > 0):
@@ -360,6 +471,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         adj_v[p] = adj_v[p] + adj_v[i]
                         adj_w[p] = adj_w[p] + adj_w[i]
                         adj_p[p] = adj_p[p] + adj_p[i]
+                        if wp.static(CONSTRAINED):
+                            adj_b[p] = adj_b[p] + adj_b[i]
+                        if wp.static(DAMPED):
+                            adj_d[p] = adj_d[p] + adj_d[i]
+                            adj_w1[p] = adj_w1[p] + adj_w1[i]
             if wp.static(BALL_SPRING):
                 # The spring sees the rotation vector, whose derivative in the tangent space is not the identity.
                 for b in range(m.ball_count[lane]):
@@ -376,6 +492,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 xv = adj_v[0] - wp.spatial_cross_dual(vp, adj_a[0])
                 tq = adj_p[0] - wp.spatial_cross_dual(vp, xv)
                 tq = tq - wp.spatial_cross_dual(wl, adj_w[0]) - wp.spatial_cross_dual(ap, adj_a[0])
+                if wp.static(CONSTRAINED):
+                    tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(B[0])), adj_b[0])
+                if wp.static(DAMPED):
+                    tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(D[0])), adj_d[0])
+                    tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(W1[0])), adj_w1[0])
                 tw = xv - wp.spatial_cross_dual(V[0], adj_a[0])
                 gp = gp + wp.spatial_bottom(adj_p[0])
                 gr = gr + wp.transpose(R[0]) * wp.spatial_top(tq)

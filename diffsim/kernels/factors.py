@@ -20,11 +20,15 @@ def environment_law(spec: KernelSpec) -> wp.Function:
     t = types(spec)
     T, Model, Law, read = t.T, t.Model, t.Law, blocks(spec).read
     CONTACT, VARIED, TERRAIN = "contact" in spec.features, spec.varied, "terrain" in spec.features
+    CONSTRAINED = spec.constrained
 
     @wp.func
     def law_of(m: Model, factors: t.array2, e: int):
         law = Law()
-        if wp.static(CONTACT):
+        if wp.static(CONTACT and CONSTRAINED and VARIED):
+            law.k_n = read(factors, e, K_N)  # of stiffness over inertia, so of the time constant's inverse square
+            law.mu = read(factors, e, MU)
+        if wp.static(CONTACT and not CONSTRAINED):
             law.k_n = T(m.k_n)
             law.k_d = T(m.k_d)
             law.k_t = T(m.k_t)

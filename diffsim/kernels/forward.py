@@ -12,6 +12,7 @@ from functools import cache
 import warp as wp
 
 from diffsim.kernels.base import base_inertia
+from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
 from diffsim.kernels.exchange import lane_sums
@@ -34,13 +35,15 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
     contact, drag, force, joint = contact_law(spec), drag_law(spec), external_force(spec), joint_law(spec)
-    muscle, base = muscle_law(spec, adjoint=False), base_inertia(spec)
+    muscle, base, constraint = muscle_law(spec, adjoint=False), base_inertia(spec), constraint_law(spec)
     CONTACT, DRAG, TERRAIN, MOTOR, MUSCLE, HILL = (
         name in spec.features for name in ("contact", "drag", "terrain", "motor", "muscle", "hill")
     )
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
+    # With MuJoCo's constraints the penalty law of contact is not used, and a step takes several solves.
+    CONSTRAINED, SOLVES, PASSES = spec.constrained, spec.solves, spec.passes
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
-    VADR = spec.dof0 - 1  # link i's joint in qvel is VADR + i
+    NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
 
@@ -59,7 +62,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         F = wp.spatial_cross_dual(V, sp.momentum(mass, com, inertia, V))
         if wp.static(DRAG):
             F = F - drag.drag_wrench(m, k, R, com, V)
-        if wp.static(CONTACT):
+        if wp.static(CONTACT and not CONSTRAINED):
             Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, h, theta, Ia, Ib, Id, F)
         return Ia, Ib, Id, F
 
@@ -94,7 +97,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         ck_v: t.array3,
         ck_a: t.array3,
         ck_f: t.array3,
-        # state out
+        # state out; with constraints the last column of qvel_out is how far the last pass moved the acceleration
         qpos_out: t.array2,
         qvel_out: t.array2,
         nonfinite: wp.array(dtype=wp.bool),
@@ -158,6 +161,15 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             v = vec3(read(qvel, e, 0), read(qvel, e, 1), read(qvel, e, 2))
             w = vec3(read(qvel, e, 3), read(qvel, e, 4), read(qvel, e, 5))
 
+        if wp.static(CONSTRAINED):
+            Ia0 = wp.zeros(shape=SLOTS, dtype=mat3)  # inertias and bias forces without constraints
+            Ib0 = wp.zeros(shape=SLOTS, dtype=mat3)
+            Id0 = wp.zeros(shape=SLOTS, dtype=mat3)
+            P0 = wp.zeros(shape=SLOTS, dtype=vec6)
+            B = wp.zeros(shape=SLOTS, dtype=vec6)  # the twist if the rates were the accelerations, see constraint.py
+            guess = wp.zeros(shape=SLOTS, dtype=T)  # acceleration of the last pass, and that of the base
+            residual = T(0.0)
+
         for sub in range(substeps):
             row = row0 + sub
             if wp.static(TERRAIN):
@@ -214,72 +226,177 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 force.add_forces(m, at, n, forces, e, R, x, P)
             if wp.static(MUSCLE):
                 muscle.add_muscles(m, lane, pull, tension, lengths, rates, R, x, V, P)
-            # 2. inward: articulated inertias
-            if wp.static(SHARERS > 1):
-                sums.sharers.add_inertias(Ia, Ib, Id, P)
-            for j in range(1, slots + 1):
-                i = slots - j
-                if wp.static(THREADS_PER_ENV > SHARERS):
-                    if i == TRUNK:
-                        sums.limbs.add_inertias(Ia, Ib, Id, P)
-                if i > 0 and i < n:
-                    k = at + i
-                    p = m.parent[k]
-                    sa = wp.spatial_top(S[i])
-                    sl = wp.spatial_bottom(S[i])
-                    Ua = Ia[i] * sa + Ib[i] * sl
-                    Ul = sa * Ib[i] + Id[i] * sl
-                    Ui = join(Ua, Ul)
-                    d = wp.dot(S[i], Ui) + T(m.armature[k])
-                    qi = q[i]
-                    if wp.static(IMPLICIT):
-                        qi = qi + theta * h * qd[i]
-                        resistance = joint.passive_resistance(m, law, k, qi, qd[i])
-                        d = d + theta * h * h * resistance[0] + h * resistance[1]
-                    di = T(1.0) / d
-                    ui = motor[i] + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
-                    if wp.static(FLOATING) or p > 0:
-                        va = Ua * di
-                        vl = Ul * di
-                        ca = wp.spatial_top(C[i])
-                        cl = wp.spatial_bottom(C[i])
-                        bias = join(Ia[i] * ca + Ib[i] * cl, ca * Ib[i] + Id[i] * cl)
-                        P[p] = P[p] + P[i] + bias + join(va, vl) * (ui - wp.dot(Ui, C[i]))
-                        Ia[p] = Ia[p] + Ia[i] - wp.outer(Ua, va)
-                        Ib[p] = Ib[p] + Ib[i] - wp.outer(Ua, vl)
-                        Id[p] = Id[p] + Id[i] - wp.outer(Ul, vl)
-                    U[i] = Ui
-                    dinv[i] = di
-                    u[i] = ui
+            # 2. inward: articulated inertias. With constraints each pass is a step of Newton's method, the first one as if
+            # all of them stuck. MuJoCo's implicit damping is one pass more: (M + h b) change = -h b a.
+            begin = 0
+            end = 1
+            factor_row = row
+            if wp.static(CONSTRAINED):
+                end = int(PASSES) + int(SOLVES) - 1
+                last_change = T(wp.inf)
+                wdot = vec3()
+                vdot = vec3()
+                A[0] = join(vec3(), -vec3(m.gravity))
+                if wp.static(FLOATING):
+                    A[0] = A[0] - join(vec3(), wp.cross(R[0] * w, v))
+                B[0] = vec6()
+                for i in range(n):
+                    Ia0[i] = Ia[i]
+                    Ib0[i] = Ib[i]
+                    Id0[i] = Id[i]
+                    P0[i] = P[i]
+                    guess[i] = T(0.0)
+                    if i > 0:
+                        A[i] = A[m.parent[at + i]] + C[i]
+                        B[i] = vec6()
+            for solve in range(begin, end):
+                if wp.static(CONSTRAINED):
+                    newton = wp.where(solve < PASSES, 1, 0)
+                    stuck = T(wp.where(solve == 0, 1, 0))
+                    factor_row = SOLVES * row + (SOLVES - 1) * newton
+                    for i in range(n):
+                        Ia[i] = Ia0[i]
+                        Ib[i] = Ib0[i]
+                        Id[i] = Id0[i]
+                        P[i] = P0[i]
+                        if newton == 0:
+                            P[i] = vec6()
+                            C[i] = vec6()
+                    if wp.static(CONTACT):
+                        if newton == 1:
+                            for i in range(FIRST, n):
+                                ia, ib, id, f = constraint.add_contacts(
+                                    m, law, at + i, R[i], x[i], V[i], A[i], B[i], place, stuck, Ia[i], Ib[i], Id[i], P[i]
+                                )
+                                Ia[i] = ia
+                                Ib[i] = ib
+                                Id[i] = id
+                                P[i] = f
+                if wp.static(SHARERS > 1):
+                    sums.sharers.add_inertias(Ia, Ib, Id, P)
+                for j in range(1, slots + 1):
+                    i = slots - j
+                    if wp.static(THREADS_PER_ENV > SHARERS):
+                        if i == TRUNK:
+                            sums.limbs.add_inertias(Ia, Ib, Id, P)
+                    if i > 0 and i < n:
+                        k = at + i
+                        p = m.parent[k]
+                        sa = wp.spatial_top(S[i])
+                        sl = wp.spatial_bottom(S[i])
+                        Ua = Ia[i] * sa + Ib[i] * sl
+                        Ul = sa * Ib[i] + Id[i] * sl
+                        Ui = join(Ua, Ul)
+                        d = wp.dot(S[i], Ui) + T(m.armature[k])
+                        qi = q[i]
+                        if wp.static(IMPLICIT):
+                            qi = qi + theta * h * qd[i]
+                            resistance = joint.passive_resistance(m, law, k, qi, qd[i])
+                            d = d + theta * h * h * resistance[0] + h * resistance[1]
+                        if wp.static(CONSTRAINED):
+                            damper = h * T(m.damping[k])
+                            ui = -damper * guess[i]
+                            if newton == 1:
+                                held = constraint.joint_constraint(m, law, k, qi, qd[i], guess[i], stuck)
+                                ui = motor[i] + joint.passive_force(m, law, k, qi, qd[i]) + held[0] + held[1] * guess[i]
+                                d = d + held[1]
+                            else:
+                                d = d + damper
+                            ui = ui - wp.dot(S[i], P[i])
+                        else:
+                            ui = motor[i] + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
+                        di = T(1.0) / d
+                        if wp.static(FLOATING) or p > 0:
+                            va = Ua * di
+                            vl = Ul * di
+                            ca = wp.spatial_top(C[i])
+                            cl = wp.spatial_bottom(C[i])
+                            bias = join(Ia[i] * ca + Ib[i] * cl, ca * Ib[i] + Id[i] * cl)
+                            P[p] = P[p] + P[i] + bias + join(va, vl) * (ui - wp.dot(Ui, C[i]))
+                            Ia[p] = Ia[p] + Ia[i] - wp.outer(Ua, va)
+                            Ib[p] = Ib[p] + Ib[i] - wp.outer(Ua, vl)
+                            Id[p] = Id[p] + Id[i] - wp.outer(Ul, vl)
+                        U[i] = Ui
+                        dinv[i] = di
+                        u[i] = ui
+                        if record == 1:
+                            f0 = 7 * (link_of(m, k) - 1)
+                            for r in range(6):
+                                store(ck_f, factor_row, f0 + r, e, Ui[r])
+                            store(ck_f, factor_row, f0 + 6, e, di)
+                # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base)
+                A[0] = join(vec3(), -vec3(m.gravity))
+                if wp.static(SOLVES > 1):
+                    A[0] = A[0] * T(newton)
+                if wp.static(FLOATING):
+                    L, a0 = base.factor_base(Ia[0], Ib[0], Id[0], -P[0])
+                    A[0] = a0
+                    turning_up = wp.transpose(R[0]) * wp.spatial_top(a0)
+                    speeding_up = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + vec3(m.gravity)
                     if record == 1:
-                        f0 = 7 * (link_of(m, k) - 1)
-                        for r in range(6):
-                            store(ck_f, row, f0 + r, e, Ui[r])
-                        store(ck_f, row, f0 + 6, e, di)
-            # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base) and the new state
-            A[0] = join(vec3(), -vec3(m.gravity))
+                        base.store_base(ck_f, factor_row, e, L)
+                for i in range(1, n):
+                    ai = A[m.parent[at + i]] + C[i]
+                    qdd = (u[i] - wp.dot(U[i], ai)) * dinv[i]
+                    A[i] = ai + S[i] * qdd
+                    u[i] = qdd
+                if wp.static(CONSTRAINED):
+                    if newton == 1:
+                        change = T(0.0)
+                        size = T(1.0)
+                        if wp.static(FLOATING):
+                            change = wp.length_sq(turning_up - wdot) + wp.length_sq(speeding_up - vdot)
+                            size = size + wp.length_sq(turning_up) + wp.length_sq(speeding_up)
+                        for i in range(1, n):
+                            change = change + (u[i] - guess[i]) * (u[i] - guess[i])
+                            size = size + u[i] * u[i]
+                        if wp.static(THREADS_PER_ENV > 1):
+                            change = sums.add(change)
+                            size = sums.add(size)
+                        # Newton's method may go to and fro between zones: where a step is no shorter, half of it.
+                        part = pick(last_change, change, T(0.5), T(1.0))
+                        last_change = change
+                        if solve == PASSES - 1:
+                            residual = wp.max(residual, wp.sqrt(change / size))
+                        if wp.static(FLOATING):
+                            wdot = wdot + part * (turning_up - wdot)
+                            vdot = vdot + part * (speeding_up - vdot)
+                            turning_up = wdot
+                            speeding_up = vdot
+                            B[0] = join(R[0] * wdot, vdot)
+                            A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v) - vec3(m.gravity))
+                        for i in range(1, n):
+                            p = m.parent[at + i]
+                            guess[i] = guess[i] + part * (u[i] - guess[i])
+                            u[i] = guess[i]
+                            A[i] = A[p] + C[i] + S[i] * guess[i]
+                            B[i] = B[p] + S[i] * guess[i]
+                    else:
+                        if wp.static(FLOATING):
+                            turning_up = wdot + turning_up
+                            speeding_up = vdot + wp.spatial_bottom(a0)
+                        for i in range(1, n):
+                            u[i] = guess[i] + u[i]
+            # 4. the new state
             if wp.static(FLOATING):
-                L, a0 = base.factor_base(Ia[0], Ib[0], Id[0], -P[0])
-                A[0] = a0
-                wdot = wp.transpose(R[0]) * wp.spatial_top(a0)
-                vdot = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + vec3(m.gravity)
                 if record == 1:
-                    base.store_base(ck_f, row, e, L)
                     for k in range(3):
-                        store(ck_a, row, k, e, vdot[k])
-                        store(ck_a, row, 3 + k, e, wdot[k])
-                v = v + h * vdot
-                w = w + h * wdot
+                        store(ck_a, row, k, e, speeding_up[k])
+                        store(ck_a, row, 3 + k, e, turning_up[k])
+                        if wp.static(SOLVES > 1):
+                            store(ck_a, row, NV + k, e, vdot[k])
+                            store(ck_a, row, NV + 3 + k, e, wdot[k])
+                v = v + h * speeding_up
+                w = w + h * turning_up
                 pos = pos + h * v
                 rot = wp.normalize(rot * exp_quat(h * w))
             for i in range(1, n):
-                ai = A[m.parent[at + i]] + C[i]
-                qdd = (u[i] - wp.dot(U[i], ai)) * dinv[i]
-                A[i] = ai + S[i] * qdd
-                qd[i] = qd[i] + h * qdd
+                qd[i] = qd[i] + h * u[i]
                 q[i] = q[i] + h * qd[i]
                 if record == 1:
-                    store(ck_a, row, VADR + link_of(m, at + i), e, qdd)
+                    store(ck_a, row, VADR + link_of(m, at + i), e, u[i])
+                    if wp.static(SOLVES > 1):
+                        store(ck_a, row, NV + VADR + link_of(m, at + i), e, guess[i])
             if wp.static(NBALL > 0):
                 for b in range(m.ball_count[lane]):
                     i = m.ball_slot[lane * NBALL + b]
@@ -300,6 +417,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(THREADS_PER_ENV > 1):
             broken = sums.add(broken)
         block.write_flags(nonfinite, e, broken)
+        if wp.static(CONSTRAINED):
+            write(qvel_out, e, NV, pick(T(0.0), broken, T(0.0), residual))
         if wp.static(FLOATING):
             for k in range(3):
                 hand_back(qpos_out, qpos, e, k, broken, pos[k])

@@ -26,6 +26,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     T, Model, Law = t.T, t.Model, t.Law
     vec2, pick = t.vec2, blocks(spec).pick
     STIFFNESS, DAMPING, LIMIT = (name in spec.features for name in ("stiffness", "damping", "limit"))
+    LIMIT = LIMIT and not spec.constrained
     VARIED = spec.varied
 
     @wp.func

@@ -16,7 +16,7 @@ from diffsim.robot.scene import Scene
 @cache
 def scene_types(dtype: type) -> SimpleNamespace:
     """Warp's vector types of a scene's numbers, and their struct."""
-    vec3, vec4, vec9 = (wp.types.vector(n, dtype) for n in (3, 4, 9))
+    vec3, vec4, vec9, vec11 = (wp.types.vector(n, dtype) for n in (3, 4, 9, 11))
     mat3 = wp.types.matrix((3, 3), dtype)
 
     @wp.struct
@@ -69,6 +69,10 @@ def scene_types(dtype: type) -> SimpleNamespace:
         contact_begin: wp.array(dtype=int)  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
+        # MuJoCo's constraints, read by the integrator mujoco only: robot/constraint.py has their order
+        contact_numbers: wp.array(dtype=vec11)
+        limit_numbers: wp.array(dtype=vec11)
+        joint_loss: wp.array(dtype=vec3)
         body_begin: wp.array(dtype=int)  # bodies of entry k are body_begin[k] .. body_begin[k + 1]
         body: wp.array(dtype=int)
         body_com: wp.array(dtype=vec3)
@@ -87,7 +91,7 @@ def scene_types(dtype: type) -> SimpleNamespace:
         k_t: dtype
         mu: dtype
 
-    return SimpleNamespace(vec3=vec3, vec4=vec4, vec9=vec9, mat3=mat3, Model=Model)
+    return SimpleNamespace(vec3=vec3, vec4=vec4, vec9=vec9, vec11=vec11, mat3=mat3, Model=Model)
 
 
 @cache
@@ -257,6 +261,12 @@ class _Writer:
             contact_position=(scene.contact_position[sphere], self.t.vec3),
             contact_radius=(scene.contact_radius[sphere], self.dtype),
         )
+        if scene.constraints is not None:
+            self.put(
+                contact_numbers=(scene.constraints.contact[sphere], self.t.vec11),
+                limit_numbers=(scene.constraints.limit[self.link], self.t.vec11),
+                joint_loss=(scene.constraints.loss[self.link], self.t.vec3),
+            )
         for name in ("k_n", "k_d", "k_t", "mu"):
             setattr(self.model, name, self.dtype(getattr(scene, name)))
         vertices = np.zeros((1, 1, 2)) if scene.terrain is None else scene.terrain

@@ -29,6 +29,7 @@ class KernelSpec:
     trunk: int
     slots: int
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
+    passes: int  # of Newton's method on MuJoCo's constraints (constraint.py), 0 with the laws of springs and dampers
 
     @property
     def floating(self) -> bool:
@@ -46,6 +47,15 @@ class KernelSpec:
     @property
     def nq(self) -> int:
         return self.nv + int(self.floating) + self.nball
+
+    @property
+    def constrained(self) -> bool:
+        return self.passes > 0
+
+    @property
+    def solves(self) -> int:
+        """Linear systems of a substep that its adjoint needs: MuJoCo's damping is one more, after the constraints'."""
+        return 2 if self.constrained and "damping" in self.features else 1
 
     @property
     def nfactors(self) -> int:
@@ -67,6 +77,7 @@ def kernel_spec(
     varied: bool = False,
     forced: bool = False,
     block: int = 1,
+    passes: int = 0,
 ) -> KernelSpec:
     limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
     return KernelSpec(
@@ -86,4 +97,5 @@ def kernel_spec(
         trunk=division.trunk,
         slots=division.slots,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
+        passes=passes,
     )

@@ -39,6 +39,12 @@ inline wide atan2(wide y, wide x)
         y[k] = atan2(y[k], x[k]);
     return y;
 }
+inline wide pow(wide x, wide y)
+{
+    for (int k = 0; k < BLOCK; ++k)
+        x[k] = pow(x[k], y[k]);
+    return x;
+}
 template <> inline wide muladd<wide>(wide a, wide b, wide c) { return c + a * b; }
 inline vec_t<3, wide> abs(vec_t<3, wide> a) { return vec_t<3, wide>(abs(a.c[0]), abs(a.c[1]), abs(a.c[2])); }
 template <unsigned N> inline wide length(vec_t<N, wide> a) { return sqrt(dot(a, a)); }

@@ -93,6 +93,7 @@ class PairLaw(NamedTuple):
     condim: int
     friction: float
     solref: tuple[float, float]
+    solimp: tuple[float, ...] = ()
 
 
 def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
@@ -124,17 +125,19 @@ def _collide(m: mujoco.MjModel, a: int, b: NDArray[np.int64]) -> NDArray[np.bool
 
 
 def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
-    """The geom of higher priority decides; of equals friction and condim are the larger, solref is the mean."""
+    """The geom of higher priority decides; of equals friction and condim are the larger, solref and solimp the mean."""
     geoms = [a, b]
     if m.geom_priority[a] != m.geom_priority[b]:
         geoms = [a if m.geom_priority[a] > m.geom_priority[b] else b] * 2
     solref, weight = m.geom_solref[geoms], m.geom_solmix[geoms]
+    weights = weight if weight.min() >= 0 and 0 < weight.sum() < np.inf else None
     if geoms[0] == geoms[1] or not (solref[:, 0] > 0).all():
         mixed = solref.min(0)
     else:
-        mixed = np.average(solref, axis=0, weights=weight if weight.min() >= 0 and 0 < weight.sum() < np.inf else None)
+        mixed = np.average(solref, axis=0, weights=weights)
+    solimp = np.average(m.geom_solimp[geoms], axis=0, weights=weights)
     friction = float(m.geom_friction[geoms, 0].max())
-    return PairLaw(int(m.geom_condim[geoms].max()), friction, (float(mixed[0]), float(mixed[1])))
+    return PairLaw(int(m.geom_condim[geoms].max()), friction, (float(mixed[0]), float(mixed[1])), tuple(solimp.tolist()))
 
 
 # Constants ------------------------------------------------------------------------------------------------------------

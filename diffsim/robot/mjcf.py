@@ -29,7 +29,7 @@ from diffsim.robot.constants import (
 )
 from diffsim.robot.refuse import obstacles, overflows
 from diffsim.robot.report import approximations, troubles
-from diffsim.robot.scene import Array, Scene, SceneError
+from diffsim.robot.scene import Array, Scene, SceneError, Spheres
 
 MOST_BYTES = 2e6  # of an MJCF without its meshes; MuJoCo takes half a minute for them
 
@@ -276,7 +276,8 @@ class _Reader:
     def _contacts(self, mass: float, slide: NDArray[np.bool_]) -> dict[str, Any]:
         m = self.m
         data, pairs = at_rest(m), ground_pairs(m)
-        spheres = self._outer_spheres([sphere for _, geom in pairs for sphere in self._spheres(geom)], slide)
+        every = [sphere for _, geom in pairs for sphere in self._spheres(geom)]
+        spheres = self._outer_spheres(every, slide)
         points = []  # the lowest one of each sphere in the reference pose
         for sphere in spheres:
             body = m.geom_bodyid[sphere.geom]
@@ -285,6 +286,12 @@ class _Reader:
             points.append((body, centre - [0.0, 0.0, sphere.radius]))
         laws = [pair_law(m, pairs[0][0], sphere.geom) for sphere in spheres]
         return self._contact_constants(mass, points, laws) | {
+            "spheres": Spheres(
+                np.array([sphere.link for sphere in every], np.int32),
+                np.array([sphere.centre for sphere in every]).reshape(-1, 3),
+                np.array([sphere.radius for sphere in every]),
+                np.array([sphere.geom for sphere in every], np.int32),
+            ),
             "contact_link": np.array([sphere.link for sphere in spheres], np.int32),
             "contact_position": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
             "contact_radius": np.array([sphere.radius for sphere in spheres]),

@@ -131,9 +131,9 @@ def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
     """What must be finite, by kind and attribute; (n,) or (n, ...) each."""
     fields = {
         Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat"),
-        Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solmix margin"),
+        Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solimp solmix margin gap"),
         Kind.mjOBJ_SITE: ("site", "pos"),
-        Kind.mjOBJ_JOINT: ("jnt", "pos axis range stiffness solref margin"),
+        Kind.mjOBJ_JOINT: ("jnt", "pos axis range stiffness solref solimp margin"),
         Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange gainprm biasprm lengthrange"),
     }
     table = {k: {f: getattr(m, f"{prefix}_{f}") for f in names.split()} for k, (prefix, names) in fields.items()}
@@ -255,20 +255,21 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Obstacle]:
 def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
     dof, limited, (low, high) = m.jnt_dofadr, m.jnt_limited != 0, m.jnt_range.T
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
-    passive = (m.dof_armature[dof] != 0) | (m.dof_damping[dof] != 0) | (m.jnt_stiffness != 0)
+    loss = m.dof_frictionloss[dof]
+    passive = (m.dof_armature[dof] != 0) | (m.dof_damping[dof] != 0) | (m.jnt_stiffness != 0) | (loss != 0)
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
     curved = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(_any(m, "dof_dampingpoly"))])
     rules = {
         "damping and stiffness are linear here, one number each": curved | _any(m, "jnt_stiffnesspoly"),
         "springs that yield are not simulated": _any(m, "jnt_springyield") | plastic,
-        "frictionloss is not simulated": m.dof_frictionloss[dof],
+        "frictionloss {loss:g} is negative": loss < 0,
         "the limit of a ball joint is not simulated": ball & limited,
-        "a free joint has no armature, damping or stiffness here": free & passive,
+        "a free joint has no armature, damping, stiffness or frictionloss here": free & passive,
         "one free joint, of the first moving body, is simulated": free & ~first,
         "range {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
     }
-    yield from _where(m, Kind.mjOBJ_JOINT, rules, low=low, high=high)
+    yield from _where(m, Kind.mjOBJ_JOINT, rules, low=low, high=high, loss=loss)
     wrong = np.array([_wrong(solref) for solref in m.jnt_solref], str)
     yield from _where(m, Kind.mjOBJ_JOINT, {"solreflimit {wrong}": limited & (wrong != "")}, wrong=wrong)
 

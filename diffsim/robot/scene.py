@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.sim.integration import is_real
+
+if TYPE_CHECKING:
+    from diffsim.robot.constraint import Constraints
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -37,6 +40,15 @@ class SceneError(ValueError):
 
 class TerrainError(ValueError):
     """A terrain that cannot be made of its name, or not for a robot."""
+
+
+class Spheres(NamedTuple):
+    """All that may touch the ground, in the frames of their links."""
+
+    link: Index  # (n,)
+    centre: Array  # (n, 3)
+    radius: Array  # (n,)
+    geom: Index  # (n,) what they are part of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,7 +96,8 @@ class Scene:
     segment_muscle: Index  # (ns,) whose path it is
     hill: Array  # (nu, 9) numbers of the Hill-type model (kernels/hill.py), NaN where not a <muscle>
     muscle_model: str  # "linear" (the paper's: force = maximum force times activation) or "hill"
-    # Spheres that may touch the ground
+    spheres: Spheres
+    # Those that have a spring and a damper, as they do not lie inside another one in every pose
     contact_link: Index  # (nc,)
     contact_position: Array  # (nc, 3)
     contact_radius: Array  # (nc,)
@@ -99,6 +112,7 @@ class Scene:
     density: float = 0.0  # kg/m^3, of the fluid around the robot
     viscosity: float = 0.0  # kg/(m s)
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
+    constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
     approximations: tuple[str, ...] = ()  # what the file asks for and is simulated only roughly, a sentence each
 
     def __post_init__(self) -> None:
@@ -147,7 +161,7 @@ class Scene:
     @property
     def features(self) -> frozenset[str]:
         """What this scene uses; the generated kernels hold nothing else."""
-        limited = np.isfinite(self.lower) | np.isfinite(self.upper)
+        limited, constrained = np.isfinite(self.lower) | np.isfinite(self.upper), self.constraints is not None
         present = {
             "floating": self.floating,
             "hinge": bool((~self.slide & (self.ball < 0))[1:].any()),
@@ -155,7 +169,8 @@ class Scene:
             "ball": self.nball > 0,
             "contact": self.ncontact > 0,
             "terrain": self.ncontact > 0 and self.terrain is not None,
-            "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0))).any()),
+            "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0) | constrained)).any()),
+            "frictionloss": constrained and bool(self.constraints.loss[:, 0].any()),
             "stiffness": bool(self.stiffness.any()),
             "damping": bool(self.damping.any()),
             "motor": bool((self.motor_link > 0).any()),

@@ -5,7 +5,9 @@ from __future__ import annotations
 from numbers import Integral, Real
 from typing import NamedTuple
 
-INTEGRATORS = ("semi_implicit", "implicit", "extrapolated")
+INTEGRATORS = ("semi_implicit", "implicit", "extrapolated", "mujoco")
+MOST_PASSES = 1000
+PASSES = 4  # at four substeps MuJoCo's own acceleration, to rounding in most states: docs/physics.md
 
 
 class Integration(NamedTuple):
@@ -13,23 +15,30 @@ class Integration(NamedTuple):
 
     Attributes:
         integrator: "semi_implicit" (Euler), "implicit" (linearly implicit in damping, friction and, scaled by theta,
-            stiffness) or "extrapolated" (from two semi-implicit steps, one of half the substeps; second order at 1.5
-            times the cost).
+            stiffness), "extrapolated" (from two semi-implicit steps, one of half the substeps; second order at 1.5
+            times the cost) or "mujoco" (MuJoCo's Euler, with its own laws of contact, limits and dry friction in place
+            of springs and dampers).
         substeps: integration steps in one control step; even if extrapolated.
         theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); 0 unless implicit.
+        passes: of Newton's method on MuJoCo's constraints, in each substep; not read by the other integrators.
     """
 
     integrator: str = "semi_implicit"
     substeps: int = 16
     theta: float = 0.0
+    passes: int = PASSES
 
-    def replaced(self, integrator: str | None, substeps: int | None, theta: float | None) -> Integration:
+    def replaced(
+        self, integrator: str | None, substeps: int | None, theta: float | None, passes: int | None = None
+    ) -> Integration:
         """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
         new = self
         if integrator is not None and integrator != self.integrator:
             new = Integration(integrator, self.substeps)
         if substeps is not None:
             new = new._replace(substeps=substeps)
+        if passes is not None:
+            new = new._replace(passes=passes)
         return new if theta is None else new._replace(theta=theta)
 
     def check(self) -> Integration:
@@ -43,7 +52,7 @@ class Integration(NamedTuple):
             raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
         if self.theta and self.integrator != "implicit":
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
-        return self._replace(substeps=substeps)
+        return self._replace(substeps=substeps, passes=check_count("passes", self.passes, MOST_PASSES))
 
 
 def is_real(value: object) -> bool:

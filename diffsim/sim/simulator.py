@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 import torch
 
+from diffsim.robot.constraint import check_springs, constrained
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory
@@ -42,6 +43,8 @@ class Simulator:
             step is differentiable in them too. (N, 0, 6) without the argument.
         nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s. Their
             state is returned as it was before that step, its gradient is zero; other environments are not touched.
+        residual: (N,) how far the last pass of the integrator mujoco moved the acceleration, relative to its norm + 1,
+            in that substep of the last step where it is largest; zeros with other integrators.
         nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
     """
 
@@ -69,6 +72,10 @@ class Simulator:
         width, bodies = len(FACTORS) if self.options.factors else 0, scene.nbody if self.options.forces else 0
         numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width + 6 * bodies)
         check_memory("states and actions", num_envs, numbers * self.dtype.itemsize, self.device)
+        if self.integration.integrator == "mujoco":
+            scene = constrained(scene, control_dt / self.integration.substeps)
+        else:
+            check_springs(scene, self.integration.integrator)
         launcher = Launcher(scene, num_envs, self.options)
         stepper = ExtrapolatedStepper if self.integration.integrator == "extrapolated" else Stepper
         self._stepper = stepper(launcher, self.integration, control_dt, horizon)
@@ -79,6 +86,10 @@ class Simulator:
     @property
     def nonfinite(self) -> torch.Tensor:
         return self._stepper.nonfinite
+
+    @property
+    def residual(self) -> torch.Tensor:
+        return self._stepper.residual
 
     @property
     def factors(self) -> torch.Tensor:

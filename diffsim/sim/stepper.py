@@ -60,7 +60,8 @@ class Stepper:
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step.
         self._widths = (spec.nq, spec.nv, spec.nu, spec.nfactors, 6 * spec.forced)
-        self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
+        self._end_widths = (spec.nq, spec.nv + int(spec.constrained))  # with constraints a column for the residual
+        self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, sum(self._end_widths))
         self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
         self._nonfinite = tensor(slots, n, of=torch.bool)
         self._checkpoint: list[wp.array] | None = None
@@ -71,6 +72,10 @@ class Stepper:
     @property
     def nonfinite(self) -> torch.Tensor:
         return self._nonfinite[self._last]
+
+    @property
+    def residual(self) -> torch.Tensor:
+        return self._end[:, sum(self._widths[:2]) :].sum(1)
 
     def step(self, *start: torch.Tensor) -> State:
         if torch.is_grad_enabled() and any(part.requires_grad for part in start):
@@ -94,7 +99,7 @@ class Stepper:
         torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
         self._last = slot
         self._launcher.launch(self._command("forward", slot))
-        return self._end.clone()
+        return self._end[:, : sum(self._widths[:2])].clone()
 
     def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """The adjoints of qpos, qvel, ctrl, factors and forces from that of the state (N, nq + nv) after the step.
@@ -127,7 +132,7 @@ class Stepper:
             [wp.from_torch(part) for part in buffer.split(widths, dim=1)]
             for buffer, widths in (
                 (self._start[slot], self._widths),
-                (self._end, self._widths[:2]),
+                (self._end, self._end_widths),
                 (self._g_start, self._widths),
                 (self._g_end, self._widths[:2]),
             )
@@ -140,16 +145,20 @@ class Stepper:
         return [*self._scalars, row0, *rows, qpos, *inputs, nonfinite, *g_end, *g_start, blown_up]
 
     def _rows(self, count: int) -> list[wp.array]:
-        """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix."""
+        """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix.
+
+        Where MuJoCo's damping follows the constraints: the acceleration after and before, and the factor of both.
+        """
         spec, n, device = self._launcher.spec, self._launcher.num_envs, str(self._launcher.device)
-        widths = (spec.nq, spec.nv, spec.nv, spec.nfactor)
-        numbers = count * sum(widths)
+        widths = (spec.nq, spec.nv, spec.solves * spec.nv, spec.nfactor)
+        counts = (count, count, count, spec.solves * count)
+        numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
         check_memory("checkpoints", n, numbers * self._launcher.dtype.itemsize, self._launcher.device)
         if spec.block == 1:
-            sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
+            sizes = [(c, k, n) if spec.env_last else (c, n, k) for c, k in zip(counts, widths, strict=True)]
             return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
-        blocks = self._launcher.num_blocks
-        return [array_of_vectors(torch.zeros(count, blocks, k, spec.block), types(spec).T) for k in widths]
+        sizes = [(c, self._launcher.num_blocks, k, spec.block) for c, k in zip(counts, widths, strict=True)]
+        return [array_of_vectors(torch.zeros(size), types(spec).T) for size in sizes]
 
 
 def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:

@@ -16,7 +16,7 @@ from diffsim.sim.integration import Integration
 from diffsim.tasks.mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
-Contact = Literal["soft", "firm"]
+Contact = Literal["soft", "firm", "mujoco"]
 
 
 class Firm(NamedTuple):
@@ -75,6 +75,9 @@ class Task:
         cls.penalty(contact)
         if accuracy not in get_args(Accuracy):
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
+        if contact == "mujoco":
+            exact = Integration("mujoco", 4)
+            return exact._replace(substeps=16) if accuracy == "accurate" else exact
         if contact == "firm":
             firm = cls.firm.integration
             return firm._replace(substeps=4 * firm.substeps) if accuracy == "accurate" else firm
@@ -86,14 +89,14 @@ class Task:
 
     @classmethod
     def penalty(cls, contact: str) -> dict[str, float]:
-        """The constants of contact and limits that "soft" (none: the file's) or "firm" puts in place of the file's.
+        """The constants of contact and limits that "soft" or "mujoco" (none) or "firm" puts in place of the file's.
 
         Raises:
             ValueError: another name, or firm contact of a task that has none.
         """
         if contact not in get_args(Contact):
             raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(get_args(Contact))}")
-        if contact == "soft":
+        if contact in ("soft", "mujoco"):
             return {}
         if not hasattr(cls, "firm"):
             raise ValueError(f"task {cls.name!r} has no firm contact; choose soft")

@@ -1,0 +1,279 @@
+"""MuJoCo's regularised constraints: contact in the elliptic cone, joint limits and dry friction, and their adjoints.
+
+A row of MuJoCo's constraints has a force that depends on the acceleration a of the robot by
+
+    jar = J a + b v + k d(r) r,   D = d(r) / ((1 - d(r)) w),
+
+with v the row's velocity, r < 0 how far it is beyond its margin, d(r) its impedance (`solimp`), k and b from `solref`,
+w its inverse weight. MuJoCo leaves dJ/dt v out of J a, so it is that of the twists B that links would have if the joint
+rates were their accelerations. A limit pushes with -D jar where jar < 0, dry friction with -D jar bounded by +-eta, a
+contact with the three numbers of `cone`. All are linear in a within their zones, with slope -H. So Newton's step of
+MuJoCo's convex problem,
+
+    (M + J'HJ) (a_new - a) = tau + J'f(a) - M a,
+
+is one pass of the articulated-body algorithm with each contact's block X'HX added to its link's inertia, and D to its
+joint's: `add_contacts` and `joint_constraint`.
+
+The adjoint begins at phi = -f . w with w the velocity of the point under lambda: `add_contacts_adjoint`.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.factors import K_N, MU
+from diffsim.kernels.model import types
+from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
+
+
+@cache
+def constraint_law(spec: KernelSpec) -> SimpleNamespace:
+    t, sp, block = types(spec), spatial(spec), blocks(spec)
+    T, U, vec2, vec3, vec4, vec6, mat3, Model, Law = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
+    Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
+    LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
+
+    @wp.func
+    def row(c: Numbers, stiffness: T, r: T):
+        """(D, D' / D, k d r, (k d r)'), primes with respect to r <= 0; stiffness is a factor of k."""
+        x = wp.min(-r / T(c[7]), T(1.0))
+        middle, power = T(c[8]), T(c[9])
+        if c[9] == U(2.0):
+            low = x * x / middle
+            low_slope = T(2.0) * x / middle
+            high = T(1.0) - (T(1.0) - x) * (T(1.0) - x) / (T(1.0) - middle)
+            high_slope = T(2.0) * (T(1.0) - x) / (T(1.0) - middle)
+        else:
+            low_slope = power * wp.pow(x / middle, power - T(1.0))
+            high_slope = power * wp.pow((T(1.0) - x) / (T(1.0) - middle), power - T(1.0))
+            low = low_slope * x / power
+            high = T(1.0) - high_slope * (T(1.0) - x) / power
+        rise = T(c[6]) - T(c[5])
+        d = T(c[5]) + rise * pick(middle, x, high, low)
+        slope = -rise / T(c[7]) * pick(x, T(1.0), pick(middle, x, high_slope, low_slope), T(0.0))
+        k = stiffness * T(c[0])
+        rest = T(1.0) - d
+        return vec4(d / (rest * T(c[4])), slope / (d * rest), k * d * r, k * (d + slope * r))
+
+    @wp.func
+    def cone(D: T, friction: T, squash: T, jar: vec3, stuck: T):
+        """Force of a contact, and the matrix H of minus its derivatives; squash is 1 / impratio.
+
+        Where stuck is 1 it is as if it stuck, however it does.
+        """
+        normal = jar[2]
+        slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
+        sticks = wp.max(stuck, pick(slip, -friction * squash * normal, T(1.0), T(0.0)))
+        slides = wp.max(pick(normal, friction * slip, T(1.0), T(0.0)) - sticks, T(0.0))
+        Dn = sticks * D
+        Dt = Dn / squash
+        Ds = slides * D / (T(1.0) + friction * friction * squash)
+        over = normal - friction * slip
+        inverse = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
+        tx = inverse * jar[0]
+        ty = inverse * jar[1]
+        across = Dt - Ds * over * friction * inverse
+        along = Ds * friction * friction - (across - Dt)
+        nx = -Ds * friction * tx
+        ny = -Ds * friction * ty
+        xy = along * tx * ty
+        f = vec3(-across * jar[0], -across * jar[1], -Dn * normal - Ds * over)
+        H = mat3(across + along * tx * tx, xy, nx, xy, across + along * ty * ty, ny, nx, ny, Dn + Ds)
+        return f, H
+
+    @wp.func
+    def by_friction(D: T, friction: T, squash: T, jar: vec3, w: vec3):
+        """w . df / d friction; only what slides depends on it."""
+        slip = wp.sqrt(jar[0] * jar[0] + jar[1] * jar[1])
+        sticks = pick(slip, -friction * squash * jar[2], T(1.0), T(0.0))
+        slides = pick(jar[2], friction * slip, T(1.0), T(0.0)) - sticks
+        inverse = pick(T(0.0), slip, T(1.0) / slip, T(0.0))
+        mu2 = T(1.0) + friction * friction * squash
+        Ds = slides * D / mu2
+        over = jar[2] - friction * slip
+        change = Ds * (T(2.0) * friction * squash / mu2 * over + slip)  # of the normal force
+        along = inverse * (jar[0] * w[0] + jar[1] * w[1])
+        return change * w[2] + (Ds * over - friction * change) * along
+
+    @wp.func
+    def place(m: Model, c: int, R: mat3, x: vec3, height: T):
+        """Centre of contact sphere c, its distance from the ground, and 1 where that is within its margin, else 0."""
+        centre = x + R * vec3(m.contact_position[c])
+        distance = height + centre[2] - T(m.contact_radius[c])
+        return centre, distance, pick(distance, T(m.contact_numbers[c][10]), T(1.0), T(0.0))
+
+    @wp.func
+    def constants(m: Model, law: Law, c: int):
+        """(stiffness, damping, friction) of contact sphere c."""
+        numbers = m.contact_numbers[c]
+        if wp.static(VARIED):
+            return vec3(law.k_n, wp.sqrt(law.k_n) * T(numbers[1]), law.mu * T(numbers[2]))
+        return vec3(T(1.0), T(numbers[1]), T(numbers[2]))
+
+    @wp.func
+    def contact_state(m: Model, law: Law, c: int, centre: vec3, distance: T, on: T, V: vec6, B: vec6):
+        """MuJoCo's contact point, jar, what row and what constants return; D is 0 where the sphere does not touch."""
+        numbers = m.contact_numbers[c]
+        # The point lies in the middle between the two surfaces.
+        p = centre - vec3(T(0.0), T(0.0), T(m.contact_radius[c]) + T(0.5) * distance)
+        of = constants(m, law, c)
+        state = row(numbers, of[0], wp.min(distance - T(numbers[10]), T(0.0)))
+        jar = point_velocity(B, p) + of[1] * point_velocity(V, p) + vec3(T(0.0), T(0.0), state[2])
+        return p, jar, vec4(on * state[0], state[1], state[2], state[3]), of
+
+    @wp.func
+    def add_contacts(
+        m: Model,
+        law: Law,
+        k: int,
+        R: mat3,
+        x: vec3,
+        V: vec6,
+        A: vec6,
+        B: vec6,
+        height: T,
+        stuck: T,
+        Ia: mat3,
+        Ib: mat3,
+        Id: mat3,
+        F: vec6,
+    ):
+        """Inertia blocks and bias force of link k with its contacts, linear about the acceleration A; stuck as of cone."""
+        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+            centre, distance, on = place(m, c, R, x, height)
+            if block.any_of(on):
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
+                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, stuck)
+                PH = wp.skew(p) * H
+                Ia = Ia - PH * wp.skew(p)
+                Ib = Ib + PH
+                Id = Id + H
+                F = F - force_at(p, f + H * point_velocity(A, p))
+        return Ia, Ib, Id, F
+
+    @wp.func
+    def contact_response(
+        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, W: vec6, height: T
+    ):
+        """X'HX W of link k's contacts: how their force falls with the acceleration W."""
+        wrench = vec6()
+        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+            centre, distance, on = place(m, c, R, x, height)
+            if block.any_of(on):
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
+                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
+                wrench = wrench + force_at(p, H * point_velocity(W, p))
+        return wrench
+
+    @wp.func
+    def add_contacts_adjoint(
+        m: Model,
+        law: Law,
+        k: int,
+        R: mat3,
+        x: vec3,
+        V: vec6,
+        B: vec6,
+        W: vec6,
+        height: T,
+        adj_v: vec6,
+        adj_w: vec6,
+        adj_p: vec6,
+        adj_factors: t.array,  # written if varied only
+    ):
+        """The adjoints of link k with its contacts' part of phi added, and the adjoint of B."""
+        adj_b = vec6()
+        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+            centre, distance, on = place(m, c, R, x, height)
+            if block.any_of(on):
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
+                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
+                w = point_velocity(W, p)
+                g_jar = H * w
+                g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
+                if wp.static(VARIED):
+                    by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(V, p)) + g_jar[2] * state[2]
+                    by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)
+                    adj_factors[K_N] = adj_factors[K_N] + by_k / of[0]
+                    adj_factors[MU] = adj_factors[MU] - T(m.contact_numbers[c][2]) * by_mu
+                G = force_at(p, g_jar)
+                wrench = force_at(p, f)
+                g_p = wp.cross(g_jar, wp.spatial_top(B) + of[1] * wp.spatial_top(V)) - wp.cross(f, wp.spatial_top(W))
+                adj_w = adj_w - wrench
+                adj_v = adj_v + of[1] * G
+                adj_b = adj_b + G
+                # The point follows the sphere's centre, at half its speed up and down.
+                adj_p = adj_p + force_at(centre, vec3(g_p[0], g_p[1], T(0.5) * g_p[2] + g_r))
+                adj_p = adj_p + wp.spatial_cross_dual(of[1] * V + B, G) - wp.spatial_cross_dual(W, wrench)
+        return adj_v, adj_w, adj_p, adj_b
+
+    @wp.func
+    def limit_row(m: Model, law: Law, i: int, q: T):
+        """(D or 0 within the range, D' / D, k d r, (k d r)'), and the direction in which the joint returns."""
+        numbers = m.limit_numbers[i]
+        low = q - T(m.lower[i])
+        high = T(m.upper[i]) - q
+        r = wp.min(low, high) - T(numbers[10])
+        stiffness = T(1.0)
+        if wp.static(VARIED):
+            stiffness = law.k_limit
+        state = row(numbers, stiffness, wp.min(r, T(0.0)))
+        on = pick(r, T(0.0), T(1.0), T(0.0))
+        return vec4(on * state[0], state[1], state[2], state[3]), pick(low, high, T(1.0), T(-1.0))
+
+    @wp.func
+    def limit_damping(m: Model, law: Law, i: int):
+        b = T(m.limit_numbers[i][1])
+        if wp.static(VARIED):
+            b = wp.sqrt(law.k_limit) * b
+        return b
+
+    @wp.func
+    def joint_constraint(m: Model, law: Law, i: int, q: T, qd: T, qdd: T, stuck: T):
+        """(force of the limit and of dry friction on the joint, minus its derivative in qdd); stuck as of cone."""
+        force = T(0.0)
+        slope = T(0.0)
+        if wp.static(LIMIT):
+            state, way = limit_row(m, law, i, q)
+            if block.any_of(state[0]):
+                jar = way * (qdd + limit_damping(m, law, i) * qd) + state[2]
+                D = pick(jar, T(0.0), state[0], stuck * state[0])
+                force = force - way * D * jar
+                slope = slope + D
+        if wp.static(LOSS):
+            loss = m.joint_loss[i]
+            f = -T(loss[1]) * (qdd + T(loss[2]) * qd)
+            eta = pick(T(0.0), stuck, wp.abs(f) + T(1.0), T(loss[0]))
+            force = force + wp.max(wp.min(f, eta), -eta)
+            slope = slope + pick(wp.abs(f), eta, T(loss[1]), T(0.0))
+        return vec2(force, slope)
+
+    @wp.func
+    def joint_gain(m: Model, law: Law, i: int, q: T, qd: T, qdd: T):
+        """Derivatives of that force with respect to q, qd and the factor of k_limit."""
+        gain = vec3()
+        if wp.static(LIMIT):
+            state, way = limit_row(m, law, i, q)
+            b = limit_damping(m, law, i)
+            jar = way * (qdd + b * qd) + state[2]
+            D = pick(jar, T(0.0), state[0], T(0.0))
+            gain = -D * vec3(state[3] + jar * state[1], b, T(0.0))
+            if wp.static(VARIED):
+                gain[2] = -D * (T(0.5) * b * qd + way * state[2]) / law.k_limit
+        if wp.static(LOSS):
+            loss = m.joint_loss[i]
+            f = T(loss[1]) * (qdd + T(loss[2]) * qd)
+            gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
+        return gain
+
+    return SimpleNamespace(
+        add_contacts=add_contacts,
+        contact_response=contact_response,
+        add_contacts_adjoint=add_contacts_adjoint,
+        joint_constraint=joint_constraint,
+        joint_gain=joint_gain,
+    )

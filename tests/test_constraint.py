@@ -1,0 +1,280 @@
+"""MuJoCo's own contact, joint limits and dry friction: against MuJoCo, and their gradients against differences."""
+
+from __future__ import annotations
+
+import copy
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import reference
+import torch
+from scenes import (
+    BALL,
+    acting_states,
+    free_states,
+    leg_scene,
+    parse,
+    pass_limits,
+    pendulum,
+    raise_ground,
+    random_tree,
+    robot,
+    task_scene,
+)
+from test_gradient import differences, gradients, weights
+
+import diffsim
+from diffsim.robot.scene import FACTORS, SceneError
+from diffsim.sim.integration import Integration
+from diffsim.sim.simulator import Simulator
+from diffsim.terrain import rough
+from diffsim.training.checkpoint import load_policy
+
+ROBOTS = ("hopper", "half_cheetah", "ant", "humanoid")
+TREES = [(base, seed) for base in ("floating", "fixed", "planar", "ball") for seed in range(3)]
+H = 1 / 240  # s, of a substep
+PASSES = 40  # Newton's method has converged by then, but in a few states where it goes to and fro between zones
+STATES = {"satisfied": 0, "quadratic": 1, "linear_neg": 2, "linear_pos": 3, "cone": 4}  # MuJoCo's mjtConstraintState
+
+
+def constrained_tree(base, seed):
+    """A random tree (scenes.py) of capsules and spheres that asks for every kind of constraint in every way."""
+    rng = np.random.default_rng(100 + seed)
+
+    def solref():
+        time, ratio, stiffness, damping = rng.uniform((0.01, 0.5, -2000, -100), (0.05, 1.5, -100, -10))
+        return f"{time} {ratio}" if rng.random() < 0.7 else f"{stiffness} {damping}"
+
+    def solimp():
+        ends = rng.uniform((0.5, 0.9, 0.005, 0.2), (0.9, 0.97, 0.05, 0.8))
+        return " ".join(map(str, (*ends, rng.choice([1, 2, 2, 3.5]))))
+
+    def joint(found):
+        text = f'{found[0]} frictionloss="{rng.uniform(0.2, 3)}" solreffriction="{solref()}" '
+        text += f'solimpfriction="{solimp()}" '
+        limit = f'margin="{rng.uniform(0, 0.1)}" solreflimit="{solref()}" solimplimit="{solimp()}"'
+        return text if "ball" in found[0] else text + limit
+
+    def geom(found):
+        friction, mix, margin = rng.uniform((0.2, 0.5, 0), (1.5, 2, 0.03))
+        kind = f'condim="{rng.choice([1, 3, 3])}" priority="{rng.choice([0, 1])}" solmix="{mix}" margin="{margin}"'
+        return f'{found[0]} friction="{friction}" {kind} solref="{solref()}" solimp="{solimp()}"'
+
+    text = random_tree(base, seed).replace('type="box"', 'type="capsule"')
+    text = re.sub(r'<joint name="joint\d+" type="\w+"', joint, text)
+    text = re.sub(r'<geom type="(sphere|capsule)"', geom, text)
+    text = text.replace('<geom type="plane"', '<geom type="plane" margin="0.01" friction="0.6" condim="1"')
+    return parse(text.replace("<option ", f'<option impratio="{rng.uniform(0.5, 5)}" '))
+
+
+def tree_states(base, seed, count, rng):
+    """Such a tree, and random states with contacts, half of them nearly at rest."""
+    scene = constrained_tree(base, seed)
+    qpos, qvel, ctrl = free_states(scene, count, rng)
+    pass_limits(scene, qpos, rng)
+    qvel[::2] *= 0.05
+    if scene.floating:
+        qpos[:, 2] -= [reference.contacts(scene, *state)[0].min() + 0.02 for state in zip(qpos, qvel, strict=True)]
+        return scene, (qpos, qvel, ctrl)
+    return raise_ground(scene, qpos), (qpos, qvel, ctrl)
+
+
+def in_mujoco(scene, qpos, qvel, ctrl, steps=1, substeps=1):
+    """qpos, qvel after control steps of MuJoCo's Euler with elliptic cones, and the set of its constraints' states."""
+    m = copy.copy(scene.mj_model)
+    m.opt.cone, m.opt.timestep = mujoco.mjtCone.mjCONE_ELLIPTIC, H
+    m.opt.iterations, m.opt.tolerance, m.opt.ls_iterations, m.opt.ls_tolerance = 200, 0, 100, 1e-10
+    if len(ground := np.flatnonzero(m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)):
+        m.geom_pos[ground, 2] = scene.ground_height
+    m.geom_contype[:], m.geom_conaffinity[:] = 1, 0  # the robot's parts pass through each other
+    m.geom_contype[ground], m.geom_conaffinity[ground] = 0, 1
+    low, high = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-1.0, 1.0]).T
+    data, ends, kinds = mujoco.MjData(m), [], set()
+    for q, v, u in zip(qpos, qvel, np.broadcast_to(ctrl, (steps, *np.shape(ctrl)[-2:])).swapaxes(0, 1), strict=True):
+        mujoco.mj_resetData(m, data)
+        data.qpos, data.qvel = q, v
+        for action in u:
+            data.ctrl = low + (action + 1) / 2 * (high - low)
+            mujoco.mj_step(m, data, substeps)
+        kinds |= set(data.efc_state.tolist())
+        ends.append((data.qpos.copy(), data.qvel.copy()))
+    return *map(np.array, zip(*ends, strict=True)), kinds
+
+
+def step(scene, states, passes=PASSES, substeps=1, **options):
+    """qpos, qvel and the residual after a control step."""
+    options = {"dtype": torch.float64} | options
+    factors = options.pop("factors", None)
+    integration, given = Integration("mujoco", substeps, passes=passes), factors is not None
+    sim = Simulator(scene, len(states[0]), integration, substeps * H, factors=given, **options)
+    sim.factors = factors if given else sim.factors
+    with torch.no_grad():
+        ends = sim.step(*(torch.as_tensor(x, dtype=options["dtype"]) for x in states))
+    return *(x.double().numpy() for x in ends), sim.residual.double().numpy()
+
+
+def check_step(scene, states, enough):
+    _, qvel, residual = step(scene, states)
+    _, expected, kinds = in_mujoco(scene, *states)
+    error = abs(qvel - expected).max(1) / abs(expected - states[1]).max(1)
+    converged = residual < 1e-10
+    assert converged.mean() >= enough
+    assert error[converged].max() < 1e-8
+    return kinds
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_task_steps_are_mujocos(name, rng):
+    """Pressed into the ground and beyond limits, at rest and in motion; joint damping included."""
+    scene = task_scene(name)
+    assert check_step(scene, acting_states(scene, 64, rng), 0.95) >= {STATES[k] for k in ("satisfied", "quadratic", "cone")}
+
+
+@pytest.mark.parametrize("base, seed", TREES)
+def test_tree_steps_are_mujocos(base, seed, rng):
+    """solref of both forms, solimp, margins, impratio, priorities, frictionless geoms, dry friction on every joint."""
+    scene, states = tree_states(base, seed, 32, rng)
+    assert check_step(scene, states, 0.75) == set(STATES.values())
+
+
+@pytest.mark.parametrize("name", ["ant", "humanoid"])
+def test_four_passes_suffice_in_gaits(name):
+    """And in random motion, the second half of the robots."""
+    env = diffsim.make(name, 16, seed=0, contact="mujoco", threads=1)
+    policy = load_policy(Path(diffsim.__file__).parent / "policies" / f"{name}.pt").network
+    generator, states, obs = torch.Generator().manual_seed(0), [], env.reset(seed=0)[0]
+    for _ in range(50):
+        with torch.no_grad():
+            action = policy(obs).clamp(-1, 1)
+            action[8:] = torch.rand(8, env.scene.nu, generator=generator) * 2 - 1
+            states.append([x.double().numpy().copy() for x in (env.qpos, env.qvel, action)])
+            obs = env.step(action)[0]
+    states = [np.concatenate(x) for x in zip(*states, strict=True)]
+    (_, four, _), (_, many, residual) = step(task_scene(name), states, 4), step(task_scene(name), states)
+    error = abs(four - many).max(1) / (abs(many - states[1]).max(1) + H)
+    assert np.median(error) < 1e-9
+    assert (error[residual < 1e-10] > 0.01).mean() < 0.04
+
+
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+def test_control_steps_stay_with_mujoco(name, rng):
+    """A hundred, of four substeps, of a trained policy's actions."""
+    env = diffsim.make(name, 4, seed=0, dtype=torch.float64, contact="mujoco", passes=PASSES, threads=1)
+    policy = load_policy(Path(diffsim.__file__).parent / "policies" / f"{name}.pt").network.double()
+    obs = env.reset(seed=0)[0]
+    start, actions = [x.numpy().copy() for x in (env.qpos, env.qvel)], []
+    sim, (qpos, qvel) = env.sim, (env.qpos.clone(), env.qvel.clone())
+    with torch.no_grad():
+        for _ in range(100):
+            actions.append(policy(obs).clamp(-1, 1))
+            qpos, qvel = sim.step(qpos, qvel, actions[-1])
+            obs = env.task.observe(qpos, qvel, actions[-1])
+    expected = in_mujoco(env.scene, *start, np.array([a.numpy() for a in actions]), steps=100, substeps=4)
+    assert abs(qpos.numpy() - expected[0]).max() < 1e-3
+
+
+# Gradients
+
+
+def check_gradients(scene, states, rng, optional=None, enough=0.5):
+    """Against differences, in the states where Newton's method has converged."""
+    integration, w = Integration("mujoco", 4, passes=PASSES), weights(scene, rng)
+    given = {name: torch.tensor(x) for name, x in (optional or {}).items()}
+    residual = step(scene, states, substeps=4, **given)[2]
+    sim = {"integration": integration, "control_dt": 4 * H}
+    kept = residual < 1e-10
+    assert kept.mean() >= enough
+    states = [x[kept] for x in states]
+    optional = {name: x[kept] for name, x in (optional or {}).items()}
+    values = gradients(scene, states, w, optional=optional, **sim)
+    # Short steps drown in the solver's rounding, long ones cross from zone to zone: one of the two must agree.
+    expected = [differences(scene, states, w, optional, scale, **sim) for scale in (10.0, 100.0)]
+    for name, value, *slopes in zip(("qpos", "qvel", "ctrl", *optional), values, *expected, strict=True):
+        if slopes[0].size:
+            wrong = [np.linalg.norm(value.reshape(s.shape) - s, axis=-1) / np.linalg.norm(s, axis=-1) for s in slopes]
+            assert np.minimum(*wrong).max() < 1e-6, f"gradient with respect to {name}: {np.minimum(*wrong)}"
+
+
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+def test_task_gradient_is_that_of_differences(name, rng):
+    scene = task_scene(name)
+    check_gradients(scene, acting_states(scene, 8, rng), rng, enough=0.9)
+
+
+@pytest.mark.parametrize("base", ["floating", "fixed", "planar", "ball"])
+def test_tree_gradient_is_that_of_differences(base, rng):
+    """In every zone of every law, and with factors of friction, time constants, mass and motors."""
+    scene, states = tree_states(base, 0, 16, rng)
+    assert in_mujoco(scene, *states)[2] == set(STATES.values())
+    check_gradients(scene, states, rng)
+    if base in ("floating", "planar"):
+        check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (16, len(FACTORS)))})
+
+
+def test_muscle_gradient_is_that_of_differences(rng):
+    scene = leg_scene("linear", grounded=True)
+    qpos, qvel, ctrl = free_states(scene, 8, rng)
+    check_gradients(raise_ground(scene, qpos), (qpos, 0.1 * qvel, ctrl), rng)
+
+
+def test_robot_without_damping(rng):
+    """It has no second solve: a ball that flies, rolls, slides or lies, in MuJoCo and by differences."""
+    scene = parse(BALL)
+    qpos, qvel = np.zeros((16, 7)), rng.normal(size=(16, 6)) * np.linspace(0, 2, 16)[:, None]
+    qpos[:, 3], qpos[:, 2] = 1.0, rng.uniform(0.09, 0.102, 16)
+    check_step(scene, (qpos, qvel, np.zeros((16, 0))), 1.0)
+    check_gradients(scene, (qpos, qvel, np.zeros((16, 0))), rng, enough=1.0)
+
+
+# Single precision, metrics, bad input
+
+
+def test_blocks_in_single_precision_are_close(rng):
+    """Of an environment's gradient, too; an impedance with another power calls pow for each of a block."""
+    scene = task_scene("ant")
+    states = [x[:18] for x in acting_states(scene, 32, rng)]
+    double = step(scene, states, 4, 4)
+    for block in (1, 16):
+        single = step(scene, states, 4, 4, dtype=torch.float32, block=block)
+        error = abs(single[1] - double[1]).max(1) / abs(double[1] - states[1]).max(1)
+        assert np.median(error) < 1e-4 and np.quantile(error, 0.8) < 1e-2
+    w, integration = weights(scene, rng), Integration("mujoco", 4)
+    double = gradients(scene, states, w, integration=integration)
+    single = gradients(scene, states, w, torch.float32, integration=integration, block=16)
+    for value, expected in zip(single, double, strict=True):
+        assert np.median(np.linalg.norm(value - expected, axis=1) / np.linalg.norm(expected, axis=1)) < 1e-3
+
+
+@pytest.mark.parametrize(
+    "scene, integration, why",
+    [
+        (pendulum(), Integration("mujoco", 4, passes=0), "passes is 0, must be an integer of at least 1"),
+        (pendulum(), Integration("mujoco", 4, theta=0.5), "only the implicit integrator has a theta"),
+        (pendulum('frictionloss="1"'), Integration(), "semi_implicit has no frictionloss .joint 'hinge'.; mujoco has"),
+        (pendulum('range="-.1 .1" margin=".2"'), Integration("mujoco", 4), "margins of the limits of joint 'hinge' meet"),
+        (pendulum(rest='<option><flag diagexact="enable"/></option>'), Integration("mujoco", 4), "diagexact"),
+    ],
+)
+def test_bad_input_is_named(scene, integration, why):
+    with pytest.raises(ValueError, match=why) as error:
+        Simulator(parse(scene), 1, integration)
+    assert "\n" not in str(error.value)
+
+
+def test_terrain_is_refused():
+    with pytest.raises(SceneError, match="the ground is a plane, no terrain"):
+        Simulator(task_scene("hopper").with_terrain(rough(0)), 1, Integration("mujoco", 4))
+
+
+def test_frictionless_contact_and_friction_of_zero():
+    """Both slide as in MuJoCo, which takes friction of zero for 1e-5."""
+    for kind in ('condim="1"', 'friction="0"'):
+        body = f'<body><freejoint/><geom type="sphere" size="0.1" {kind}/></body>'
+        scene = parse(robot(body, world=f'<geom type="plane" size="1 1 1" {kind}/>'))
+        states = np.array([[0, 0, 0.0999, 1.0, 0, 0, 0]]), np.array([[1.0, 0, 0, 0, 0, 0]]), np.zeros((1, 0))
+        _, qvel, _ = step(scene, states)
+        np.testing.assert_allclose(qvel, in_mujoco(scene, *states)[1], atol=1e-9)
+        assert qvel[0, 0] > 0.9999
