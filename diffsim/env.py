@@ -285,12 +285,15 @@ class DiffEnv(VectorEnv):
 
         Returns:
             "episodes": how many ended; "return" and "length": sums over them; "nonfinite": environments that blew up;
-            "nonfinite_gradients": adjoints of control steps that were not finite.
+            "nonfinite_gradients": adjoints of control steps that were not finite; "sim/residual", with the integrator
+            mujoco only: the mean of Simulator.residual in the last step.
         """
         parts = self._statistics | {"nonfinite_gradients": self.sim.nonfinite_gradients}
         sums = {name: part.sum() for name, part in parts.items()}
         for part in parts.values():
             part.zero_()
+        if self.sim.integration.integrator == "mujoco":
+            sums["sim/residual"] = self.sim.residual.mean()
         return sums
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> Tensor:

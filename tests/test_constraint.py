@@ -130,7 +130,9 @@ def check_step(scene, states, enough):
 def test_task_steps_are_mujocos(name, rng):
     """Pressed into the ground and beyond limits, at rest and in motion; joint damping included."""
     scene = task_scene(name)
-    assert check_step(scene, acting_states(scene, 64, rng), 0.95) >= {STATES[k] for k in ("satisfied", "quadratic", "cone")}
+    assert check_step(scene, acting_states(scene, 64, rng), 0.95) >= {
+        STATES[k] for k in ("satisfied", "quadratic", "cone")
+    }
 
 
 @pytest.mark.parametrize("base, seed", TREES)
@@ -255,7 +257,11 @@ def test_blocks_in_single_precision_are_close(rng):
         (pendulum(), Integration("mujoco", 4, passes=0), "passes is 0, must be an integer of at least 1"),
         (pendulum(), Integration("mujoco", 4, theta=0.5), "only the implicit integrator has a theta"),
         (pendulum('frictionloss="1"'), Integration(), "semi_implicit has no frictionloss .joint 'hinge'.; mujoco has"),
-        (pendulum('range="-.1 .1" margin=".2"'), Integration("mujoco", 4), "margins of the limits of joint 'hinge' meet"),
+        (
+            pendulum('range="-.1 .1" margin=".2"'),
+            Integration("mujoco", 4),
+            "margins of the limits of joint 'hinge' meet",
+        ),
         (pendulum(rest='<option><flag diagexact="enable"/></option>'), Integration("mujoco", 4), "diagexact"),
     ],
 )

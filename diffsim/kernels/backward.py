@@ -316,7 +316,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     if wp.static(CONTACT):
                         if solve == 1:
                             for i in range(FIRST, n):
-                                W[i] = constraint.contact_response(m, law, at + i, R[i], x[i], V[i], B[i], W1[i], place)
+                                k = at + i
+                                W[i] = constraint.contact_response(m, law, k, R[i], x[i], V[i], B[i], W1[i], place)
                             if wp.static(SHARERS > 1):
                                 sums.sharers.add_vectors(W)
                 else:
@@ -340,10 +341,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                                 Ui[r] = load(ck_f, factor_row, f0 + r, e)
                             W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, factor_row, f0 + 6, e))
                 if wp.static(FLOATING):
-                    force = join(R[0] * gw, gv) * (-h)
+                    wanted = join(R[0] * gw, gv) * (-h)
                     if wp.static(DAMPED):
-                        force = force * T(1 - solve)
-                    W[0] = base.solve_base(ck_f, factor_row, e, force - W[0])
+                        wanted = wanted * T(1 - solve)
+                    W[0] = base.solve_base(ck_f, factor_row, e, wanted - W[0])
                 for i in range(1, n):
                     p = m.parent[at + i]
                     f0 = 7 * (link_of(m, at + i) - 1)

@@ -156,9 +156,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return Ia, Ib, Id, F
 
     @wp.func
-    def contact_response(
-        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, W: vec6, height: T
-    ):
+    def contact_response(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, W: vec6, height: T):
         """X'HX W of link k's contacts: how their force falls with the acceleration W."""
         wrench = vec6()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):

@@ -265,8 +265,9 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     if wp.static(CONTACT):
                         if newton == 1:
                             for i in range(FIRST, n):
+                                k = at + i
                                 ia, ib, id, f = constraint.add_contacts(
-                                    m, law, at + i, R[i], x[i], V[i], A[i], B[i], place, stuck, Ia[i], Ib[i], Id[i], P[i]
+                                    m, law, k, R[i], x[i], V[i], A[i], B[i], place, stuck, Ia[i], Ib[i], Id[i], P[i]
                                 )
                                 Ia[i] = ia
                                 Ib[i] = ib

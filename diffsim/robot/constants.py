@@ -137,7 +137,8 @@ def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
         mixed = np.average(solref, axis=0, weights=weights)
     solimp = np.average(m.geom_solimp[geoms], axis=0, weights=weights)
     friction = float(m.geom_friction[geoms, 0].max())
-    return PairLaw(int(m.geom_condim[geoms].max()), friction, (float(mixed[0]), float(mixed[1])), tuple(solimp.tolist()))
+    condim = int(m.geom_condim[geoms].max())
+    return PairLaw(condim, friction, (float(mixed[0]), float(mixed[1])), tuple(solimp.tolist()))
 
 
 # Constants ------------------------------------------------------------------------------------------------------------

@@ -170,7 +170,7 @@ class Scene:
             "contact": self.ncontact > 0,
             "terrain": self.ncontact > 0 and self.terrain is not None,
             "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0) | constrained)).any()),
-            "frictionloss": constrained and bool(self.constraints.loss[:, 0].any()),
+            "frictionloss": self.constraints is not None and bool(self.constraints.loss[:, 0].any()),
             "stiffness": bool(self.stiffness.any()),
             "damping": bool(self.damping.any()),
             "motor": bool((self.motor_link > 0).any()),

@@ -157,8 +157,9 @@ class Stepper:
         if spec.block == 1:
             sizes = [(c, k, n) if spec.env_last else (c, n, k) for c, k in zip(counts, widths, strict=True)]
             return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
-        sizes = [(c, self._launcher.num_blocks, k, spec.block) for c, k in zip(counts, widths, strict=True)]
-        return [array_of_vectors(torch.zeros(size), types(spec).T) for size in sizes]
+        blocks = self._launcher.num_blocks
+        values = [torch.zeros(c, blocks, k, spec.block) for c, k in zip(counts, widths, strict=True)]
+        return [array_of_vectors(value, types(spec).T) for value in values]
 
 
 def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
@@ -181,6 +182,10 @@ class ExtrapolatedStepper:
         self._fine, self._coarse = (Stepper(launcher, part, control_dt, horizon) for part in (fine, coarse))
         first = launcher.scene.quaternion_adr
         self._quaternions = torch.tensor([range(k, k + 4) for k in first], device=launcher.device)
+
+    @property
+    def residual(self) -> torch.Tensor:
+        return self._fine.residual
 
     @property
     def nonfinite(self) -> torch.Tensor:

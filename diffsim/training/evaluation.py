@@ -171,6 +171,7 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **opti
             substeps=args.substeps,
             integrator=args.integrator,
             theta=args.theta,
+            passes=args.passes,
             contact=args.contact,
             penalty=parse_penalty(args.penalty),
             threads=args.threads or None,
@@ -220,19 +221,22 @@ def evaluate_checkpoint(
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     if args.finer:
         substeps = FINER * args.substeps
-        explicit = dataclasses.replace(args, integrator="semi_implicit", theta=0.0, substeps=substeps)
-        value = measure(explicit).returns.median().item()
+        finer = dataclasses.replace(args, theta=0.0, substeps=substeps)
+        if args.integrator != "mujoco":  # whose laws no other one has
+            finer.integrator = "semi_implicit"
+        value = measure(finer).returns.median().item()
         share = kept(evaluation.returns.median().item(), value)
         found["finer"] = {"substeps": substeps, "return": value, "kept": share}
         warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-        print(f"explicit with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
+        name = "mujoco" if args.integrator == "mujoco" else "explicit"
+        print(f"{name} with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
     write_evaluation(args, evaluation, state["iteration"], **found)
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
     """Print the gait, and leave evaluation.json and, if asked for, the video in the run's directory."""
     assert args.run_dir
-    names = "env integrator substeps theta contact penalty early_termination clip device eval_episodes".split()
+    names = "env integrator substeps theta passes contact penalty early_termination clip device eval_episodes".split()
     settings = {name: getattr(args, name) for name in names} | dict(script=args.script(), iteration=iteration)
     if gait := evaluation.gait():
         print(f"gait: {gait}")

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
+from diffsim.sim.integration import PASSES
 from diffsim.tasks import TASKS, HumanoidImitation
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
@@ -42,14 +43,16 @@ class SimulatorFlags:
     """task, one of diffsim.TASKS"""
     accuracy: Literal["fast", "default", "accurate"] = "default"
     """preset of integrator, substeps and theta (docs/accuracy.md); default is the paper's"""
-    integrator: Literal["semi_implicit", "implicit", "extrapolated"] = "semi_implicit"
-    """time integration (per task and --accuracy)"""
+    integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
+    """time integration (per task, --accuracy and --contact); mujoco has MuJoCo's own contact and limits"""
     substeps: Count = 16
     """simulation steps per control step (per task and --accuracy)"""
     theta: Fraction = 0.0
     """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
-    contact: Literal["soft", "firm"] = "soft"
-    """constants of contact and limits (docs/transfer.md): the paper's, or such as another simulator agrees with"""
+    passes: Count = PASSES
+    """of Newton's method on the constraints in each substep, with --integrator mujoco"""
+    contact: Literal["soft", "firm", "mujoco"] = "soft"
+    """contact and limits: the paper's springs, firm ones fitted to MuJoCo (docs/transfer.md), or MuJoCo's own"""
     penalty: tuple[str, ...] = ()
     """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
     early_termination: bool = True
@@ -100,7 +103,8 @@ class Flags(SimulatorFlags, RunFlags):
 
     # What may change when a run goes on or is evaluated; the checkpoint decides everything else.
     MAY_CHANGE: ClassVar[tuple[str, ...]] = (
-        *("accuracy", "integrator", "substeps", "theta", "contact", "penalty", "early_termination", "threads"),
+        *("accuracy", "integrator", "substeps", "theta", "passes", "contact", "penalty"),
+        *("early_termination", "threads"),
         *(field.name for field in dataclasses.fields(RunFlags) if field.name != "seed"),
     )
 

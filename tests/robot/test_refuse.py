@@ -50,7 +50,7 @@ REFUSED = [
         pendulum,
         {
             'actuatorfrcrange="-1 1"': "hinge",
-            'frictionloss="1"': "hinge",
+            'frictionloss="-1"': "joint 'hinge': frictionloss -1 is negative",
             'damping="1 2"': "hinge|damping",
             'stiffness="1 2"': "hinge|stiffness",
             'range="-1 1" solreflimit="-1 1"': "joint 'hinge': solreflimit",
@@ -297,7 +297,7 @@ def test_all_obstacles_in_one_message():
     with pytest.raises(SceneError) as error:
         parse(
             pendulum(
-                'frictionloss="1" damping="-2"',
+                'actuatorfrcrange="-1 1" damping="-2"',
                 inside='<geom name="egg" type="ellipsoid" size="1 2 3"/><geom name="can" type="cylinder" size="1 2"/>'
                 '<geom type="cylinder" size="1 2"/>',
                 rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="5"/></actuator>'
