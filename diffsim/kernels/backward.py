@@ -20,17 +20,16 @@ from functools import cache
 
 import warp as wp
 
-from diffsim.kernels.base import base_inertia
 from diffsim.kernels.constraint import constraint_law
-from diffsim.kernels.contact import contact_law
-from diffsim.kernels.drag import drag_law
 from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.factors import D_LIMIT, K_LIMIT, MASS, MOTOR, environment_law
+from diffsim.kernels.factors import D_LIMIT, K_LIMIT, MOTOR, environment_law
 from diffsim.kernels.force import external_force
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
+from diffsim.kernels.solve import factor_solve
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks, module_options
@@ -41,14 +40,14 @@ from diffsim.robot.scene import FACTORS
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
     T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
-    Model, Law, Place, law_of = t.Model, t.Law, kin.Place, environment_law(spec)
-    join, momentum, load, link_of, qpos_adr = sp.join, sp.momentum, kin.load, kin.link_of, kin.qpos_adr
-    contact, drag, force, joint = contact_law(spec), drag_law(spec), external_force(spec), joint_law(spec)
-    muscle, base, constraint = muscle_law(spec, adjoint=True), base_inertia(spec), constraint_law(spec)
+    Model, law_of, solve_with_factor = t.Model, environment_law(spec), factor_solve(spec)
+    join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
+    link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
+    muscle, constraint = muscle_law(spec, adjoint=True), constraint_law(spec)
     CONSTRAINED, SOLVES, NV = spec.constrained, spec.solves, spec.nv
     DAMPED = SOLVES > 1  # after the constraints are solved
-    CONTACT, DRAG, TERRAIN, DRIVEN, MUSCLE, HILL, LIMIT = (
-        name in spec.features for name in ("contact", "drag", "terrain", "motor", "muscle", "hill", "limit")
+    CONTACT, TERRAIN, DRIVEN, MUSCLE, HILL, LIMIT = (
+        name in spec.features for name in ("contact", "terrain", "motor", "muscle", "hill", "limit")
     )
     LIMIT = LIMIT and not spec.constrained  # the penalty law
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
@@ -63,58 +62,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         """Three rates in a row at the end of the substep."""
         v = vec3(load(ck_v, row, k, e), load(ck_v, row, k + 1, e), load(ck_v, row, k + 2, e))
         return v + h * vec3(load(ck_a, row, k, e), load(ck_a, row, k + 1, e), load(ck_a, row, k + 2, e))
-
-    @wp.func
-    def link_adjoint(
-        m: Model,
-        law: Law,
-        k: int,
-        R: mat3,
-        x: vec3,
-        V: vec6,
-        A: vec6,
-        W: vec6,
-        place: Place,
-        h: T,
-        theta: T,
-        adj_factors: t.array,  # written if varied only
-    ):
-        """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position."""
-        com = x + R * vec3(m.com[k])
-        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
-        Iv = momentum(T(m.mass[k]), com, inertia, V)
-        adj_a = momentum(T(m.mass[k]), com, inertia, W)
-        adj_w = momentum(T(m.mass[k]), com, inertia, A) + wp.spatial_cross_dual(V, Iv)
-        adj_v = momentum(T(m.mass[k]), com, inertia, wp.spatial_cross(W, V))
-        adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
-        adj_p = vec6()
-        if wp.static(VARIED):
-            # phi's inertial part is W . adj_w, and all of this is that of a factor of one.
-            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
-            adj_a = law.mass * adj_a
-            adj_w = law.mass * adj_w
-            adj_v = law.mass * adj_v
-        if wp.static(DRAG):
-            adj_w = adj_w - drag.drag_wrench(m, k, R, com, V)
-            adj_v = adj_v + drag.drag_adjoint(m, k, R, com, V, W)
-        if wp.static(CONTACT and not CONSTRAINED):
-            adj_a, adj_v, adj_w, adj_p = contact.add_contacts_adjoint(
-                m, law, k, R, x, V, A, W, place, h, theta, adj_a, adj_v, adj_w, adj_p, adj_factors
-            )
-        return adj_a, adj_v, adj_w, adj_p
-
-    @wp.func
-    def damping_adjoint(m: Model, law: Law, k: int, R: mat3, x: vec3, D: vec6, W: vec6, adj_factors: t.array):
-        """The adjoints of D and W in W . I D, with I the inertia of one link."""
-        com = x + R * vec3(m.com[k])
-        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
-        adj_d = momentum(T(m.mass[k]), com, inertia, W)
-        adj_w = momentum(T(m.mass[k]), com, inertia, D)
-        if wp.static(VARIED):
-            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
-            adj_d = law.mass * adj_d
-            adj_w = law.mass * adj_w
-        return adj_d, adj_w
 
     @wp.func
     def hand_out(out: t.array2, e: int, column: int, drop: T, value: T):
@@ -207,11 +154,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(CONSTRAINED):
             B = wp.zeros(shape=SLOTS, dtype=vec6)  # as in the forward kernel, and its adjoint
             adj_b = wp.zeros(shape=SLOTS, dtype=vec6)
-            rate = wp.zeros(shape=SLOTS, dtype=T)  # acceleration before damping
+            rate = wp.zeros(shape=SLOTS, dtype=T)  # the acceleration, before damping
         if wp.static(DAMPED):
-            W1 = wp.zeros(shape=SLOTS, dtype=vec6)  # lambda of the constraints' solve; W and lam are of the sum
-            lam1 = wp.zeros(shape=SLOTS, dtype=T)
-            D = wp.zeros(shape=SLOTS, dtype=vec6)  # what damping takes from B
+            W1 = wp.zeros(shape=SLOTS, dtype=vec6)
+            D = wp.zeros(shape=SLOTS, dtype=vec6)  # what damping adds to B
+            ga = wp.zeros(shape=SLOTS, dtype=T)
             adj_d = wp.zeros(shape=SLOTS, dtype=vec6)
             adj_w1 = wp.zeros(shape=SLOTS, dtype=vec6)
         R[0] = wp.identity(3, dtype=T)
@@ -274,14 +221,15 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     place = place + load(ck_q, row, 2, e)
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
+                if wp.static(DAMPED):
+                    D[0] = join(R[0] * wdot, vdot)
+                    vdot = vec3(load(ck_a, row, NV, e), load(ck_a, row, NV + 1, e), load(ck_a, row, NV + 2, e))
+                    vdot = vdot - vec3(m.gravity)
+                    wdot = vec3(load(ck_a, row, NV + 3, e), load(ck_a, row, NV + 4, e), load(ck_a, row, NV + 5, e))
+                    D[0] = D[0] - join(R[0] * wdot, vdot)
                 A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v))
                 if wp.static(CONSTRAINED):
                     B[0] = join(R[0] * wdot, vdot + vec3(m.gravity))
-                if wp.static(DAMPED):
-                    vdot1 = vec3(load(ck_a, row, NV, e), load(ck_a, row, NV + 1, e), load(ck_a, row, NV + 2, e))
-                    wdot1 = vec3(load(ck_a, row, NV + 3, e), load(ck_a, row, NV + 4, e), load(ck_a, row, NV + 5, e))
-                    D[0] = join(R[0] * wdot1, vdot1) - B[0]
-                    B[0] = B[0] + D[0]
             place = kin.place_links(m, at, n, q, R, x, S, place)
             for i in range(1, n):
                 k = at + i
@@ -290,75 +238,26 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 turning = i
                 if wp.static(NBALL > 0):
                     turning = m.inboard[k]
-                qdd = load(ck_a, row, VADR + link_of(m, k), e)
+                qdd = load(ck_a, row, (SOLVES - 1) * NV + VADR + link_of(m, k), e)
                 A[i] = A[p] + S[i] * qdd + wp.spatial_cross(V[turning], S[i] * qd[i])
-                W[i] = vec6()
                 if wp.static(CONSTRAINED):
-                    rate[i] = load(ck_a, row, (SOLVES - 1) * NV + VADR + link_of(m, k), e)
-                    B[i] = B[p] + S[i] * rate[i]
+                    rate[i] = qdd
+                    B[i] = B[p] + S[i] * qdd
                 if wp.static(DAMPED):
-                    D[i] = D[p] + S[i] * (rate[i] - qdd)
-            # 2. lambda = -M^-1 g; on the way in, W holds the articulated bias force. Of the damping's solve first, whose
-            # forces the acceleration before it has moved by -J'HJ lambda; then of the constraints', W1, with M + J'HJ.
+                    D[i] = D[p] + S[i] * (load(ck_a, row, VADR + link_of(m, k), e) - qdd)
+            # 2. lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
+            # first, and g + h b lambda1 reaches the acceleration before it.
+            g_base = vec6()
+            if wp.static(FLOATING):
+                g_base = join(R[0] * gw, gv)
             for solve in range(SOLVES):
-                factor_row = SOLVES * row + solve
                 if wp.static(DAMPED):
                     for i in range(n):
                         W1[i] = W[i]
-                        lam1[i] = lam[i]
-                        W[i] = vec6()
-                        u[i] = -h * gqd[i]
-                        if solve == 1:
-                            u[i] = T(0.0)
-                            if i > 0:
-                                held = constraint.joint_constraint(m, law, at + i, q[i], qd[i], rate[i], T(0.0))
-                                u[i] = -held[1] * lam[i]
-                    if wp.static(CONTACT):
-                        if solve == 1:
-                            for i in range(FIRST, n):
-                                k = at + i
-                                W[i] = constraint.contact_response(m, law, k, R[i], x[i], V[i], B[i], W1[i], place)
-                            if wp.static(SHARERS > 1):
-                                sums.sharers.add_vectors(W)
+                        ga[i] = gqd[i] + T(solve) * T(m.damping[at + i]) * lam[i]
+                    solve_with_factor(m, at, n, ck_f, SOLVES * row + solve, e, S, h, g_base, ga, u, W, lam)
                 else:
-                    W[0] = vec6()
-                for j in range(1, slots + 1):
-                    i = slots - j
-                    if wp.static(THREADS_PER_ENV > SHARERS):
-                        if i == TRUNK:
-                            sums.limbs.add_vectors(W)
-                    if i > 0 and i < n:
-                        p = m.parent[at + i]
-                        if wp.static(DAMPED):
-                            ui = u[i] - wp.dot(S[i], W[i])
-                        else:
-                            ui = -h * gqd[i] - wp.dot(S[i], W[i])
-                        u[i] = ui
-                        if wp.static(FLOATING) or p > 0:
-                            f0 = 7 * (link_of(m, at + i) - 1)
-                            Ui = vec6()
-                            for r in range(6):
-                                Ui[r] = load(ck_f, factor_row, f0 + r, e)
-                            W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, factor_row, f0 + 6, e))
-                if wp.static(FLOATING):
-                    wanted = join(R[0] * gw, gv) * (-h)
-                    if wp.static(DAMPED):
-                        wanted = wanted * T(1 - solve)
-                    W[0] = base.solve_base(ck_f, factor_row, e, wanted - W[0])
-                for i in range(1, n):
-                    p = m.parent[at + i]
-                    f0 = 7 * (link_of(m, at + i) - 1)
-                    UW = T(0.0)
-                    for r in range(6):
-                        UW = UW + load(ck_f, factor_row, f0 + r, e) * W[p][r]
-                    lam[i] = (u[i] - UW) * load(ck_f, factor_row, f0 + 6, e)
-                    W[i] = W[p] + S[i] * lam[i]
-            if wp.static(DAMPED):
-                for i in range(n):
-                    both = W[i] + W1[i]
-                    W1[i] = W[i]
-                    W[i] = both
-                    lam[i] = lam[i] + lam1[i]
+                    solve_with_factor(m, at, n, ck_f, row, e, S, h, g_base, gqd, u, W, lam)
             # 3. the partial derivatives of phi, link by link
             for i in range(1, INERT + 1):
                 adj_a[i] = vec6()
@@ -371,24 +270,21 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     adj_d[i] = vec6()
                     adj_w1[i] = vec6()
             for i in range(FIRST, n):
-                la, lv, lw, lp = link_adjoint(
+                la, lv, lw, lp = link.link_adjoint(
                     m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, h, theta, adj_factors
                 )
-                adj_a[i] = la
-                adj_v[i] = lv
-                adj_w[i] = lw
-                adj_p[i] = lp
                 if wp.static(CONSTRAINED and CONTACT):
                     lv, lw, lp, l_twist = constraint.add_contacts_adjoint(
                         m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, lv, lw, lp, adj_factors
                     )
-                    adj_v[i] = lv
-                    adj_w[i] = lw
-                    adj_p[i] = lp
                     adj_b[i] = l_twist
+                adj_a[i] = la
+                adj_v[i] = lv
+                adj_w[i] = lw
+                adj_p[i] = lp
                 if wp.static(DAMPED):
-                    # Without damping W1 . I (A + D) takes the place of its part in W . I A.
-                    ld, lw1 = damping_adjoint(m, law, at + i, R[i], x[i], D[i], W1[i], adj_factors)
+                    # phi has W1 . I D besides.
+                    ld, lw1 = link.damping_adjoint(m, law, at + i, R[i], x[i], D[i], W1[i], adj_factors)
                     adj_d[i] = ld
                     adj_w1[i] = lw1
             if wp.static(FORCED):

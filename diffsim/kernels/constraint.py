@@ -142,7 +142,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         Id: mat3,
         F: vec6,
     ):
-        """Inertia blocks and bias force of link k with its contacts, linear about the acceleration A; stuck as of cone."""
+        """Inertia blocks and bias force of link k with its contacts, linear about A; stuck as of cone."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             centre, distance, on = place(m, c, R, x, height)
             if block.any_of(on):
@@ -154,18 +154,6 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 Id = Id + H
                 F = F - force_at(p, f + H * point_velocity(A, p))
         return Ia, Ib, Id, F
-
-    @wp.func
-    def contact_response(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, W: vec6, height: T):
-        """X'HX W of link k's contacts: how their force falls with the acceleration W."""
-        wrench = vec6()
-        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on = place(m, c, R, x, height)
-            if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
-                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
-                wrench = wrench + force_at(p, H * point_velocity(W, p))
-        return wrench
 
     @wp.func
     def add_contacts_adjoint(
@@ -270,7 +258,6 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
 
     return SimpleNamespace(
         add_contacts=add_contacts,
-        contact_response=contact_response,
         add_contacts_adjoint=add_contacts_adjoint,
         joint_constraint=joint_constraint,
         joint_gain=joint_gain,

@@ -13,13 +13,12 @@ import warp as wp
 
 from diffsim.kernels.base import base_inertia
 from diffsim.kernels.constraint import constraint_law
-from diffsim.kernels.contact import contact_law
-from diffsim.kernels.drag import drag_law
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.factors import environment_law
 from diffsim.kernels.force import external_force
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
@@ -31,40 +30,21 @@ from diffsim.kernels.wide import blocks, module_options
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
     T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
-    Model, Law, Place, law_of = t.Model, t.Law, kin.Place, environment_law(spec)
+    Model, law_of = t.Model, environment_law(spec)
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
-    contact, drag, force, joint = contact_law(spec), drag_law(spec), external_force(spec), joint_law(spec)
+    link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, base, constraint = muscle_law(spec, adjoint=False), base_inertia(spec), constraint_law(spec)
-    CONTACT, DRAG, TERRAIN, MOTOR, MUSCLE, HILL = (
-        name in spec.features for name in ("contact", "drag", "terrain", "motor", "muscle", "hill")
+    CONTACT, TERRAIN, MOTOR, MUSCLE, HILL = (
+        name in spec.features for name in ("contact", "terrain", "motor", "muscle", "hill")
     )
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
-    # With MuJoCo's constraints the penalty law of contact is not used, and a step takes several solves.
+    # With MuJoCo's constraints a substep takes several solves.
     CONSTRAINED, SOLVES, PASSES = spec.constrained, spec.solves, spec.passes
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
-
-    @wp.func
-    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, h: T, theta: T):
-        """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
-        com = x + R * vec3(m.com[k])
-        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
-        mass = T(m.mass[k])
-        if wp.static(VARIED):
-            inertia = law.mass * inertia
-            mass = law.mass * mass
-        Ib = mass * wp.skew(com)
-        Ia = inertia - Ib * wp.skew(com)
-        Id = wp.diag(vec3(mass, mass, mass))
-        F = wp.spatial_cross_dual(V, sp.momentum(mass, com, inertia, V))
-        if wp.static(DRAG):
-            F = F - drag.drag_wrench(m, k, R, com, V)
-        if wp.static(CONTACT and not CONSTRAINED):
-            Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, h, theta, Ia, Ib, Id, F)
-        return Ia, Ib, Id, F
 
     @wp.func
     def too_fast(rate: T):
@@ -217,7 +197,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 Id[i] = mat3()
                 P[i] = vec6()
             for i in range(FIRST, n):
-                ia, ib, id, f = link_inertia(m, law, at + i, R[i], x[i], V[i], place, h, theta)
+                ia, ib, id, f = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place, h, theta)
                 Ia[i] = ia
                 Ib[i] = ib
                 Id[i] = id
@@ -226,7 +206,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 force.add_forces(m, at, n, forces, e, R, x, P)
             if wp.static(MUSCLE):
                 muscle.add_muscles(m, lane, pull, tension, lengths, rates, R, x, V, P)
-            # 2. inward: articulated inertias. With constraints each pass is a step of Newton's method, the first one as if
+            # 2. inward: articulated inertias. With constraints each pass is a step of Newton's method, the first as if
             # all of them stuck. MuJoCo's implicit damping is one pass more: (M + h b) change = -h b a.
             begin = 0
             end = 1

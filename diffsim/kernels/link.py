@@ -1,0 +1,96 @@
+"""One link's part of the equations of motion: its inertia and bias force, and their adjoints."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from diffsim.kernels.contact import contact_law
+from diffsim.kernels.drag import drag_law
+from diffsim.kernels.factors import MASS
+from diffsim.kernels.kinematics import kinematics
+from diffsim.kernels.model import types
+from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
+
+
+@cache
+def link_law(spec: KernelSpec) -> SimpleNamespace:
+    t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
+    T, vec3, vec6, mat3, Model, Law = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law
+    momentum, Place, VARIED = sp.momentum, kinematics(spec).Place, spec.varied
+    # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
+    DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
+
+    @wp.func
+    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, h: T, theta: T):
+        """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
+        com = x + R * vec3(m.com[k])
+        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        mass = T(m.mass[k])
+        if wp.static(VARIED):
+            inertia = law.mass * inertia
+            mass = law.mass * mass
+        Ib = mass * wp.skew(com)
+        Ia = inertia - Ib * wp.skew(com)
+        Id = wp.diag(vec3(mass, mass, mass))
+        F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
+        if wp.static(DRAG):
+            F = F - drag.drag_wrench(m, k, R, com, V)
+        if wp.static(CONTACT):
+            Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, h, theta, Ia, Ib, Id, F)
+        return Ia, Ib, Id, F
+
+    @wp.func
+    def link_adjoint(
+        m: Model,
+        law: Law,
+        k: int,
+        R: mat3,
+        x: vec3,
+        V: vec6,
+        A: vec6,
+        W: vec6,
+        place: Place,
+        h: T,
+        theta: T,
+        adj_factors: t.array,  # written if varied only
+    ):
+        """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position."""
+        com = x + R * vec3(m.com[k])
+        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        Iv = momentum(T(m.mass[k]), com, inertia, V)
+        adj_a = momentum(T(m.mass[k]), com, inertia, W)
+        adj_w = momentum(T(m.mass[k]), com, inertia, A) + wp.spatial_cross_dual(V, Iv)
+        adj_v = momentum(T(m.mass[k]), com, inertia, wp.spatial_cross(W, V))
+        adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
+        adj_p = vec6()
+        if wp.static(VARIED):
+            # phi's inertial part is W . adj_w, and all of this is that of a factor of one.
+            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
+            adj_a = law.mass * adj_a
+            adj_w = law.mass * adj_w
+            adj_v = law.mass * adj_v
+        if wp.static(DRAG):
+            adj_w = adj_w - drag.drag_wrench(m, k, R, com, V)
+            adj_v = adj_v + drag.drag_adjoint(m, k, R, com, V, W)
+        if wp.static(CONTACT):
+            adj_a, adj_v, adj_w, adj_p = contact.add_contacts_adjoint(
+                m, law, k, R, x, V, A, W, place, h, theta, adj_a, adj_v, adj_w, adj_p, adj_factors
+            )
+        return adj_a, adj_v, adj_w, adj_p
+
+    @wp.func
+    def damping_adjoint(m: Model, law: Law, k: int, R: mat3, x: vec3, D: vec6, W: vec6, adj_factors: t.array):
+        """The adjoints of D and W in W . I D, with I the inertia of one link."""
+        com = x + R * vec3(m.com[k])
+        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        adj_d = momentum(T(m.mass[k]), com, inertia, W)
+        adj_w = momentum(T(m.mass[k]), com, inertia, D)
+        if wp.static(VARIED):
+            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
+            adj_d = law.mass * adj_d
+            adj_w = law.mass * adj_w
+        return adj_d, adj_w
+
+    return SimpleNamespace(link_inertia=link_inertia, link_adjoint=link_adjoint, damping_adjoint=damping_adjoint)
