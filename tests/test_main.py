@@ -151,15 +151,6 @@ def test_a_policy_alone_cannot_be_resumed(trained: Path, tmp_path: Path, capsys:
 # The start ------------------------------------------------------------------------------------------------------------
 
 
-def test_only_a_compilation_is_announced(tmp_path: Path) -> None:
-    step = "import torch, diffsim; env = diffsim.make('cartpole', 1, horizon=1)\n"
-    step += "with torch.no_grad(): env.step(torch.zeros(1, 1)), env.step(torch.zeros(1, 1))"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(tmp_path), "MUJOCO_GL": "osmesa"}
-    result = subprocess.run([sys.executable, "-c", step], capture_output=True, text=True, env=environment)
-    assert (result.returncode, result.stdout) == (0, "")
-    assert result.stderr == "compiling kernels for cartpole (once, about 10 s) ...\n"
-
-
 def test_only_the_warning_is_held_back(capfd: pytest.CaptureFixture[str]) -> None:
     with startup._without(b"noise"):
         os.write(2, b"first\nmuch noise here\nlast\n")
