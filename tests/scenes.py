@@ -159,12 +159,11 @@ def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple
 
 
 def varied_robot(name: str, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
-    """A robot for the factors, all of which matter in its states: "linear" and "hill" legs, "planar" tree, "hopper"."""
+    """A robot for the factors, all of which matter in its states: "linear" and "hill" legs, "hopper"."""
     if name == "hopper":
         scene = task_scene(name).with_penalty({"d_limit": 500.0})
         return scene, acting_states(scene, count, rng)
-    scene = tree_scene("planar", 0) if name == "planar" else leg_scene(name, grounded=True)
-    return grounded_states(scene, count, rng)
+    return grounded_states(leg_scene(name, grounded=True), count, rng)
 
 
 # A pendulum on a cart that is pulled from the wall.
