@@ -206,7 +206,7 @@ def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
     for case in args.measured:
         for row in part.measure(args, case):
             args.keep(part.csv, row, part.key)
-    order = {name: place for place, name in enumerate(LEARNT)}
+    order: dict[str, int] = {name: place for place, name in enumerate(LEARNT)}
     rows = sorted(args.read(part.csv), key=lambda row: order.get(row.get("task", "").partition(" ")[0], 0))
     args.publish(part.table, tables.markdown(part.shown(rows)), part.page, part.everywhere)
     return rows

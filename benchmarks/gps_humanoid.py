@@ -51,7 +51,7 @@ def noisy(act: Act, noise: Tensor) -> Act:
     return lambda t, x: act(t, x) + noise[:, t]
 
 
-def measure(_: CheckpointFlags, path: Path) -> Iterator[Row]:
+def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:
     """One row for each case, size and controller."""
     path = checkpoint_of(path)
     about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)

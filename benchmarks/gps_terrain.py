@@ -64,7 +64,7 @@ def until_fall(x: Tensor, height: int) -> tuple[Tensor, Tensor]:
     return up[..., -1].bool(), (x[..., 0].gather(-1, last) - x[..., :1, 0]).squeeze(-1)
 
 
-def measure(_: CheckpointFlags, path: Path) -> Iterator[Row]:
+def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:
     """One row for each terrain, size and controller."""
     path = checkpoint_of(path)
     about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
