@@ -229,10 +229,10 @@ def test_vector_wrappers() -> None:
 def test_the_wrapper_that_wants_the_reset_in_the_next_step() -> None:
     with pytest.raises(ValueError, match="NEXT_STEP"):
         wrappers.vector.NormalizeObservation(gymnasium.make_vec(HOPPERS, num_envs=2))
-    env = gymnasium.make_vec(HOPPERS, num_envs=8, autoreset_mode="NextStep", max_episode_steps=20)
+    env = gymnasium.make_vec(HOPPERS, num_envs=16, autoreset_mode="NextStep", max_episode_steps=20)
     env = wrappers.vector.NormalizeObservation(env)
     env.reset(seed=0)
-    seen = np.stack([env.step(action)[0] for action in random_actions(100, 8, 3)])
+    seen = np.stack([env.step(action)[0] for action in random_actions(100, 16, 3)])
     assert seen.dtype == np.float32 and abs(seen[50:].mean()) < 0.3 and 0.5 < seen[50:].std() < 2
 
 

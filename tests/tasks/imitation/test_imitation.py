@@ -277,7 +277,7 @@ def test_the_phase_is_kept_in_single_precision() -> None:
 
 
 def test_the_environment_keeps_the_clock() -> None:
-    env = diffsim.make("humanoid_imitation", 8, seed=0, horizon=4)
+    env = diffsim.make("humanoid_imitation", 7, seed=0, horizon=4)
     task, step = env.task, env.first_step.clone()
     assert isinstance(task, HumanoidImitation) and len(set(step.tolist())) > 3
     assert torch.equal(task.frame(env.reset(seed=0)[0]), env.first_step) and torch.equal(step, env.first_step)
@@ -285,21 +285,21 @@ def test_the_environment_keeps_the_clock() -> None:
     for _ in range(60):
         before = env.first_step + env.episode_step
         with torch.no_grad():
-            obs, reward, terminated, _, info = env.step(torch.randn(8, NU, generator=generator))
+            obs, reward, terminated, _, info = env.step(torch.randn(7, NU, generator=generator))
         assert torch.equal(task.frame(info["final_obs"]), (before + 1) % task.period)
         assert torch.equal(task.frame(obs), (env.first_step + env.episode_step) % task.period)
         assert torch.equal(env.first_step[~terminated] + env.episode_step[~terminated], before[~terminated] + 1)
         torch.testing.assert_close(task.reward(obs, obs)[terminated], torch.ones(int(terminated.sum())))
         ends += int(terminated.sum())
     assert ends > 8
-    other = diffsim.make("humanoid_imitation", 8, seed=1, horizon=4)
+    other = diffsim.make("humanoid_imitation", 7, seed=1, horizon=4)
     other.load_state_dict(env.state_dict())
     other.detach(), env.detach()
     for _ in range(30):
         with torch.no_grad():
-            actions = torch.randn(8, NU, generator=generator)
+            actions = torch.randn(7, NU, generator=generator)
             assert torch.equal(env.step(actions)[0], other.step(actions)[0])
-    env.reset(options={"reset_mask": torch.arange(8) == 2})
+    env.reset(options={"reset_mask": torch.arange(7) == 2})
     assert env.episode_step[2] == 0 and task.frame(env._obs)[2] == env.first_step[2]
     assert torch.equal(env.set_state(env.qpos, env.qvel), env._obs)
     calm = diffsim.make("humanoid_imitation", 2, stochastic_init=False)
