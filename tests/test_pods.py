@@ -251,7 +251,7 @@ def test_a_run_resumes_bitwise(order: list[str], tmp_path: Path) -> None:
         assert_same(part[name], whole[name])
     rows = read_progress(tmp_path / "part")
     assert whole["control_steps"] == int(rows[-1]["control_steps"])
-    count = 3 * 80 * (1 + 1 + (2 if not order else 2 + 11))
+    count = 3 * 80 * (1 + 1 + (2 if not order else 4 + 11))
     assert [int(row["control_steps"]) for row in rows] == [count * (k + 1) for k in range(len(rows))]
     assert [row["length"] for row in rows] == ["", "", *["240.0"] * (len(rows) - 2)]
     assert all(float(row["pods_improved_return"]) >= float(row["pods_return"]) for row in rows)
