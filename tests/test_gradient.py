@@ -150,7 +150,7 @@ def test_quaternion_of_any_length(rng):
 @pytest.mark.parametrize("name", ["hopper", "ant", "humanoid_mtu"])
 def test_float32_gradient_is_that_of_float64(name, rng):
     scene, simulator = task_scene(name), {"integration": TASKS[name].integration("default")}
-    states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 16, rng)]
+    states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 15, rng)]
     w = weights(scene, rng)
     single, double = (gradients(scene, states, w, dtype, **simulator) for dtype in (torch.float32, torch.float64))
     errors = [np.linalg.norm(a - b, axis=-1) / np.linalg.norm(b, axis=-1) for a, b in zip(single, double, strict=True)]
