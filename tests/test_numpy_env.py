@@ -119,10 +119,13 @@ def test_blow_ups_are_passed_on() -> None:
 
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 def test_behaves_as_gymnasiums_vector_of_single_environments(mode: AutoresetMode) -> None:
-    """Bit by bit, with episodes that fall and episodes that run out of time; but "nonfinite" is there for everyone."""
-    ours = gymnasium.make_vec(HOPPERS, num_envs=4, autoreset_mode=mode, max_episode_steps=75)
-    arguments = dict(vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, max_episode_steps=75)
-    theirs = gymnasium.make_vec(HOPPER, num_envs=4, **arguments)
+    """Bit by bit, with episodes that fall and episodes that run out of time; but "nonfinite" is there for everyone.
+
+    In float64, as in float32 several environments are a block, whose sums are rounded otherwise than those of one.
+    """
+    options = dict(num_envs=4, max_episode_steps=75, dtype=torch.float64)
+    ours = gymnasium.make_vec(HOPPERS, autoreset_mode=mode, **options)
+    theirs = gymnasium.make_vec(HOPPER, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **options)
     assert isinstance(theirs, SyncVectorEnv) and ours.metadata == theirs.metadata
     assert ours.observation_space == theirs.observation_space and ours.action_space == theirs.action_space
     ends = np.zeros(2, int)
