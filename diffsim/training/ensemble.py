@@ -131,13 +131,12 @@ class EnsembleAdam(ClippedAdam):
             gradient = torch.where(self.tied > 0, gradient.mean(1, keepdim=True), gradient)
         norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
         good = norm < self.skip_norm
-        self.vector.grad = torch.where(good, gradient / (norm / self.max_norm).clamp(min=1.0), 0.0)
-        self.adam.step()
+        self.step_count += 1
+        self._descend(torch.where(good, gradient / (norm / self.max_norm).clamp(min=1.0), 0.0))
         self.skipped += (~good).sum()
         return norm.max()
 
     def tie(self, member: int) -> None:
         """Give all members the weights and moments of one."""
-        for tensor in (self.vector, *self.adam.state[self.vector].values()):
-            if tensor.shape == self.vector.shape:
-                tensor.copy_(tensor[:, member : member + 1].clone().expand_as(tensor))
+        for tensor in (self.vector, self.exp_avg, self.exp_avg_sq):
+            tensor.copy_(tensor[:, member : member + 1].clone().expand_as(tensor))
