@@ -723,14 +723,14 @@ ALGORITHMS: dict[str, type[PPO | SHAC | SAC]] = {"ppo": PPO, "shac": SHAC, "sac"
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     learner = run.restore(ALGORITHMS[args.algorithm](args, env))
     interact, learn = run.capture(learner.interact, env), run.capture(learner.learn)
     for iteration in run:
         learner.schedule(iteration)
         run.log(interact() | learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, learner.policy))
+            run.log_evaluation(evaluate(run.eval_env, learner.policy))
 
 
 @command

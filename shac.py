@@ -243,14 +243,14 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     shac = run.restore(SHAC(args, env))
     update_actor, update_critic = run.capture(shac.update_actor, env), run.capture(shac.update_critic)
     for iteration in run:
         shac.set_learning_rates(iteration)
         run.log(update_actor() | update_critic())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, shac.policy))
+            run.log_evaluation(evaluate(run.eval_env, shac.policy))
 
 
 @command
