@@ -132,7 +132,7 @@ class EnsembleAdam(ClippedAdam):
         norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
         good = norm < self.skip_norm
         self.step_count += 1
-        self._descend(torch.where(good, gradient / (norm / self.max_norm).clamp(min=1.0), 0.0))
+        self._update(torch.where(good, gradient / (norm / self.max_norm).clamp(min=1.0), 0.0))
         self.skipped += (~good).sum()
         return norm.max()
 

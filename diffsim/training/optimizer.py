@@ -60,16 +60,20 @@ class ClippedAdam:
 
     def step(self, loss: Tensor) -> Tensor:
         """One descent step; returns the gradient's norm () before clipping."""
-        gradient = distributed.average(self._flatten(torch.autograd.grad(loss, self.parameters)))
+        return self.descend(self._flatten(torch.autograd.grad(loss, self.parameters)))
+
+    def descend(self, gradient: Tensor) -> Tensor:
+        """`step` along a gradient of the form of `vector`, which becomes the mean of all ranks'."""
+        gradient = distributed.average(gradient)
         norm = torch.linalg.vector_norm(gradient)
         good = norm < self.skip_norm
         bad = (~good).to(norm.dtype)
         self.step_count += good
-        self._descend(gradient, grad_scale=(norm / self.max_norm).clamp(min=1.0), found_inf=bad)
+        self._update(gradient, grad_scale=(norm / self.max_norm).clamp(min=1.0), found_inf=bad)
         self.skipped += bad
         return norm
 
-    def _descend(self, gradient: Tensor, grad_scale: Tensor | None = None, found_inf: Tensor | None = None) -> None:
+    def _update(self, gradient: Tensor, grad_scale: Tensor | None = None, found_inf: Tensor | None = None) -> None:
         """Adam's update along the gradient over grad_scale; where found_inf is 1, nothing changes."""
         torch._fused_adam_(
             *([self.vector], [gradient], [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]),
