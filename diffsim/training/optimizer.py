@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from diffsim.training import distributed
 
-EPSILON = 1e-8
+PLAIN: dict[str, Any] = dict(weight_decay=0.0, eps=1e-8, amsgrad=False, maximize=False)  # torch.optim.Adam's defaults
 
 
 class ClippedAdam:
@@ -43,14 +43,14 @@ class ClippedAdam:
         skip_norm: float = 1e6,
     ) -> None:
         self.parameters = [p for p in module.parameters() if p.requires_grad]
-        self.vector = self._flatten(self.parameters).detach()
+        self.vector = self.flatten(self.parameters).detach()
         self._adopt(self.vector)
         self.exp_avg, self.exp_avg_sq = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
         self.lr = torch.full((), lr, device=self.vector.device)
         self.step_count, self.skipped = torch.zeros_like(self.lr), torch.zeros_like(self.lr)
         self.betas, self.max_norm, self.skip_norm = betas, max_norm, skip_norm
 
-    def _flatten(self, tensors: Sequence[Tensor]) -> Tensor:
+    def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
         """All numbers in one tensor."""
         return torch.cat([tensor.flatten() for tensor in tensors])
 
@@ -60,7 +60,7 @@ class ClippedAdam:
 
     def step(self, loss: Tensor) -> Tensor:
         """One descent step; returns the gradient's norm () before clipping."""
-        return self.descend(self._flatten(torch.autograd.grad(loss, self.parameters)))
+        return self.descend(self.flatten(torch.autograd.grad(loss, self.parameters)))
 
     def descend(self, gradient: Tensor) -> Tensor:
         """`step` along a gradient of the form of `vector`, which becomes the mean of all ranks'."""
@@ -73,20 +73,11 @@ class ClippedAdam:
         self.skipped += bad
         return norm
 
-    def _update(self, gradient: Tensor, grad_scale: Tensor | None = None, found_inf: Tensor | None = None) -> None:
-        """Adam's update along the gradient over grad_scale; where found_inf is 1, nothing changes."""
-        torch._fused_adam_(
-            *([self.vector], [gradient], [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]),
-            lr=self.lr,
-            beta1=self.betas[0],
-            beta2=self.betas[1],
-            weight_decay=0.0,
-            eps=EPSILON,
-            amsgrad=False,
-            maximize=False,
-            grad_scale=grad_scale,
-            found_inf=found_inf,
-        )
+    def _update(self, gradient: Tensor, **scaled: Any) -> None:
+        """Adam's update along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
+        tensors: Any = [[self.vector], [gradient], [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]]
+        beta1, beta2 = self.betas
+        torch._fused_adam_(*tensors, lr=self.lr, beta1=beta1, beta2=beta2, **PLAIN, **scaled)
 
     def moments(self, parameter: Tensor) -> list[Tensor]:
         """Views of a parameter's moments (numel,), first and second."""

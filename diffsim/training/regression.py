@@ -23,12 +23,6 @@ class Regression:
         if wrong := [type(layer).__name__ for layer in network if not isinstance(layer, KINDS)]:
             raise TypeError(f"no regression of {wrong[0]}: only of Linear, ELU and LayerNorm")
         self.layers, self.optimizer = list(network), optimizer
-        self.gradient = torch.zeros_like(optimizer.vector)
-        # Each layer's part of it: of the weight and of the bias
-        self._parts = [
-            [self.gradient.as_strided(p.shape, p.stride(), p.storage_offset()) for p in layer.parameters()]
-            for layer in network
-        ]
 
     @torch.no_grad()
     def step(self, x: Tensor, target: Tensor) -> Tensor:
@@ -48,16 +42,16 @@ class Regression:
                 x = y
         error = x.squeeze(-1) - target
         g = (2.0 / len(error) * error).unsqueeze(-1)  # the adjoint of what a layer returns
-        for layer, (x, *moments), part in zip(self.layers[::-1], kept[::-1], self._parts[::-1], strict=True):
+        gradients: list[Tensor] = []  # of the parameters, the last one first
+        for layer, (x, *moments) in zip(self.layers[::-1], kept[::-1], strict=True):
             if isinstance(layer, nn.Linear):
-                torch.mm(g.t(), x, out=part[0])
-                torch.sum(g, 0, out=part[1])
+                gradients += g.sum(0), g.t() @ x
                 g = g @ layer.weight if layer is not self.layers[0] else g
             elif isinstance(layer, nn.ELU):
                 g = torch.ops.aten.elu_backward(g, layer.alpha, 1.0, 1.0, layer.inplace, x)
             elif isinstance(layer, nn.LayerNorm):
                 affine = layer.normalized_shape, *moments, layer.weight, layer.bias
-                g, *slopes = torch.ops.aten.native_layer_norm_backward(g, x, *affine, (True, True, True))
-                torch._foreach_copy_(part, slopes)
-        self.optimizer.descend(self.gradient)
+                g, weight, bias = torch.ops.aten.native_layer_norm_backward(g, x, *affine, (True, True, True))
+                gradients += bias, weight
+        self.optimizer.descend(self.optimizer.flatten(gradients[::-1]))
         return error.square().mean()
