@@ -75,9 +75,9 @@ class ClippedAdam:
 
     def _update(self, gradient: Tensor, **scaled: Any) -> None:
         """Adam's update along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
-        tensors: Any = [[self.vector], [gradient], [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]]
-        beta1, beta2 = self.betas
-        torch._fused_adam_(*tensors, lr=self.lr, beta1=beta1, beta2=beta2, **PLAIN, **scaled)
+        state: Any = [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]
+        options: dict[str, Any] = dict(lr=self.lr, beta1=self.betas[0], beta2=self.betas[1]) | PLAIN | scaled
+        torch._fused_adam_([self.vector], [gradient], *state, **options)
 
     def moments(self, parameter: Tensor) -> list[Tensor]:
         """Views of a parameter's moments (numel,), first and second."""
