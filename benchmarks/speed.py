@@ -22,14 +22,16 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import mujoco
 import torch
+import warp as wp
 from common import Panel, Part, TaskName, lines, measured, plot, run
 from motions import CONTROL_DT, shac, simulator
 from runner import ScriptFlags
@@ -38,13 +40,18 @@ from tables import ROOT, Row, read_csv
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
-from diffsim.sim.launcher import available_cores
+from diffsim.sim.launcher import Launcher, available_cores
+from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
 from diffsim.training.evaluation import make_env
 
-Precision = Literal["float32", "float64"]
-DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
+KernelName = Literal["blocks", "scalar", "float64"]
+KERNELS: dict[KernelName, dict[str, Any]] = {
+    "blocks": {},  # float32; on a CPU in vectors of environments
+    "scalar": {"block": 1},
+    "float64": {"dtype": torch.float64},
+}
 PartName = Literal["physics", "scaling", "training", "time"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; the scaling table leaves out larger settings
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
@@ -57,7 +64,11 @@ class Args(ScriptFlags):
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
     scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
     horizons: tuple[Count, ...] = (1, 4, 8, 16, 32, 64, 128)  # horizons of the scaling table, at 64 environments
-    dtype: tuple[Precision, ...] = ("float32", "float64")  # precisions of the physics table
+    kernels: tuple[KernelName, ...] = (
+        "blocks",
+        "scalar",
+        "float64",
+    )  # those of the physics table, scalar on a CPU only
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
     script: str = "shac"  # script of the training table, in the repository's root, without .py
@@ -83,8 +94,25 @@ def random_states(name: str, num_envs: int, count: int) -> list[State]:
     return states
 
 
+@contextmanager
+def kernel_time() -> Iterator[list[float]]:
+    """Seconds of each launch of kernels meanwhile; on a GPU, which does not wait for them, meaningless."""
+    seconds, launch = list[float](), Launcher.launch
+
+    def timed_launch(self: Launcher, command: list[wp.Launch]) -> None:
+        start = time.perf_counter()
+        launch(self, command)
+        seconds.append(time.perf_counter() - start)
+
+    Launcher.launch = timed_launch  # type: ignore[method-assign]
+    try:
+        yield seconds
+    finally:
+        Launcher.launch = launch  # type: ignore[method-assign]
+
+
 def timer(sim: Simulator) -> Callable[[State], Times]:
-    """Times one differentiated control step, forward and backward, as a learner sees it."""
+    """Times one differentiated control step, forward and backward, as a learner sees it, and of it the kernels."""
     synchronize = torch.cuda.synchronize if sim.device.type == "cuda" else lambda: None
 
     def time_step(state: State) -> Times:
@@ -92,12 +120,16 @@ def timer(sim: Simulator) -> Callable[[State], Times]:
         gradients = [torch.ones_like(x) for x in inputs[:2]]
         synchronize()
         start = time.perf_counter()
-        outputs = sim.step(*inputs)
+        with kernel_time() as forward:
+            outputs = sim.step(*inputs)
         synchronize()
         middle = time.perf_counter()
-        torch.autograd.grad(outputs, inputs, gradients)
+        with kernel_time() as backward:
+            torch.autograd.grad(outputs, inputs, gradients)
         synchronize()
-        return {"forward": 1e6 * (middle - start), "backward": 1e6 * (time.perf_counter() - middle)}
+        whole = {"forward": middle - start, "backward": time.perf_counter() - middle}
+        kernels = {"forward kernel": sum(forward), "backward kernel": sum(backward)}
+        return {what: 1e6 * seconds for what, seconds in (whole | kernels).items()}
 
     return time_step
 
@@ -137,36 +169,38 @@ def mujoco_timer(scene: Scene, num_envs: int, substeps: int) -> Callable[[State]
 
 
 def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
-    """With all models of its muscles if a task has any, and without; beside MuJoCo."""
+    """Beside MuJoCo: with all models of its muscles and without, if a task has any; the hopper also on rough ground."""
     threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()} if args.device == "cpu" else {args.device: 1}
     default, whole = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs=1).scene
     scenes = {"": whole}
     if "muscle" in whole.features:
-        scenes = {model: dataclasses.replace(whole, muscle_model=model) for model in ("linear", "hill")}
-        scenes["none"] = whole.without("muscle")
+        scenes = {f"{kind} muscles": dataclasses.replace(whole, muscle_model=kind) for kind in ("linear", "hill")}
+        scenes["no muscles"] = whole.without("muscle")
+    if name == "hopper":
+        scenes["rough ground"] = whole.with_terrain(rough(0))
+    kernels = [kernel for kernel in args.kernels if args.device == "cpu" or kernel != "scalar"]
     for num_envs in args.num_envs:
         reference = "", "", "mj_step"
         competitors = {reference: mujoco_timer(whole, num_envs, default.substeps)}
-        for (muscles, scene), dtype, (place, count) in product(scenes.items(), args.dtype, threads.items()):
-            sim = simulator(scene, default, num_envs, DTYPES[dtype], device=args.device, threads=count)
-            competitors[muscles, dtype, place] = timer(sim)
+        for (scene_name, scene), kernel, (place, count) in product(scenes.items(), kernels, threads.items()):
+            sim = simulator(scene, default, num_envs, device=args.device, threads=count, **KERNELS[kernel])
+            competitors[scene_name, kernel, place] = timer(sim)
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
         per_substep = num_envs * default.substeps
         mj = times.pop(reference)["mj_step"] / per_substep
-        for (muscles, precision, place), t in times.items():
-            forward, backward = t["forward"] / per_substep, t["backward"] / per_substep
-            yield {
+        for (scene_name, kind, place), t in times.items():
+            scalar = times.get((scene_name, "scalar", place), {})
+            row: dict[str, object] = {
                 "task": name,
                 "environments": num_envs,
-                "precision": precision,
+                "scene": scene_name,
+                "kernel": kernel,
                 "device": place,
-                "muscles": muscles,
-                "forward (us/substep)": forward,
-                "backward (us/substep)": backward,
-                "backward/forward": backward / forward,
-                "mj_step, one core (us/substep)": mj,
-                "mj_step/forward": mj / forward,
             }
+            row |= {f"{what} (us/substep)": microseconds / per_substep for what, microseconds in t.items()}
+            ratios = {what: t[what] / scalar[what] for what in scalar if "kernel" in what}
+            row |= {f"{what}/scalar": ratio for what, ratio in ratios.items()}
+            yield row | {"mj_step, one core (us/substep)": mj, "mj_step/forward": mj * per_substep / t["forward"]}
 
 
 def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: int) -> list[float]:
@@ -316,7 +350,7 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
 
 
 PARTS: dict[PartName, Part] = {
-    "physics": Part("speed_physics", measure_physics, ("task", "environments", "precision", "device", "muscles")),
+    "physics": Part("speed_physics", measure_physics, ("task", "environments", "scene", "kernel", "device")),
     "scaling": Part("speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique")),
     "training": Part("speed_training", measure_training, ("task", "environments", "device", "script")),
     "time": Part("time", measure_time, ("task",), "time", "experiments.md"),

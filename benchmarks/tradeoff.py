@@ -14,13 +14,14 @@ import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import motions
 import numpy as np
 import torch
 from common import TASKS, Line, Panel, Part, TaskName, measured, plot, run
 from motions import INTEGRATORS, Array, Integration, PolicyFlags, integration, replay, simulator
-from speed import DTYPES, Precision, race, timer
+from speed import race, timer
 from tables import Row, markdown
 
 import diffsim
@@ -35,6 +36,10 @@ PANELS = {
 }
 ERRORS = ("state 0.1 s", "state 0.5 s", "gradient 8", "gradient 32", "cosine 32", "norm 32, 95 %", "policy")
 COLOURS = {kind: f"C{k}" for k, kind in enumerate(INTEGRATORS)}
+
+
+Precision = Literal["float32", "float64"]
+DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
 
 
 @dataclass

@@ -55,8 +55,8 @@ class DiffEnv(VectorEnv):
         early_termination: end episodes where the task says that the robot has fallen.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
         render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
-        **options: device, dtype, threads, factors, forces, division: see sim.Options. `env.sim` has the factors and the
-            forces.
+        **options: device, dtype, threads, factors, forces, block, division: see sim.Options. `env.sim` has the factors
+            and the forces.
 
     Attributes:
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.

@@ -31,23 +31,25 @@ from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import KernelSpec, module_options
+from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks, module_options
 from diffsim.robot.scene import FACTORS
 
 
 @cache
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
-    t, sp, kin, sums = types(spec.dtype), spatial(spec.dtype), kinematics(spec), lane_sums(spec)
-    T, vec2, vec3, vec6, mat3, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
+    t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
+    T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
     Model, Law, Place, law_of = t.Model, t.Law, kin.Place, environment_law(spec)
     join, momentum, load, link_of, qpos_adr = sp.join, sp.momentum, kin.load, kin.link_of, kin.qpos_adr
-    contact, drag, force, joint = contact_law(spec), drag_law(T), external_force(spec), joint_law(spec)
+    contact, drag, force, joint = contact_law(spec), drag_law(spec), external_force(spec), joint_law(spec)
     muscle, base = muscle_law(spec, adjoint=True), base_inertia(spec)
     CONTACT, DRAG, TERRAIN, DRIVEN, MUSCLE, HILL, LIMIT = (
         name in spec.features for name in ("contact", "drag", "terrain", "motor", "muscle", "hill", "limit")
     )
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
+    read, write, pick = block.read, block.write, block.pick
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in spec.features
     NFACTORS, NBODY = len(FACTORS), spec.forced
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
@@ -74,12 +76,12 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         adj_factors: t.array,  # written if varied only
     ):
         """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position."""
-        com = x + R * m.com[k]
-        inertia = R * m.inertia[k] * wp.transpose(R)
-        Iv = momentum(m.mass[k], com, inertia, V)
-        adj_a = momentum(m.mass[k], com, inertia, W)
-        adj_w = momentum(m.mass[k], com, inertia, A) + wp.spatial_cross_dual(V, Iv)
-        adj_v = momentum(m.mass[k], com, inertia, wp.spatial_cross(W, V))
+        com = x + R * vec3(m.com[k])
+        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        Iv = momentum(T(m.mass[k]), com, inertia, V)
+        adj_a = momentum(T(m.mass[k]), com, inertia, W)
+        adj_w = momentum(T(m.mass[k]), com, inertia, A) + wp.spatial_cross_dual(V, Iv)
+        adj_v = momentum(T(m.mass[k]), com, inertia, wp.spatial_cross(W, V))
         adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
         adj_p = vec6()
         if wp.static(VARIED):
@@ -97,13 +99,18 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             )
         return adj_a, adj_v, adj_w, adj_p
 
+    @wp.func
+    def hand_out(out: t.array2, e: int, column: int, drop: T, value: T):
+        """Writes the value, but 0 where the gradient is dropped."""
+        write(out, e, column, pick(T(0.0), drop, T(0.0), value))
+
     @wp.kernel(module="unique", module_options=module_options(spec))
     def backward(
         # model
         m: Model,
-        first: int,  # environment of this launch
-        h: T,
-        theta: T,
+        first: int,  # block of this launch
+        seconds: t.U,  # of a substep
+        implicitness: t.U,
         substeps: int,
         # checkpoint in
         row0: int,
@@ -128,8 +135,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         g_forces: t.array2,
         nonfinite_gradients: wp.array(dtype=int),
     ):
+        h = T(seconds)
+        theta = T(implicitness)
         tid = wp.tid()
-        e = first + tid / THREADS_PER_ENV
+        e = first + tid / THREADS_PER_ENV  # the environment, or block of environments
         lane = tid % THREADS_PER_ENV
         slots = int(SLOTS)
         n = int(SLOTS)
@@ -161,8 +170,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(FORCED):
             adj_forces = wp.zeros(shape=NBODY, dtype=vec6)
         for i in range(1, n):
-            gq[i] = g_qpos_out[e, qpos_adr(m, at + i)]
-            gqd[i] = g_qvel_out[e, VADR + link_of(m, at + i)]
+            gq[i] = read(g_qpos_out, e, qpos_adr(m, at + i))
+            gqd[i] = read(g_qvel_out, e, VADR + link_of(m, at + i))
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
             adj_pull = wp.zeros(shape=NU, dtype=T)
@@ -193,19 +202,19 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(FLOATING):
             w = next_rate(ck_v, ck_a, end, 3, e, h)
             rot = wp.normalize(kin.load_quat_row(ck_q, end, 3, e) * sp.exp_quat(h * w))
-            gp = vec3(g_qpos_out[e, 0], g_qpos_out[e, 1], g_qpos_out[e, 2])
+            gp = vec3(read(g_qpos_out, e, 0), read(g_qpos_out, e, 1), read(g_qpos_out, e, 2))
             gr = sp.to_tangent(rot, kin.load_quat(g_qpos_out, e, 3))
-            gv = vec3(g_qvel_out[e, 0], g_qvel_out[e, 1], g_qvel_out[e, 2])
-            gw = vec3(g_qvel_out[e, 3], g_qvel_out[e, 4], g_qvel_out[e, 5])
+            gv = vec3(read(g_qvel_out, e, 0), read(g_qvel_out, e, 1), read(g_qvel_out, e, 2))
+            gw = vec3(read(g_qvel_out, e, 3), read(g_qvel_out, e, 4), read(g_qvel_out, e, 5))
 
         for sub in range(substeps):
             row = row0 + substeps - 1 - sub
             # 1. the state of this substep, and the adjoint of the integrator
             if wp.static(TERRAIN):
-                place = vec2(m.carrier_along, m.carrier_height)
+                place = vec2(T(m.carrier_along), T(m.carrier_height))
             else:
-                place = m.carrier_height
-            A[0] = join(vec3(), -m.gravity)
+                place = T(m.carrier_height)
+            A[0] = join(vec3(), -vec3(m.gravity))
             for i in range(1, n):
                 q[i] = load(ck_q, row, qpos_adr(m, at + i), e)
                 qd[i] = load(ck_v, row, VADR + link_of(m, at + i), e)
@@ -226,7 +235,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 rot = kin.load_quat_row(ck_q, row, 3, e)
                 v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
                 w = vec3(load(ck_v, row, 3, e), load(ck_v, row, 4, e), load(ck_v, row, 5, e))
-                vdot = vec3(load(ck_a, row, 0, e), load(ck_a, row, 1, e), load(ck_a, row, 2, e)) - m.gravity
+                vdot = vec3(load(ck_a, row, 0, e), load(ck_a, row, 1, e), load(ck_a, row, 2, e)) - vec3(m.gravity)
                 wdot = vec3(load(ck_a, row, 3, e), load(ck_a, row, 4, e), load(ck_a, row, 5, e))
                 g_turn, gr_start = sp.exp_adjoint(h * (w + h * wdot), gr)
                 gv = gv + h * gp
@@ -356,7 +365,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 for b in range(m.ball_count[lane]):
                     i = m.ball_slot[lane * NBALL + b]
                     lb = vec3(lam[i], lam[i + 1], lam[i + 2])
-                    lb = m.stiffness[at + i] * (sp.log_adjoint(vec3(q[i], q[i + 1], q[i + 2]), lb) - lb)
+                    lb = T(m.stiffness[at + i]) * (sp.log_adjoint(vec3(q[i], q[i + 1], q[i + 2]), lb) - lb)
                     for k in range(3):
                         gq[i + k] = gq[i + k] + lb[k]
             if wp.static(FLOATING):
@@ -376,31 +385,24 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         # A gradient that left the finite numbers, or of a contained step, is zero.
         broken = T(0.0)
         for i in range(1, n):
-            if not (wp.isfinite(gq[i]) and wp.isfinite(gqd[i]) and wp.isfinite(gtau[i])):
-                broken = T(1.0)
+            broken = broken + block.broken(gq[i]) + block.broken(gqd[i]) + block.broken(gtau[i])
         if wp.static(FLOATING):
             for k in range(3):
-                if not (wp.isfinite(gp[k]) and wp.isfinite(gr[k]) and wp.isfinite(gv[k]) and wp.isfinite(gw[k])):
-                    broken = T(1.0)
+                broken = broken + block.broken(gp[k]) + block.broken(gr[k]) + block.broken(gv[k]) + block.broken(gw[k])
         if wp.static(MUSCLE):
             for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
-                k = m.muscle[entry]
-                if not wp.isfinite(adj_pull[k]):
-                    broken = T(1.0)
+                broken = broken + block.broken(adj_pull[m.muscle[entry]])
         if wp.static(VARIED):
             for k in range(NFACTORS):
-                if not wp.isfinite(adj_factors[k]):
-                    broken = T(1.0)
+                broken = broken + block.broken(adj_factors[k])
         if wp.static(FORCED):
-            if not force.finite_forces(m, at, adj_forces):
-                broken = T(1.0)
+            broken = broken + force.broken_forces(m, at, adj_forces)
         if wp.static(THREADS_PER_ENV > 1):
             broken = sums.add(broken)
-        finite = broken == T(0.0)
-        contained = nonfinite[e]
-        if lane == 0 and not finite and not contained:
-            nonfinite_gradients[e] = nonfinite_gradients[e] + 1
-        keep = finite and not contained
+        contained = block.read_flags(nonfinite, e)
+        if lane == 0:
+            block.count(nonfinite_gradients, e, pick(T(0.0), contained, T(0.0), broken))
+        drop = broken + contained
         for k in range(NU):
             if m.motor_lane[k] == lane:
                 g = T(0.0)
@@ -409,36 +411,37 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(MUSCLE):
                     g = g + adj_pull[k]
                 if wp.static(VARIED):
-                    adj_factors[MOTOR] = adj_factors[MOTOR] + g * (m.gear[k] * ctrl[e, k] + m.motor_bias[k])
+                    motor = T(m.gear[k]) * read(ctrl, e, k) + T(m.motor_bias[k])
+                    adj_factors[MOTOR] = adj_factors[MOTOR] + g * motor
                     g = law.motor * g
-                g_ctrl[e, k] = wp.where(keep, g * m.gear[k], T(0.0))
+                hand_out(g_ctrl, e, k, drop, g * T(m.gear[k]))
         if wp.static(VARIED):
             for k in range(NFACTORS):
                 total = adj_factors[k]
                 if wp.static(THREADS_PER_ENV > 1):
                     total = sums.add(total)
                 if lane == 0:
-                    g_factors[e, k] = wp.where(keep, total, T(0.0))
+                    hand_out(g_factors, e, k, drop, total)
         if wp.static(FORCED):
-            force.write_forces_adjoint(m, at, e, keep, adj_forces, g_forces)
+            force.write_forces_adjoint(m, at, e, drop, adj_forces, g_forces)
         for i in range(1, n):
-            g_qpos[e, qpos_adr(m, at + i)] = wp.where(keep, gq[i], T(0.0))
-            g_qvel[e, VADR + link_of(m, at + i)] = wp.where(keep, gqd[i], T(0.0))
+            hand_out(g_qpos, e, qpos_adr(m, at + i), drop, gq[i])
+            hand_out(g_qvel, e, VADR + link_of(m, at + i), drop, gqd[i])
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[lane]):
                 i = m.ball_slot[lane * NBALL + b]
                 adr = qpos_adr(m, at + i)
                 gb4 = sp.from_tangent(kin.load_quat(qpos, e, adr), vec3(gq[i], gq[i + 1], gq[i + 2]))
-                g_qpos[e, adr] = wp.where(keep, gb4[3], T(0.0))
+                hand_out(g_qpos, e, adr, drop, gb4[3])
                 for k in range(3):
-                    g_qpos[e, adr + 1 + k] = wp.where(keep, gb4[k], T(0.0))
+                    hand_out(g_qpos, e, adr + 1 + k, drop, gb4[k])
         if wp.static(FLOATING):
             g4 = sp.from_tangent(kin.load_quat(qpos, e, 3), gr)
             for k in range(3):
-                g_qpos[e, k] = wp.where(keep, gp[k], T(0.0))
-                g_qpos[e, 4 + k] = wp.where(keep, g4[k], T(0.0))
-                g_qvel[e, k] = wp.where(keep, gv[k], T(0.0))
-                g_qvel[e, 3 + k] = wp.where(keep, gw[k], T(0.0))
-            g_qpos[e, 3] = wp.where(keep, g4[3], T(0.0))
+                hand_out(g_qpos, e, k, drop, gp[k])
+                hand_out(g_qpos, e, 4 + k, drop, g4[k])
+                hand_out(g_qvel, e, k, drop, gv[k])
+                hand_out(g_qvel, e, 3 + k, drop, gw[k])
+            hand_out(g_qpos, e, 3, drop, g4[3])
 
     return backward

@@ -12,8 +12,8 @@ from diffsim.kernels.spec import KernelSpec
 
 @cache
 def base_inertia(spec: KernelSpec) -> SimpleNamespace:
-    t, kin = types(spec.dtype), kinematics(spec)
-    T, vec6, mat3, mat6 = spec.dtype, t.vec6, t.mat3, t.mat6
+    t, kin = types(spec), kinematics(spec)
+    T, vec6, mat3, mat6 = t.T, t.vec6, t.mat3, t.mat6
     load, store = kin.load, kin.store
     BASE = 7 * (spec.nlink - 1)  # where the base's factor begins, packed by rows
 

@@ -24,22 +24,23 @@ from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
+from diffsim.kernels.wide import blocks
 
 
 @cache
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
-    t, sp = types(spec.dtype), spatial(spec.dtype)
-    T, vec3, vec4, vec6, mat3, Model, Law = spec.dtype, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
-    Place, force_at, point_velocity = kinematics(spec).Place, sp.force_at, sp.point_velocity
+    t, sp, block = types(spec), spatial(spec), blocks(spec)
+    T, vec3, vec4, vec6, mat3, Model, Law = t.T, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
+    Place, force_at, point_velocity, pick = kinematics(spec).Place, sp.force_at, sp.point_velocity, block.pick
     sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, VARIED = spec.implicit, spec.varied
 
     @wp.func
     def sphere_state(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
         """Lowest point p, its velocity, and the depth (predicted theta h ahead if implicit) of contact sphere k."""
-        p = x + R * m.contact_position[k]
-        depth = height + p[2] - m.contact_radius[k]
-        p = p - vec3(T(0.0), T(0.0), m.contact_radius[k])
+        p = x + R * vec3(m.contact_position[k])
+        depth = height + p[2] - T(m.contact_radius[k])
+        p = p - vec3(T(0.0), T(0.0), T(m.contact_radius[k]))
         v = point_velocity(V, p)
         if wp.static(IMPLICIT):
             depth = depth + theta * h * v[2]
@@ -47,18 +48,16 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def touches(law: Law, d: T, v: vec3):
-        return d < T(0.0) and law.k_d * v[2] < law.k_n
+        """1 where the ground pushes, else 0."""
+        return pick(d, T(0.0), pick(law.k_d * v[2], law.k_n, T(1.0), T(0.0)), T(0.0))
 
     @wp.func
     def friction_viscosity(law: Law, f_n: T, v: vec3):
         """(c, 1 if sliding else 0)."""
         speed = wp.sqrt(v[0] * v[0] + v[1] * v[1])
-        c = law.k_t
-        sliding = T(0.0)
-        if law.k_t * speed > law.mu * f_n:
-            c = law.mu * f_n / speed
-            sliding = T(1.0)
-        return c, sliding
+        most = law.mu * f_n
+        viscous = law.k_t * speed
+        return pick(most, viscous, most / speed, law.k_t), pick(most, viscous, T(1.0), T(0.0))
 
     @wp.func
     def contact_force(law: Law, d: T, v: vec3):
@@ -81,13 +80,12 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         g_n = g[2]
         gx = -c * g[0]
         gy = -c * g[1]
-        if sliding > T(0.0):
-            # f_t - h c a_t = -c (v_t + h a_t) with c = mu f_n / |v_t|
-            speed2 = v[0] * v[0] + v[1] * v[1]
-            g_c = -(g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
-            g_n = g_n + g_c * law.mu / wp.sqrt(speed2)
-            gx = gx - g_c * c * v[0] / speed2
-            gy = gy - g_c * c * v[1] / speed2
+        # Where the sphere slides, f_t - h c a_t = -c (v_t + h a_t) with c = mu f_n / |v_t|.
+        speed2 = pick(T(0.0), sliding, v[0] * v[0] + v[1] * v[1], T(1.0))
+        g_c = -sliding * (g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
+        g_n = g_n + g_c * law.mu / wp.sqrt(speed2)
+        gx = gx - g_c * c * v[0] / speed2
+        gy = gy - g_c * c * v[1] / speed2
         g_d = g_n * s + g[2] * h * law.k_d * a[2]
         return vec4(gx, gy, g_n * law.k_d * d + theta * h * g_d, g_d)
 
@@ -97,13 +95,10 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         f_n = (law.k_d * v[2] - law.k_n) * d
         c, sliding = friction_viscosity(law, f_n, v)
         g_c = -(g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
-        g_n = g[2]
-        g_mu = T(0.0)
-        if sliding > T(0.0):
-            speed = wp.sqrt(v[0] * v[0] + v[1] * v[1])
-            g_n = g_n + g_c * law.mu / speed
-            g_mu = g_c * f_n / speed
-            g_c = T(0.0)
+        speed = pick(T(0.0), sliding, wp.sqrt(v[0] * v[0] + v[1] * v[1]), T(1.0))
+        g_n = g[2] + sliding * g_c * law.mu / speed
+        g_mu = sliding * g_c * f_n / speed
+        g_c = (T(1.0) - sliding) * g_c
         g_kn = -g_n * d - g[2] * theta * h * h * a[2]
         return vec4(g_kn, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
@@ -126,21 +121,23 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         """Inertia blocks and bias force of link k with its contacts added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, _ = sphere_on_terrain(m, law.profile, c, R, x, V, place, h, theta)
+                p, v, depth, E, _ = sphere_on_terrain(m, law.block, c, R, x, V, place, h, theta)
             else:
                 p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
-            if touches(law, depth, v):
+            on = touches(law, depth, v)
+            if block.any_of(on):
+                depth = on * depth  # no force on the others, as it grows with the depth
                 fc = contact_force(law, depth, v)
                 f = vec3(fc[0], fc[1], fc[2])
                 if wp.static(TERRAIN):
                     f = E * f
                 if wp.static(IMPLICIT):
-                    B = contact_resistance(law, depth, fc[3], h, theta)
+                    B = on * contact_resistance(law, depth, fc[3], h, theta)
                     if wp.static(TERRAIN):
                         D = E * wp.diag(B) * wp.transpose(E)
-                        f = f - D * m.gravity
+                        f = f - D * vec3(m.gravity)
                     else:
-                        f = f - wp.cw_mul(B, m.gravity)
+                        f = f - wp.cw_mul(B, vec3(m.gravity))
                         D = wp.diag(B)
                     PB = wp.skew(p) * D
                     Ia = Ia - PB * wp.skew(p)
@@ -171,31 +168,33 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         """The adjoints of link k with its contacts' part of phi added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, curvature = sphere_on_terrain(m, law.profile, c, R, x, V, place, h, theta)
+                p, v, depth, E, curvature = sphere_on_terrain(m, law.block, c, R, x, V, place, h, theta)
             else:
                 p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
-            if touches(law, depth, v):
+            on = touches(law, depth, v)
+            if block.any_of(on):
+                depth = on * depth  # no force on the others, as it grows with the depth
                 fc = contact_force(law, depth, v)
                 f = vec3(fc[0], fc[1], fc[2])
-                g_f = -point_velocity(W, p)
+                g_f = -on * point_velocity(W, p)
                 if wp.static(TERRAIN):
                     g_f = wp.transpose(E) * g_f
                 a = vec3()
                 hi = T(0.0)
                 if wp.static(IMPLICIT):
                     hi = h
-                    a = point_velocity(A, p) + m.gravity
+                    a = point_velocity(A, p) + vec3(m.gravity)
                     if wp.static(TERRAIN):
                         a = wp.transpose(E) * a
-                    B = contact_resistance(law, depth, fc[3], h, theta)
+                    B = on * contact_resistance(law, depth, fc[3], h, theta)
                     f = f - wp.cw_mul(B, a)
                 g = contact_adjoint(law, depth, v, a, g_f, hi, theta)
                 if wp.static(VARIED):
                     gk = contact_constants_adjoint(law, depth, v, a, g_f, hi, theta)
-                    adj_factors[K_N] = adj_factors[K_N] + m.k_n * gk[0]
-                    adj_factors[K_D] = adj_factors[K_D] + m.k_d * gk[1]
-                    adj_factors[K_T] = adj_factors[K_T] + m.k_t * gk[2]
-                    adj_factors[MU] = adj_factors[MU] + m.mu * gk[3]
+                    adj_factors[K_N] = adj_factors[K_N] + T(m.k_n) * gk[0]
+                    adj_factors[K_D] = adj_factors[K_D] + T(m.k_d) * gk[1]
+                    adj_factors[K_T] = adj_factors[K_T] + T(m.k_t) * gk[2]
+                    adj_factors[MU] = adj_factors[MU] + T(m.mu) * gk[3]
                 g_v = vec3(g[0], g[1], g[2])
                 if wp.static(TERRAIN):
                     g_turn = wp.cross(g_v, v)[1] - wp.cross(g_f, f)[1]  # adjoint of the angle of E
@@ -221,12 +220,12 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 adj_v = adj_v + G
                 # The lowest point follows the sphere's centre, not the body's material.
                 if wp.static(TERRAIN):
-                    radius = m.contact_radius[c]
+                    radius = T(m.contact_radius[c])
                     tangent = E * vec3(T(1.0), T(0.0), T(0.0))
                     centre = p + radius * E * vec3(T(0.0), T(0.0), T(1.0))
                     g_p = g_p + curvature * (g_turn - radius * wp.dot(tangent, g_p)) * tangent
                 else:
-                    centre = p + vec3(T(0.0), T(0.0), m.contact_radius[c])
+                    centre = p + vec3(T(0.0), T(0.0), T(m.contact_radius[c]))
                 adj_p = adj_p + force_at(centre, g_p)
                 adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
         return adj_a, adj_v, adj_w, adj_p

@@ -18,12 +18,13 @@ import warp as wp
 
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
+from diffsim.kernels.spec import KernelSpec
 
 
 @cache
-def drag_law(dtype: type) -> SimpleNamespace:
-    t, sp = types(dtype), spatial(dtype)
-    T, vec3, vec6, mat3, Model = dtype, t.vec3, t.vec6, t.mat3, t.Model
+def drag_law(spec: KernelSpec) -> SimpleNamespace:
+    t, sp = types(spec), spatial(spec)
+    T, vec3, vec6, mat3, Model = t.T, t.vec3, t.vec6, t.mat3, t.Model
     join, force_at, point_velocity = sp.join, sp.force_at, sp.point_velocity
 
     @wp.func
@@ -34,23 +35,23 @@ def drag_law(dtype: type) -> SimpleNamespace:
     @wp.func
     def drag_wrench(m: Model, i: int, R: mat3, com: vec3, V: vec6):
         """The fluid's wrench on link i, whose centre of mass is at com."""
-        F = R * m.drag_frame[i]
+        F = R * mat3(m.drag_frame[i])
         l = wp.transpose(F) * point_velocity(V, com)
         w = wp.transpose(F) * wp.spatial_top(V)
-        f = m.drag_viscous[i][0] * l + wp.cw_mul(m.drag_force[i], wp.cw_mul(wp.abs(l), l))
-        torque = m.drag_viscous[i][1] * w + wp.cw_mul(m.drag_torque[i], wp.cw_mul(wp.abs(w), w))
+        f = T(m.drag_viscous[i][0]) * l + wp.cw_mul(vec3(m.drag_force[i]), wp.cw_mul(wp.abs(l), l))
+        torque = T(m.drag_viscous[i][1]) * w + wp.cw_mul(vec3(m.drag_torque[i]), wp.cw_mul(wp.abs(w), w))
         return wrench(F, com, -f, -torque)
 
     @wp.func
     def drag_adjoint(m: Model, i: int, R: mat3, com: vec3, V: vec6, W: vec6):
         """Adjoint of V of -W . drag_wrench(V)."""
-        F = R * m.drag_frame[i]
+        F = R * mat3(m.drag_frame[i])
         l = wp.transpose(F) * point_velocity(V, com)
         w = wp.transpose(F) * wp.spatial_top(V)
         wl = wp.transpose(F) * point_velocity(W, com)
         ww = wp.transpose(F) * wp.spatial_top(W)
-        g_l = m.drag_viscous[i][0] * wl + T(2.0) * wp.cw_mul(m.drag_force[i], wp.cw_mul(wp.abs(l), wl))
-        g_w = m.drag_viscous[i][1] * ww + T(2.0) * wp.cw_mul(m.drag_torque[i], wp.cw_mul(wp.abs(w), ww))
+        g_l = T(m.drag_viscous[i][0]) * wl + T(2.0) * wp.cw_mul(vec3(m.drag_force[i]), wp.cw_mul(wp.abs(l), wl))
+        g_w = T(m.drag_viscous[i][1]) * ww + T(2.0) * wp.cw_mul(vec3(m.drag_torque[i]), wp.cw_mul(wp.abs(w), ww))
         return wrench(F, com, g_l, g_w)
 
     return SimpleNamespace(drag_wrench=drag_wrench, drag_adjoint=drag_adjoint)

@@ -14,8 +14,8 @@ from diffsim.kernels.spec import KernelSpec
 
 @cache
 def lane_sums(spec: KernelSpec) -> SimpleNamespace:
-    t, threads = types(spec.dtype), spec.threads_per_env
-    T, vec6, mat3 = spec.dtype, t.vec6, t.mat3
+    t, threads = types(spec), spec.threads_per_env
+    T, vec6, mat3 = t.T, t.vec6, t.mat3
     mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
     neighbour = f"""
 #if defined(__CUDA_ARCH__)

@@ -9,6 +9,7 @@ import warp as wp
 
 from diffsim.kernels.model import types
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 from diffsim.robot.scene import FACTORS
 
 K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))
@@ -16,30 +17,30 @@ K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))
 
 @cache
 def environment_law(spec: KernelSpec) -> wp.Function:
-    t = types(spec.dtype)
-    Model, Law = t.Model, t.Law
+    t = types(spec)
+    T, Model, Law, read = t.T, t.Model, t.Law, blocks(spec).read
     CONTACT, VARIED, TERRAIN = "contact" in spec.features, spec.varied, "terrain" in spec.features
 
     @wp.func
     def law_of(m: Model, factors: t.array2, e: int):
         law = Law()
         if wp.static(CONTACT):
-            law.k_n = m.k_n
-            law.k_d = m.k_d
-            law.k_t = m.k_t
-            law.mu = m.mu
+            law.k_n = T(m.k_n)
+            law.k_d = T(m.k_d)
+            law.k_t = T(m.k_t)
+            law.mu = T(m.mu)
             if wp.static(VARIED):
-                law.k_n = law.k_n * factors[e, K_N]
-                law.k_d = law.k_d * factors[e, K_D]
-                law.k_t = law.k_t * factors[e, K_T]
-                law.mu = law.mu * factors[e, MU]
+                law.k_n = law.k_n * read(factors, e, K_N)
+                law.k_d = law.k_d * read(factors, e, K_D)
+                law.k_t = law.k_t * read(factors, e, K_T)
+                law.mu = law.mu * read(factors, e, MU)
         if wp.static(VARIED):
-            law.k_limit = factors[e, K_LIMIT]
-            law.d_limit = factors[e, D_LIMIT]
-            law.mass = factors[e, MASS]
-            law.motor = factors[e, MOTOR]
+            law.k_limit = read(factors, e, K_LIMIT)
+            law.d_limit = read(factors, e, D_LIMIT)
+            law.mass = read(factors, e, MASS)
+            law.motor = read(factors, e, MOTOR)
         if wp.static(TERRAIN):
-            law.profile = e % m.terrain.shape[0]
+            law.block = e
         return law
 
     return law_of

@@ -18,22 +18,23 @@ import warp as wp
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 
 
 @cache
 def external_force(spec: KernelSpec) -> SimpleNamespace:
-    t, sp = types(spec.dtype), spatial(spec.dtype)
-    vec3, vec6, Model = t.vec3, t.vec6, t.Model
+    t, sp = types(spec), spatial(spec)
+    T, vec3, vec6, Model, block = t.T, t.vec3, t.vec6, t.Model, blocks(spec)
     mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (t.mat3, vec3, vec6))
-    join, force_at, point_velocity = sp.join, sp.force_at, sp.point_velocity
+    join, force_at, point_velocity, read = sp.join, sp.force_at, sp.point_velocity, block.read
     FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base feels no force
 
     @wp.func
     def external(forces: t.array2, e: int, body: int, p: vec3):
         """The force on a body, and the wrench about the carrier."""
         k = 6 * body
-        f = vec3(forces[e, k], forces[e, k + 1], forces[e, k + 2])
-        torque = vec3(forces[e, k + 3], forces[e, k + 4], forces[e, k + 5])
+        f = vec3(read(forces, e, k), read(forces, e, k + 1), read(forces, e, k + 2))
+        torque = vec3(read(forces, e, k + 3), read(forces, e, k + 4), read(forces, e, k + 5))
         return f, force_at(p, f) + join(torque, vec3())
 
     @wp.func
@@ -41,7 +42,7 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         """Adds the forces to the links' bias forces P."""
         for i in range(FIRST, n):
             for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
-                f, wrench = external(forces, e, m.body[entry], x[i] + R[i] * m.body_com[entry])
+                f, wrench = external(forces, e, m.body[entry], x[i] + R[i] * vec3(m.body_com[entry]))
                 P[i] = P[i] - wrench
 
     @wp.func
@@ -62,7 +63,7 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         for i in range(FIRST, n):
             for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
                 body = m.body[entry]
-                p = x[i] + R[i] * m.body_com[entry]
+                p = x[i] + R[i] * vec3(m.body_com[entry])
                 f, wrench = external(forces, e, body, p)
                 turn = wp.spatial_top(W[i])
                 adj_w[i] = adj_w[i] - wrench
@@ -70,24 +71,24 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
                 adj_forces[body] = adj_forces[body] - join(point_velocity(W[i], p), turn)
 
     @wp.func
-    def finite_forces(m: Model, at: int, adj_forces: vec6s):
-        """Whether the adjoints of the forces on this lane's bodies are all finite."""
-        result = bool(True)
+    def broken_forces(m: Model, at: int, adj_forces: vec6s):
+        """How many numbers of the adjoints of the forces on this lane's bodies are not finite."""
+        result = T(0.0)
         for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
-            if not wp.isfinite(adj_forces[m.body[entry]]):
-                result = False
+            for k in range(6):
+                result = result + block.broken(adj_forces[m.body[entry]][k])
         return result
 
     @wp.func
-    def write_forces_adjoint(m: Model, at: int, e: int, keep: bool, adj_forces: vec6s, g_forces: t.array2):
+    def write_forces_adjoint(m: Model, at: int, e: int, drop: T, adj_forces: vec6s, g_forces: t.array2):
         for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
             body = m.body[entry]
             for k in range(6):
-                g_forces[e, 6 * body + k] = wp.where(keep, adj_forces[body][k], spec.dtype(0.0))
+                block.write(g_forces, e, 6 * body + k, block.pick(drop, T(0.5), adj_forces[body][k], T(0.0)))
 
     return SimpleNamespace(
         add_forces=add_forces,
         add_forces_adjoint=add_forces_adjoint,
-        finite_forces=finite_forces,
+        broken_forces=broken_forces,
         write_forces_adjoint=write_forces_adjoint,
     )

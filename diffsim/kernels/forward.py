@@ -22,16 +22,18 @@ from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import MAX_SPEED, KernelSpec, module_options
+from diffsim.kernels.spec import MAX_SPEED, KernelSpec
+from diffsim.kernels.wide import blocks, module_options
 
 
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
-    t, sp, kin, sums = types(spec.dtype), spatial(spec.dtype), kinematics(spec), lane_sums(spec)
-    T, vec2, vec3, vec6, mat3, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
+    t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
+    T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
     Model, Law, Place, law_of = t.Model, t.Law, kin.Place, environment_law(spec)
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
-    contact, drag, force, joint = contact_law(spec), drag_law(T), external_force(spec), joint_law(spec)
+    read, write, pick = block.read, block.write, block.pick
+    contact, drag, force, joint = contact_law(spec), drag_law(spec), external_force(spec), joint_law(spec)
     muscle, base = muscle_law(spec, adjoint=False), base_inertia(spec)
     CONTACT, DRAG, TERRAIN, MOTOR, MUSCLE, HILL = (
         name in spec.features for name in ("contact", "drag", "terrain", "motor", "muscle", "hill")
@@ -45,9 +47,9 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     @wp.func
     def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, h: T, theta: T):
         """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
-        com = x + R * m.com[k]
-        inertia = R * m.inertia[k] * wp.transpose(R)
-        mass = m.mass[k]
+        com = x + R * vec3(m.com[k])
+        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        mass = T(m.mass[k])
         if wp.static(VARIED):
             inertia = law.mass * inertia
             mass = law.mass * mass
@@ -61,13 +63,23 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, h, theta, Ia, Ib, Id, F)
         return Ia, Ib, Id, F
 
+    @wp.func
+    def too_fast(rate: T):
+        """1 where a rate is beyond any imaginable one, or no number, else 0."""
+        return pick(wp.abs(rate), T(LIMIT), T(0.0), T(1.0))
+
+    @wp.func
+    def hand_back(out: t.array2, start: t.array2, e: int, column: int, broken: T, value: T):
+        """Writes the value, but what it was at the start to broken environments."""
+        write(out, e, column, pick(T(0.0), broken, read(start, e, column), value))
+
     @wp.kernel(module="unique", module_options=module_options(spec))
     def forward(
         # model
         m: Model,
-        first: int,  # environment of this launch
-        h: T,
-        theta: T,
+        first: int,  # block of this launch
+        seconds: t.U,  # of a substep
+        implicitness: t.U,
         substeps: int,
         # state in
         qpos: t.array2,
@@ -87,8 +99,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         qvel_out: t.array2,
         nonfinite: wp.array(dtype=wp.bool),
     ):
+        h = T(seconds)
+        theta = T(implicitness)
         tid = wp.tid()
-        e = first + tid / THREADS_PER_ENV
+        e = first + tid / THREADS_PER_ENV  # the environment, or block of environments
         lane = tid % THREADS_PER_ENV
         # Variables, not constants: Warp would unroll the loops over links, and their code outgrow a GPU's cache.
         slots = int(SLOTS)
@@ -126,30 +140,30 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(MOTOR):
             for k in range(NU):
                 i = m.motor_slot[lane * NU + k]
-                motor[i] = motor[i] + m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+                motor[i] = motor[i] + T(m.gear[k]) * read(ctrl, e, k) + T(m.motor_bias[k])
             if wp.static(VARIED):
                 for i in range(1, n):
                     motor[i] = law.motor * motor[i]
         for i in range(1, n):
-            q[i] = qpos[e, qpos_adr(m, at + i)]
-            qd[i] = qvel[e, VADR + link_of(m, at + i)]
+            q[i] = read(qpos, e, qpos_adr(m, at + i))
+            qd[i] = read(qvel, e, VADR + link_of(m, at + i))
         if wp.static(NBALL > 0):
             turn = wp.zeros(shape=NBALL, dtype=quat)
             for b in range(m.ball_count[lane]):
                 turn[b] = wp.normalize(kin.load_quat(qpos, e, qpos_adr(m, at + m.ball_slot[lane * NBALL + b])))
         R[0] = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
-            pos = vec3(qpos[e, 0], qpos[e, 1], qpos[e, 2])
+            pos = vec3(read(qpos, e, 0), read(qpos, e, 1), read(qpos, e, 2))
             rot = wp.normalize(kin.load_quat(qpos, e, 3))
-            v = vec3(qvel[e, 0], qvel[e, 1], qvel[e, 2])
-            w = vec3(qvel[e, 3], qvel[e, 4], qvel[e, 5])
+            v = vec3(read(qvel, e, 0), read(qvel, e, 1), read(qvel, e, 2))
+            w = vec3(read(qvel, e, 3), read(qvel, e, 4), read(qvel, e, 5))
 
         for sub in range(substeps):
             row = row0 + sub
             if wp.static(TERRAIN):
-                place = vec2(m.carrier_along, m.carrier_height)
+                place = vec2(T(m.carrier_along), T(m.carrier_height))
             else:
-                place = m.carrier_height
+                place = T(m.carrier_height)
             if wp.static(FLOATING):
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
@@ -216,7 +230,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     Ua = Ia[i] * sa + Ib[i] * sl
                     Ul = sa * Ib[i] + Id[i] * sl
                     Ui = join(Ua, Ul)
-                    d = wp.dot(S[i], Ui) + m.armature[k]
+                    d = wp.dot(S[i], Ui) + T(m.armature[k])
                     qi = q[i]
                     if wp.static(IMPLICIT):
                         qi = qi + theta * h * qd[i]
@@ -243,12 +257,12 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                             store(ck_f, row, f0 + r, e, Ui[r])
                         store(ck_f, row, f0 + 6, e, di)
             # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base) and the new state
-            A[0] = join(vec3(), -m.gravity)
+            A[0] = join(vec3(), -vec3(m.gravity))
             if wp.static(FLOATING):
                 L, a0 = base.factor_base(Ia[0], Ib[0], Id[0], -P[0])
                 A[0] = a0
                 wdot = wp.transpose(R[0]) * wp.spatial_top(a0)
-                vdot = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + m.gravity
+                vdot = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + vec3(m.gravity)
                 if record == 1:
                     base.store_base(ck_f, row, e, L)
                     for k in range(3):
@@ -275,38 +289,32 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         broken = T(0.0)
         if wp.static(FLOATING):
             for k in range(3):
-                if not (wp.isfinite(pos[k]) and wp.isfinite(rot[k])):
-                    broken = T(1.0)
-                if not (wp.abs(v[k]) < T(LIMIT) and wp.abs(w[k]) < T(LIMIT)):
-                    broken = T(1.0)
+                broken = broken + block.broken(pos[k]) + block.broken(rot[k]) + too_fast(v[k]) + too_fast(w[k])
+            broken = broken + block.broken(rot[3])
         for i in range(1, n):
-            if not (wp.isfinite(q[i]) and wp.abs(qd[i]) < T(LIMIT)):
-                broken = T(1.0)
+            broken = broken + block.broken(q[i]) + too_fast(qd[i])
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[lane]):
-                if not wp.isfinite(turn[b]):
-                    broken = T(1.0)
+                for k in range(4):
+                    broken = broken + block.broken(turn[b][k])
         if wp.static(THREADS_PER_ENV > 1):
             broken = sums.add(broken)
-        finite = broken == T(0.0)
-        nonfinite[e] = not finite
+        block.write_flags(nonfinite, e, broken)
         if wp.static(FLOATING):
             for k in range(3):
-                qpos_out[e, k] = wp.where(finite, pos[k], qpos[e, k])
-                qpos_out[e, 4 + k] = wp.where(finite, rot[k], qpos[e, 4 + k])
-                qvel_out[e, k] = wp.where(finite, v[k], qvel[e, k])
-                qvel_out[e, 3 + k] = wp.where(finite, w[k], qvel[e, 3 + k])
-            qpos_out[e, 3] = wp.where(finite, rot[3], qpos[e, 3])
+                hand_back(qpos_out, qpos, e, k, broken, pos[k])
+                hand_back(qpos_out, qpos, e, 4 + k, broken, rot[k])
+                hand_back(qvel_out, qvel, e, k, broken, v[k])
+                hand_back(qvel_out, qvel, e, 3 + k, broken, w[k])
+            hand_back(qpos_out, qpos, e, 3, broken, rot[3])
         for i in range(1, n):
-            adr = qpos_adr(m, at + i)
-            dof = VADR + link_of(m, at + i)
-            qpos_out[e, adr] = wp.where(finite, q[i], qpos[e, adr])
-            qvel_out[e, dof] = wp.where(finite, qd[i], qvel[e, dof])
+            hand_back(qpos_out, qpos, e, qpos_adr(m, at + i), broken, q[i])
+            hand_back(qvel_out, qvel, e, VADR + link_of(m, at + i), broken, qd[i])
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[lane]):
                 adr = qpos_adr(m, at + m.ball_slot[lane * NBALL + b])
-                qpos_out[e, adr] = wp.where(finite, turn[b][3], qpos[e, adr])
+                hand_back(qpos_out, qpos, e, adr, broken, turn[b][3])
                 for k in range(3):
-                    qpos_out[e, adr + 1 + k] = wp.where(finite, turn[b][k], qpos[e, adr + 1 + k])
+                    hand_back(qpos_out, qpos, e, adr + 1 + k, broken, turn[b][k])
 
     return forward

@@ -17,52 +17,54 @@ import warp as wp
 
 from diffsim.kernels.model import types
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 
 
 @cache
 def joint_law(spec: KernelSpec) -> SimpleNamespace:
-    t = types(spec.dtype)
-    T, Model, Law = spec.dtype, t.Model, t.Law
-    vec2 = wp.types.vector(2, T)
+    t = types(spec)
+    T, Model, Law = t.T, t.Model, t.Law
+    vec2, pick = t.vec2, blocks(spec).pick
     STIFFNESS, DAMPING, LIMIT = (name in spec.features for name in ("stiffness", "damping", "limit"))
     VARIED = spec.varied
 
     @wp.func
     def way_back(m: Model, i: int, q: T):
         """From q to the bound that it is beyond; 0 within the range."""
-        way = T(0.0)
-        if q < m.lower[i]:
-            way = m.lower[i] - q
-        if q > m.upper[i]:
-            way = m.upper[i] - q
-        return way
+        lower = T(m.lower[i])
+        upper = T(m.upper[i])
+        return pick(upper, q, upper - q, pick(q, lower, lower - q, T(0.0)))
 
     @wp.func
     def limit_constants(m: Model, law: Law, i: int):
-        k = m.k_limit[i]
-        d = m.d_limit[i]
+        k = T(m.k_limit[i])
+        d = T(m.d_limit[i])
         if wp.static(VARIED):
             k = law.k_limit * k
             d = law.d_limit * d
         return k, d
 
     @wp.func
+    def returning(way: T, rate: T):
+        """The rate at which the joint returns."""
+        return pick(T(0.0), way, rate, -rate)
+
+    @wp.func
     def pushes(k: T, d: T, way: T, qd: T):
-        """Whether the limit acts: beyond a bound, and not left too fast."""
-        return way != T(0.0) and d * wp.where(way > T(0.0), qd, -qd) < k
+        """1 where the limit acts: beyond a bound, and not left too fast; else 0."""
+        return pick(d * returning(way, qd), k, pick(T(0.0), wp.abs(way), T(1.0), T(0.0)), T(0.0))
 
     @wp.func
     def passive_force(m: Model, law: Law, i: int, q: T, qd: T):
         force = T(0.0)
         if wp.static(STIFFNESS):
-            force = force - m.stiffness[i] * (q - m.spring_ref[i])
+            force = force - T(m.stiffness[i]) * (q - T(m.spring_ref[i]))
         if wp.static(DAMPING):
-            force = force - m.damping[i] * qd
+            force = force - T(m.damping[i]) * qd
         if wp.static(LIMIT):
             way = way_back(m, i, q)
             k, d = limit_constants(m, law, i)
-            if pushes(k, d, way, qd):
-                force = force + (k - d * wp.where(way > T(0.0), qd, -qd)) * way
+            force = force + pushes(k, d, way, qd) * (k - d * returning(way, qd)) * way
         return force
 
     @wp.func
@@ -71,15 +73,15 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         kq = T(0.0)
         kv = T(0.0)
         if wp.static(STIFFNESS):
-            kq = kq + m.stiffness[i]
+            kq = kq + T(m.stiffness[i])
         if wp.static(DAMPING):
-            kv = kv + m.damping[i]
+            kv = kv + T(m.damping[i])
         if wp.static(LIMIT):
             way = way_back(m, i, q)
             k, d = limit_constants(m, law, i)
-            if pushes(k, d, way, qd):
-                kq = kq + k
-                kv = kv + d * wp.abs(way)
+            on = pushes(k, d, way, qd)
+            kq = kq + on * k
+            kv = kv + on * d * wp.abs(way)
         return vec2(kq, kv)
 
     @wp.func
@@ -88,15 +90,15 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         kq = T(0.0)
         kv = T(0.0)
         if wp.static(STIFFNESS):
-            kq = kq - m.stiffness[i]
+            kq = kq - T(m.stiffness[i])
         if wp.static(DAMPING):
-            kv = kv - m.damping[i]
+            kv = kv - T(m.damping[i])
         if wp.static(LIMIT):
             way = way_back(m, i, q)
             k, d = limit_constants(m, law, i)
-            if pushes(k, d, way, qd):
-                kq = kq - k + d * wp.where(way > T(0.0), end_rate, -end_rate)
-                kv = kv - d * wp.abs(way)
+            on = pushes(k, d, way, qd)
+            kq = kq - on * k + on * d * returning(way, end_rate)
+            kv = kv - on * d * wp.abs(way)
         return vec2(kq, kv)
 
     @wp.func
@@ -104,10 +106,9 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         """d force / d factor of (k_limit, d_limit); lead is theta h, other arguments as of passive_gain."""
         way = way_back(m, i, q)
         k, d = limit_constants(m, law, i)
-        result = vec2()
-        if pushes(k, d, way, qd):
-            result = vec2(m.k_limit[i] * (way - lead * (end_rate - qd)), -m.d_limit[i] * wp.abs(way) * end_rate)
-        return result
+        on = pushes(k, d, way, qd)
+        by_k = T(m.k_limit[i]) * (way - lead * (end_rate - qd))
+        return on * vec2(by_k, -T(m.d_limit[i]) * wp.abs(way) * end_rate)
 
     return SimpleNamespace(
         passive_force=passive_force,

@@ -8,14 +8,15 @@ import warp as wp
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 
 
 @cache
 def kinematics(spec: KernelSpec) -> SimpleNamespace:
-    t = types(spec.dtype)
-    T, vec2, vec3, vec6, mat3, quat = spec.dtype, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
+    t = types(spec)
+    T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
     Model, array = t.Model, t.array
-    sp = spatial(T)
+    sp, read = spatial(spec), blocks(spec).read
     join, log_quat, quat_of = sp.join, sp.log_quat, sp.quat_of
     mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
     NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
@@ -53,7 +54,7 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def load_quat(a: t.array2, e: int, k: int):
-        return quat_of(a[e, k], a[e, k + 1], a[e, k + 2], a[e, k + 3])
+        return quat_of(read(a, e, k), read(a, e, k + 1), read(a, e, k + 2), read(a, e, k + 3))
 
     @wp.func
     def load_quat_row(a: t.array3, row: int, k: int, e: int):
@@ -82,17 +83,17 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             if wp.static(BALL):
                 turn = R[i]
             p = m.parent[k]
-            a = R[p] * m.axis[k]
-            R_joint = m.turn0[k]
+            a = R[p] * vec3(m.axis[k])
+            R_joint = mat3(m.turn0[k])
             if wp.static(HINGE):
                 if i > CARRIER:
-                    R_joint = R_joint + wp.sin(q[i]) * m.turn1[k] + wp.cos(q[i]) * m.turn2[k]
+                    R_joint = R_joint + wp.sin(q[i]) * mat3(m.turn1[k]) + wp.cos(q[i]) * mat3(m.turn2[k])
             R[i] = R[p] * R_joint
             if wp.static(BALL):
                 if m.outboard[k] == i + 2:
                     R[i] = R[i] * turn
                     a = vec3(R[i][0, 0], R[i][1, 0], R[i][2, 0])
-            xi = x[p] + R[p] * m.position[k]
+            xi = x[p] + R[p] * vec3(m.position[k])
             Si = join(a, wp.cross(xi, a))
             if wp.static(SLIDE):
                 if m.slide[k] == 1:

@@ -9,12 +9,13 @@ import numpy as np
 import warp as wp
 
 from diffsim.kernels.lanes import Division
+from diffsim.kernels.spec import KernelSpec
 from diffsim.robot.scene import Scene
 
 
 @cache
-def types(dtype: type) -> SimpleNamespace:
-    """Warp's vector types of one precision, and the struct of a scene's numbers."""
+def scene_types(dtype: type) -> SimpleNamespace:
+    """Warp's vector types of a scene's numbers, and their struct."""
     vec3, vec4, vec9 = (wp.types.vector(n, dtype) for n in (3, 4, 9))
     mat3 = wp.types.matrix((3, 3), dtype)
 
@@ -86,33 +87,43 @@ def types(dtype: type) -> SimpleNamespace:
         k_t: dtype
         mu: dtype
 
+    return SimpleNamespace(vec3=vec3, vec4=vec4, vec9=vec9, mat3=mat3, Model=Model)
+
+
+@cache
+def types(spec: KernelSpec) -> SimpleNamespace:
+    """Warp's types in a kernel: U of a scene's numbers, T of those that environments have of their own (wide.py)."""
+    U = spec.dtype
+    T = wp.float64 if spec.block > 1 else U
+
     @wp.struct
     class Law:
-        k_n: dtype
-        k_d: dtype
-        k_t: dtype
-        mu: dtype
+        k_n: T
+        k_d: T
+        k_t: T
+        mu: T
         # factors of what each link has its own of, read where they vary only
-        k_limit: dtype
-        d_limit: dtype
-        mass: dtype
-        motor: dtype
-        profile: int  # row of Model.terrain, read where there is one only
+        k_limit: T
+        d_limit: T
+        mass: T
+        motor: T
+        block: int  # whose environments' rows of Model.terrain are read where there is one only
 
     return SimpleNamespace(
-        dtype=dtype,
-        vec2=wp.types.vector(2, dtype),
-        vec3=vec3,
-        mat3=mat3,
-        vec4=vec4,
-        vec6=wp.types.vector(6, dtype),
-        vec9=vec9,
-        mat6=wp.types.matrix((6, 6), dtype),
-        quat=wp.types.quaternion(dtype),
-        array=wp.array(dtype=dtype),
-        array2=wp.array2d(dtype=dtype),
-        array3=wp.array3d(dtype=dtype),
-        Model=Model,
+        T=T,
+        U=U,
+        vec2=wp.types.vector(2, T),
+        vec3=wp.types.vector(3, T),
+        vec4=wp.types.vector(4, T),
+        vec6=wp.types.vector(6, T),
+        mat3=wp.types.matrix((3, 3), T),
+        mat6=wp.types.matrix((6, 6), T),
+        quat=wp.types.quaternion(T),
+        array=wp.array(dtype=T),
+        array2=wp.array2d(dtype=U),  # a row for each environment
+        array3=wp.array3d(dtype=T),  # checkpoints
+        scene=scene_types(U),
+        Model=scene_types(U).Model,
         Law=Law,
     )
 
@@ -134,7 +145,7 @@ class _Writer:
 
     def __init__(self, scene: Scene, division: Division, dtype: type, device: str) -> None:
         self.scene, self.division, self.dtype, self.device = scene, division, dtype, device
-        self.t = types(dtype)
+        self.t = scene_types(dtype)
         self.model = self.t.Model()
         threads, slots = division.threads_per_env, division.slots
         self.link = padded(division.links, slots)  # of each entry, and

@@ -24,26 +24,33 @@ from diffsim.kernels.hill import hill_law
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 
 SHORTEST = 1e-6  # m
 
 
 @cache
 def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
-    t, sp, hill = types(spec.dtype), spatial(spec.dtype), hill_law(spec.dtype).hill
-    T, vec3, vec6, Model, Law, array = spec.dtype, t.vec3, t.vec6, t.Model, t.Law, t.array
+    t, sp, hill = types(spec), spatial(spec), hill_law(spec).hill
+    T, vec3, vec6, Model, Law, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.array
     join, point_velocity = sp.join, sp.point_velocity
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
-    HILL, VARIED = "hill" in spec.features, spec.varied
+    HILL, VARIED, block = "hill" in spec.features, spec.varied, blocks(spec)
 
     @wp.func
     def activate(m: Model, law: Law, lane: int, ctrl: t.array2, e: int, pull: array):
         """Into pull the maximum force times the activation, of each of the lane's muscles."""
         for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
             k = m.muscle[entry]
-            pull[k] = m.gear[k] * ctrl[e, k] + m.motor_bias[k]
+            pull[k] = T(m.gear[k]) * block.read(ctrl, e, k) + T(m.motor_bias[k])
             if wp.static(VARIED):
                 pull[k] = law.motor * pull[k]
+
+    @wp.func
+    def length_of(d: vec3):
+        """Of a segment; one without direction is as if infinite, so that it pulls nothing."""
+        length = wp.length(d)
+        return block.pick(T(SHORTEST), length, length, T(wp.inf))
 
     @wp.func
     def outward(R: t.mat3, x: vec3, torque: vec3, force: vec3):
@@ -67,13 +74,11 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
             force = vec3()
             torque = vec3()
             for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
-                a = m.segment_a[s]
-                d = shift + turn * m.segment_b[s] - a
-                length = wp.length(d)
-                if length > T(SHORTEST):
-                    f = d * (tension[m.segment_muscle[s]] / length)
-                    force = force + f
-                    torque = torque + wp.cross(a, f)
+                a = vec3(m.segment_a[s])
+                d = shift + turn * vec3(m.segment_b[s]) - a
+                f = d * (tension[m.segment_muscle[s]] / length_of(d))
+                force = force + f
+                torque = torque + wp.cross(a, f)
             wrench = outward(R[i], x[i], torque, force)
             P[i] = P[i] - wrench
             P[j] = P[j] + wrench
@@ -85,7 +90,7 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         """Length of each muscle's path, and its rates under the twists V and, in the adjoint, W."""
         for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
             k = m.muscle[entry]
-            lengths[k] = m.hill[k][0]
+            lengths[k] = T(m.hill[k][0])
             rates[k] = T(0.0)
             if wp.static(adjoint):
                 powers[k] = T(0.0)
@@ -98,16 +103,14 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
             if wp.static(adjoint):
                 w = inward(R[i], x[i], W[j] - W[i])
             for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
-                b = shift + turn * m.segment_b[s]
-                d = b - m.segment_a[s]
-                length = wp.length(d)
-                if length > T(SHORTEST):
-                    k = m.segment_muscle[s]
-                    n = d / length
-                    lengths[k] = lengths[k] + length
-                    rates[k] = rates[k] + wp.dot(n, point_velocity(v, b))
-                    if wp.static(adjoint):
-                        powers[k] = powers[k] + wp.dot(n, point_velocity(w, b))
+                b = shift + turn * vec3(m.segment_b[s])
+                d = b - vec3(m.segment_a[s])
+                k = m.segment_muscle[s]
+                n = d / length_of(d)
+                lengths[k] = lengths[k] + wp.length(d)
+                rates[k] = rates[k] + wp.dot(n, point_velocity(v, b))
+                if wp.static(adjoint):
+                    powers[k] = powers[k] + wp.dot(n, point_velocity(w, b))
 
     @wp.func
     def add_pull_adjoint(
@@ -141,28 +144,27 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
                 damp = vec3()
                 damp_torque = vec3()
             for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
-                a = m.segment_a[s]
-                b = shift + turn * m.segment_b[s]
+                a = vec3(m.segment_a[s])
+                b = shift + turn * vec3(m.segment_b[s])
                 d = b - a
-                length = wp.length(d)
-                if length > T(SHORTEST):
-                    k = m.segment_muscle[s]
-                    n = d / length
-                    f = n * tension[k]
-                    z = point_velocity(w, b)
-                    if wp.static(HILL):
-                        z = z * tension[k] + point_velocity(v, b) * g_rate[k]
-                        e = (z - n * wp.dot(n, z)) / length + n * g_length[k]
-                        damp = damp + n * g_rate[k]
-                        damp_torque = damp_torque + wp.cross(a, n * g_rate[k])
-                    else:
-                        rate = wp.dot(n, z)
-                        adj_pull[k] = adj_pull[k] + rate
-                        e = (z - n * rate) * (tension[k] / length)
-                    force = force + f
-                    torque = torque + wp.cross(a, f)
-                    place = place + e
-                    place_torque = place_torque + wp.cross(a, e)
+                length = length_of(d)
+                k = m.segment_muscle[s]
+                n = d / length
+                f = n * tension[k]
+                z = point_velocity(w, b)
+                if wp.static(HILL):
+                    z = z * tension[k] + point_velocity(v, b) * g_rate[k]
+                    e = (z - n * wp.dot(n, z)) / length + n * g_length[k]
+                    damp = damp + n * g_rate[k]
+                    damp_torque = damp_torque + wp.cross(a, n * g_rate[k])
+                else:
+                    rate = wp.dot(n, z)
+                    adj_pull[k] = adj_pull[k] + rate
+                    e = (z - n * rate) * (tension[k] / length)
+                force = force + f
+                torque = torque + wp.cross(a, f)
+                place = place + e
+                place_torque = place_torque + wp.cross(a, e)
             wrench = outward(R[i], x[i], torque, force)
             gp = outward(R[i], x[i], place_torque, place) + wp.spatial_cross_dual(W[i], wrench)
             if wp.static(HILL):

@@ -9,12 +9,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.model import types
+from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 
 
 @cache
-def spatial(dtype: type) -> SimpleNamespace:
-    t = types(dtype)
-    T, vec3, vec6, mat3, quat = dtype, t.vec3, t.vec6, t.mat3, t.quat
+def spatial(spec: KernelSpec) -> SimpleNamespace:
+    t, pick = types(spec), blocks(spec).pick
+    T, vec3, vec6, mat3, quat = t.T, t.vec3, t.vec6, t.mat3, t.quat
 
     @wp.func
     def join(a: vec3, b: vec3):
@@ -39,20 +41,17 @@ def spatial(dtype: type) -> SimpleNamespace:
     def exp_quat(r: vec3):
         """The quaternion of the rotation vector r, exact and smooth at 0."""
         angle = wp.length(r)
-        s = T(0.5) - angle * angle / T(48.0)
-        if angle > T(1e-3):
-            s = wp.sin(T(0.5) * angle) / angle
+        s = pick(T(1e-3), angle, wp.sin(T(0.5) * angle) / angle, T(0.5) - angle * angle / T(48.0))
         return quat(s * r[0], s * r[1], s * r[2], wp.cos(T(0.5) * angle))
 
     @wp.func
     def exp_adjoint(r: vec3, g: vec3):
         """Adjoint of q' = q exp(r): (of r, of q), g and both in the body's tangent space: J_r(r)' g and Exp(r) g."""
         angle = wp.length(r)
-        k1 = T(0.5) - angle * angle / T(24.0)
-        k2 = T(1.0) / T(6.0) - angle * angle / T(120.0)
-        if angle > T(2e-2):
-            k1 = (T(1.0) - wp.cos(angle)) / (angle * angle)
-            k2 = (angle - wp.sin(angle)) / (angle * angle * angle)
+        small = T(2e-2)
+        k1 = pick(small, angle, (T(1.0) - wp.cos(angle)) / (angle * angle), T(0.5) - angle * angle / T(24.0))
+        k2 = (angle - wp.sin(angle)) / (angle * angle * angle)
+        k2 = pick(small, angle, k2, T(1.0) / T(6.0) - angle * angle / T(120.0))
         rg = wp.cross(r, g)
         rrg = wp.cross(r, rg)
         return g + k1 * rg + k2 * rrg, g + (T(1.0) - k2 * angle * angle) * rg + k1 * rrg
@@ -62,18 +61,15 @@ def spatial(dtype: type) -> SimpleNamespace:
         """The rotation vector of the unit quaternion q, no longer than pi; the same for q and -q."""
         v = vec3(q[0], q[1], q[2])
         s = wp.length(v)
-        scale = T(2.0) + s * s / T(3.0)
-        if s > T(1e-3):
-            scale = T(2.0) * wp.atan2(s, wp.abs(q[3])) / s
-        return v * wp.where(q[3] < T(0.0), -scale, scale)
+        scale = pick(T(1e-3), s, T(2.0) * wp.atan2(s, wp.abs(q[3])) / s, T(2.0) + s * s / T(3.0))
+        return v * pick(q[3], T(0.0), -scale, scale)
 
     @wp.func
     def log_adjoint(r: vec3, g: vec3):
         """Adjoint of log(exp(r) exp(d)) with respect to d, at d = 0: the inverse of J_r(r)'."""
         angle = wp.length(r)
-        k2 = T(1.0) / T(12.0) + angle * angle / T(720.0)
-        if angle > T(2e-2):
-            k2 = (T(1.0) - T(0.5) * angle / wp.tan(T(0.5) * angle)) / (angle * angle)
+        k2 = (T(1.0) - T(0.5) * angle / wp.tan(T(0.5) * angle)) / (angle * angle)
+        k2 = pick(T(2e-2), angle, k2, T(1.0) / T(12.0) + angle * angle / T(720.0))
         rg = wp.cross(r, g)
         return g - T(0.5) * rg + k2 * wp.cross(r, rg)
 

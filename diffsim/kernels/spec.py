@@ -1,7 +1,6 @@
 """What the generated code of the kernels depends on; the numbers that it does not depend on are in model.py."""
 
 import dataclasses
-from typing import Any
 
 from diffsim.kernels.lanes import Division
 from diffsim.robot.scene import FACTORS, Scene
@@ -18,11 +17,12 @@ class KernelSpec:
     carrier: int
     nball: int
     features: frozenset[str]
-    dtype: type
+    dtype: type  # of the scene's numbers
+    block: int  # environments that one thread steps at once (wide.py)
     implicit: bool
     varied: bool  # constants are multiplied by factors of each environment (factors.py)
     forced: int  # number of bodies that external forces act on (force.py), 0 without
-    env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, environment, component]
+    env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, block, component]
     # how threads share an environment (lanes.py); slots: the most links that one of them has
     threads_per_env: int
     sharers: int
@@ -66,6 +66,7 @@ def kernel_spec(
     env_last: bool,
     varied: bool = False,
     forced: bool = False,
+    block: int = 1,
 ) -> KernelSpec:
     limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
     return KernelSpec(
@@ -75,6 +76,7 @@ def kernel_spec(
         nball=scene.nball,
         features=scene.features,
         dtype=dtype,
+        block=block,
         implicit=implicit,
         varied=varied,
         forced=scene.nbody if forced else 0,
@@ -85,8 +87,3 @@ def kernel_spec(
         slots=division.slots,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
     )
-
-
-def module_options(spec: KernelSpec) -> dict[str, Any]:
-    # On the CPU unrolling buys no speed and costs a second of compilation; a GPU keeps small matrices in registers.
-    return {"enable_backward": False, "max_unroll": 6 if spec.env_last else 1}

@@ -22,12 +22,14 @@ import warp as wp
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.wide import blocks
 
 
 @cache
 def terrain_contact(spec: KernelSpec) -> wp.Function:
-    t, sp = types(spec.dtype), spatial(spec.dtype)
-    T, vec2, vec3, vec4, vec6, mat3, Model = spec.dtype, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3, t.Model
+    t, sp, block, BLOCK = types(spec), spatial(spec), blocks(spec), spec.block
+    T, U, vec2, vec3, vec4, vec6, mat3, Model = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3, t.Model
+    uvec4 = t.scene.vec4
     point_velocity, IMPLICIT = sp.point_velocity, spec.implicit
 
     @wp.func
@@ -37,11 +39,11 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         b = m.terrain[row, i + 1]
         length = (b[0] - a[0]) * a[2] + (b[1] - a[1]) * a[3]
         if i == 0 or i + 2 == m.terrain.shape[1]:
-            length = T(wp.inf)
+            length = U(wp.inf)
         return length
 
     @wp.func
-    def segment_below(m: Model, row: int, x: T):
+    def segment_below(m: Model, row: int, x: U):
         low = int(0)
         high = m.terrain.shape[1] - 1
         while high - low > 1:
@@ -53,7 +55,7 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         return low
 
     @wp.func
-    def in_valley(m: Model, row: int, i: int, x: T, z: T, r: T, otherwise: vec4):
+    def in_valley(m: Model, row: int, i: int, x: U, z: U, r: U, otherwise: uvec4):
         """(d, n_x, n_z, k) of a centre that both sides of the valley at vertex i push, or what it is otherwise."""
         result = otherwise
         if i > 0 and i + 1 < m.terrain.shape[1]:
@@ -61,27 +63,27 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
             b = m.terrain[row, i]
             sine = a[2] * b[3] - a[3] * b[2]
             cosine = a[2] * b[2] + a[3] * b[3]
-            fits = r * sine <= (T(1.0) + cosine) * wp.min(length_of(m, row, i - 1), length_of(m, row, i))
-            if sine > T(0.0) and fits:
-                scale = r / (T(1.0) + cosine)
+            fits = r * sine <= (U(1.0) + cosine) * wp.min(length_of(m, row, i - 1), length_of(m, row, i))
+            if sine > U(0.0) and fits:
+                scale = r / (U(1.0) + cosine)
                 wx = b[0] - scale * (a[3] + b[3]) - x
                 wz = b[1] + scale * (a[2] + b[2]) - z
                 away = wp.sqrt(wx * wx + wz * wz)
-                if wx * a[2] + wz * a[3] < T(0.0) and wx * b[2] + wz * b[3] > T(0.0) and away > T(0.0):
-                    result = vec4(-away, wx / away, wz / away, T(-1.0) / away)
+                if wx * a[2] + wz * a[3] < U(0.0) and wx * b[2] + wz * b[3] > U(0.0) and away > U(0.0):
+                    result = uvec4(-away, wx / away, wz / away, U(-1.0) / away)
         return result
 
     @wp.func
-    def nearest(m: Model, row: int, x: T, z: T, r: T, reach: T):
+    def nearest(m: Model, row: int, x: U, z: U, r: U, reach: U):
         """(d, n_x, n_z, k) of the centre (x, z); over the ground exact for centres nearer than `reach` only."""
         last = m.terrain.shape[1] - 1
         below = segment_below(m, row, x)
         a = m.terrain[row, below]
         above = z - a[1] - (x - a[0]) * a[3] / a[2]
-        result = vec4(above - r, T(0.0), T(1.0), T(0.0))
+        result = uvec4(above - r, U(0.0), U(1.0), U(0.0))
         # The nearest point is no farther than the one straight below or above: nor is it so in x.
         bound = wp.abs(above)
-        if above > T(0.0):
+        if above > U(0.0):
             bound = wp.min(above, reach)
         i = below
         while i > 0 and m.terrain[row, i][0] > x - bound:
@@ -96,8 +98,8 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
             s = dx * b[2] + dz * b[3]
             length = length_of(m, row, i)
             at = int(0)
-            if s < T(0.0) and i > 0:
-                s = T(0.0)
+            if s < U(0.0) and i > 0:
+                s = U(0.0)
                 at = -1
             elif s > length:
                 s = length
@@ -112,29 +114,40 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         if found >= 0:
             b = m.terrain[row, found]
             if end == 0:
-                result = vec4((z - b[1]) * b[2] - (x - b[0]) * b[3] - r, -b[3], b[2], T(0.0))
+                result = uvec4((z - b[1]) * b[2] - (x - b[0]) * b[3] - r, -b[3], b[2], U(0.0))
                 result = in_valley(m, row, found, x, z, r, result)
                 result = in_valley(m, row, found + 1, x, z, r, result)
             else:
                 vertex = found + wp.max(end, 0)
                 b = m.terrain[row, vertex]
-                away = wp.where(above > T(0.0), wp.sqrt(best), -wp.sqrt(best))
-                if best > T(0.0):
-                    result = vec4(away - r, (x - b[0]) / away, (z - b[1]) / away, T(1.0) / away)
+                away = wp.where(above > U(0.0), wp.sqrt(best), -wp.sqrt(best))
+                if best > U(0.0):
+                    result = uvec4(away - r, (x - b[0]) / away, (z - b[1]) / away, U(1.0) / away)
                 result = in_valley(m, row, vertex, x, z, r, result)
         return result
 
     @wp.func
-    def sphere_on_terrain(m: Model, row: int, c: int, R: mat3, x: vec3, V: vec6, place: vec2, h: T, theta: T):
+    def nearest_of_each(m: Model, b: int, x: T, z: T, r: U, reach: T):
+        """nearest(), of each of the block's environments with its own profile."""
+        result = vec4()
+        for k in range(BLOCK):
+            row = (BLOCK * b + k) % m.terrain.shape[0]
+            hit = nearest(m, row, block.element(x, k), block.element(z, k), r, block.element(reach, k))
+            for i in range(4):
+                result[i] = block.with_element(result[i], k, hit[i])
+        return result
+
+    @wp.func
+    def sphere_on_terrain(m: Model, b: int, c: int, R: mat3, x: vec3, V: vec6, place: vec2, h: T, theta: T):
         """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
         theta h ahead if implicit), E and the curvature k."""
-        centre = x + R * m.contact_position[c]
-        r = m.contact_radius[c]
+        centre = x + R * vec3(m.contact_position[c])
+        r = T(m.contact_radius[c])
         reach = r
         if wp.static(IMPLICIT):
             fastest = wp.length(point_velocity(V, centre)) + r * wp.length(wp.spatial_top(V))
             reach = r + theta * h * fastest
-        hit = nearest(m, row, place[0] + centre[0], place[1] + centre[2], r, reach)
+        hit = nearest_of_each(m, b, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
         n = vec3(hit[1], T(0.0), hit[2])
         E = mat3(n[2], T(0.0), n[0], T(0.0), T(1.0), T(0.0), -n[0], T(0.0), n[2])
         p = centre - r * n

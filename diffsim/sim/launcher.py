@@ -17,7 +17,7 @@ from diffsim.kernels.lanes import Division, divide
 from diffsim.kernels.model import model_of
 from diffsim.kernels.spec import kernel_spec
 from diffsim.robot.scene import Scene
-from diffsim.sim.options import WARP_DTYPE, Options
+from diffsim.sim.options import BLOCKS, WARP_DTYPE, Options
 
 # Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
 # thread (about 1 ms) it saves nothing. A whole iteration of 64 ants takes 0.22 s with two threads, 0.26 s with one.
@@ -43,6 +43,7 @@ class Launcher:
 
     Attributes:
         spec: what the kernels were generated for.
+        num_blocks: how many blocks of spec.block environments there are, the last of which may not be full.
         nonfinite_gradients: see Simulator.
     """
 
@@ -55,7 +56,9 @@ class Launcher:
         elif division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         implicit = options.integration.integrator == "implicit"
-        self.spec = kernel_spec(scene, division, real, implicit, cuda, options.factors, options.forces)
+        block = options.block or default_block(num_envs, options)
+        self.spec = kernel_spec(scene, division, real, implicit, cuda, options.factors, options.forces, block)
+        self.num_blocks = -(-num_envs // block)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
         with building:
             self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
@@ -64,9 +67,9 @@ class Launcher:
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
         work = num_envs * options.integration.substeps * scene.nlink
         wanted = 1 if cuda else options.threads or min(available_cores(), max(1, work // MIN_WORK_PER_THREAD))
-        count = min(wanted, num_envs)
-        bounds = [num_envs * k // count for k in range(count + 1)]
-        self._shares = list(zip(bounds, bounds[1:], strict=False))  # environments of each thread: first, end
+        count = min(wanted, self.num_blocks)
+        bounds = [self.num_blocks * k // count for k in range(count + 1)]
+        self._shares = list(zip(bounds, bounds[1:], strict=False))  # blocks of each thread: first, end
         self._pool = ThreadPoolExecutor(count - 1) if count > 1 else None
 
     def command(self, kernel: str, inputs: list[Any]) -> list[wp.Launch]:
@@ -105,6 +108,13 @@ def default_division(scene: Scene, num_envs: int) -> Division:
     candidates = [divide(scene, groups * sharers, sharers) for groups in (1, 2, 4)]
     best = min(candidates, key=lambda division: (division.slots, division.threads_per_env))
     return best if best.threads_per_env * num_envs <= MAX_THREADS else divide(scene)
+
+
+def default_block(num_envs: int, options: Options) -> int:
+    """Of the numbers of environments that a thread can step at once, the fastest as measured in docs/performance.md."""
+    if torch.device(options.device).type == "cuda" or options.dtype == torch.float64 or num_envs == 1:
+        return 1
+    return max(block for block in BLOCKS if block <= max(num_envs, 8))
 
 
 def available_cores() -> int:

@@ -26,7 +26,7 @@ class Simulator:
         integration: integrator, substeps and theta.
         control_dt: seconds of one control step.
         horizon: differentiable control steps that can be alive at once.
-        **options: device, dtype, threads, factors, forces, division: see Options.
+        **options: device, dtype, threads, factors, forces, block, division: see Options.
 
     Raises:
         ValueError: an argument out of range, with what is allowed.

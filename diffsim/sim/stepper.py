@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
+from diffsim.kernels.model import types
 from diffsim.sim.integration import Integration
 from diffsim.sim.launcher import Launcher, check_memory
 
@@ -144,8 +145,19 @@ class Stepper:
         widths = (spec.nq, spec.nv, spec.nv, spec.nfactor)
         numbers = count * sum(widths)
         check_memory("checkpoints", n, numbers * self._launcher.dtype.itemsize, self._launcher.device)
-        sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
-        return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
+        if spec.block == 1:
+            sizes = [(count, k, n) if spec.env_last else (count, n, k) for k in widths]
+            return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
+        blocks = self._launcher.num_blocks
+        return [array_of_vectors(torch.zeros(count, blocks, k, spec.block), types(spec).T) for k in widths]
+
+
+def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
+    """(..., block) float32 values as an array of vectors, which to Warp are numbers of that dtype (kernels.wide)."""
+    strides = tuple(stride * values.itemsize for stride in values.stride()[:-1])
+    array: Any = wp.array(ptr=values.data_ptr() or None, dtype=dtype, shape=values.shape[:-1], strides=strides)
+    array.tensor = values  # keeps the memory
+    return array
 
 
 class ExtrapolatedStepper:

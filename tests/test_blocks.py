@@ -1,0 +1,187 @@
+"""Blocks of environments in vectors: every law as in float64, whatever the neighbours and the block's edges."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scenes import PENDULUM, acting_states, grounded_states, leg_scene, parse, task_scene, tree_scene
+
+from diffsim.robot.scene import FACTORS
+from diffsim.sim.integration import Integration
+from diffsim.sim.options import BLOCKS
+from diffsim.sim.simulator import Simulator
+
+CONTROL_DT = 1 / 60
+SEMI, IMPLICIT, EXTRAPOLATED = (Integration(name, 8) for name in ("semi_implicit", "implicit", "extrapolated"))
+_, SMALL, BLOCK = BLOCKS
+COUNT = BLOCK + 1
+
+
+def case(name: str, rng: np.random.Generator):
+    """A scene and states of COUNT environments in which all of its laws act."""
+    if name in ("linear", "hill"):
+        return grounded_states(leg_scene(name, grounded=True), COUNT, rng)
+    if name in ("planar", "ball"):
+        return grounded_states(tree_scene(name, 0), COUNT, rng)
+    scene = task_scene("hopper" if name == "terrain" else name)
+    states = acting_states(scene, COUNT, rng)
+    if name == "terrain":  # a valley, a ridge and a step, elsewhere for each
+        start = np.linspace(-0.6, 0.6, COUNT)[:, None]
+        x = start + [-9.0, -0.2, 0.0, 0.2, 0.3, 9.0]
+        scene = scene.with_terrain(np.stack([x, np.broadcast_to([0.2, 0.0, 0.05, 0.0, 0.04, 0.1], x.shape)], 2))
+    return scene, states
+
+
+def step(scene, states, dtype, integration, weights=None, **options):
+    """State after a control step, its gradient in all that a step takes, and the simulator."""
+    count = len(states[0])
+    sim = Simulator(scene, count, integration, CONTROL_DT, dtype=dtype, **options)
+    inputs = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in states]
+    rng = np.random.default_rng(0)
+    if options.get("factors"):
+        sim.factors = torch.tensor(rng.uniform(0.6, 1.4, (COUNT, len(FACTORS)))[:count], dtype=dtype).requires_grad_()
+        inputs.append(sim.factors)
+    if options.get("forces"):
+        forces = rng.normal(size=(COUNT, scene.nbody, 6))[:count]
+        sim.forces = torch.tensor(forces, dtype=dtype).requires_grad_()
+        inputs.append(sim.forces)
+    outputs = sim.step(*inputs[:3])
+    gradients = torch.autograd.grad([x.sum() for x in outputs], inputs)
+    return [x.detach().double() for x in (*outputs, *gradients)], sim
+
+
+@pytest.mark.parametrize(
+    "name, integration, options",
+    [
+        ("ant", SEMI, {}),
+        ("swimmer", SEMI, {}),
+        ("hopper", EXTRAPOLATED, {}),
+        ("planar", IMPLICIT, {"factors": True, "forces": True}),
+        ("ball", SEMI, {}),
+        ("linear", SEMI, {}),
+        ("hill", IMPLICIT, {"factors": True, "forces": True}),
+        ("terrain", SEMI, {}),
+        ("terrain", IMPLICIT, {}),
+    ],
+)
+def test_laws_are_those_of_float64(name, integration, options, rng):
+    scene, states = case(name, rng)
+    states = tuple(x.astype(np.float32) for x in states)
+    block, sim = step(scene, states, torch.float32, integration, **options)
+    exact, _ = step(scene, states, torch.float64, integration, **options)
+    assert not sim.nonfinite.any()
+    for found, expected in zip(block, exact, strict=True):
+        error = (found - expected).abs().flatten(1).amax(1) / expected.abs().max()
+        assert (
+            error.median() < 2e-6 and error.max() < 2e-4
+        )  # the largest where a contact sticks in one, slides in the other
+
+
+@pytest.fixture(scope="module")
+def hoppers():
+    """States of the hopper beyond the second block of 16, and their step."""
+    states = acting_states(task_scene("hopper"), 2 * BLOCK + 1, np.random.default_rng(1))
+    return states, step(task_scene("hopper"), states, torch.float32, SEMI)[0]
+
+
+@pytest.mark.parametrize("count", [2, 7, SMALL, 15, BLOCK, 17])
+@pytest.mark.parametrize("last", [False, True])
+def test_an_environment_does_not_depend_on_its_place_in_a_block(count, last, hoppers):
+    states, expected = hoppers
+    part = slice(-count, None) if last else slice(count)
+    found, sim = step(task_scene("hopper"), tuple(x[part] for x in states), torch.float32, SEMI)
+    assert sim.nonfinite.shape == (count,)
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x, y[part], rtol=0, atol=0)
+
+
+def test_one_environment_is_no_block(hoppers):
+    """The scalar kernel, whose sums are rounded otherwise."""
+    states, expected = hoppers
+    found, _ = step(task_scene("hopper"), tuple(x[:1] for x in states), torch.float32, SEMI)
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x, y[:1], rtol=1e-5, atol=1e-5 * y.abs().max().item())
+
+
+@pytest.mark.parametrize("threads", [2, 3, 16])
+def test_threads_take_whole_blocks(threads, hoppers):
+    states, expected = hoppers
+    for x, y in zip(step(task_scene("hopper"), states, torch.float32, SEMI, threads=threads)[0], expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("bad", [3, BLOCK, 2 * BLOCK])  # the last one is alone in its block, which is filled up with it
+@pytest.mark.parametrize("where, value", [(0, np.nan), (1, 1e30), (2, np.inf)])
+def test_neighbours_do_not_see_a_contained_environment(bad, where, value, hoppers):
+    states, expected = hoppers
+    states = tuple(x.copy() for x in states)
+    states[where][bad, -1] = value
+    found, sim = step(task_scene("hopper"), states, torch.float32, SEMI)
+    assert sim.nonfinite.nonzero().flatten().tolist() == [bad] and sim.nonfinite_gradients.sum() == 0
+    others = np.arange(2 * BLOCK + 1) != bad
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x[others], y[others], rtol=0, atol=0)
+    np.testing.assert_array_equal(found[0][bad], states[0][bad].astype(np.float32))
+    assert all((gradient[bad] == 0).all() for gradient in found[2:])
+
+
+def test_a_gradient_that_is_not_finite_is_counted_once(hoppers):
+    states, _ = hoppers
+    sim = Simulator(task_scene("hopper"), len(states[0]), SEMI, CONTROL_DT)
+    inputs = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in states]
+    outputs = sim.step(*inputs)
+    weights = [torch.ones_like(x) for x in outputs]
+    weights[0][[5, -1], 1] = torch.nan
+    gradients = torch.autograd.grad(outputs, inputs, weights)
+    assert sim.nonfinite_gradients.nonzero().flatten().tolist() == [5, 2 * BLOCK]
+    assert sim.nonfinite_gradients[5] == sim.nonfinite_gradients[-1] == 1
+    assert all(g.isfinite().all() and (g[[5, -1]] == 0).all() and (g[4] != 0).any() for g in gradients)
+
+
+def test_sines_of_large_angles():
+    """A hinge may have turned many times; beyond 8192 the error grows with the angle."""
+    scene = parse(PENDULUM.replace('range="-9 9"', 'range="-1e5 1e5"'))
+    angles = np.concatenate([np.linspace(-8192, 8192, 160), [0.0, 1e-30, 20000.0, -50000.0]]).astype(np.float32)[
+        :, None
+    ]
+    states = angles, np.zeros_like(angles), np.zeros_like(angles)
+    once = Integration("semi_implicit", 1)  # a second substep would start from a rounded angle
+    block, exact = (step(scene, states, dtype, once)[0] for dtype in (torch.float32, torch.float64))
+    near = np.abs(angles[:, 0]) <= 8192
+    torch.testing.assert_close(block[1][near], exact[1][near], rtol=1e-6, atol=1e-6 * exact[1].abs().max().item())
+    torch.testing.assert_close(block[1], exact[1], rtol=1e-5, atol=1e-5 * exact[1].abs().max().item())
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"block": 4}, "block is 4, must be 1, 8 or 16"),
+        ({"block": 16, "dtype": torch.float64}, "block is 16, must be 1 on a GPU and in float64"),
+    ],
+)
+def test_blocks_of_other_sizes_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Simulator(task_scene("hopper"), 2, **options)
+
+
+def test_processors_without_wide_registers(tmp_path, hoppers):
+    """Compiled for the oldest processor of its kind, which has neither AVX nor a fused product and sum."""
+    states, expected = hoppers
+    np.savez(tmp_path / "states.npz", *states)
+    code = f"""
+import numpy as np, torch, warp as wp
+wp.config.cpu_compiler_flags = ""
+from scenes import task_scene
+from test_blocks import SEMI, step
+states = [x for x in np.load({str(tmp_path / "states.npz")!r}).values()]
+torch.save(step(task_scene("hopper"), states, torch.float32, SEMI)[0], {str(tmp_path / "found.pt")!r})
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True)
+    for x, y in zip(torch.load(tmp_path / "found.pt"), expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-5 * y.abs().max().item())
+        assert (x != y).any()  # rounded otherwise
