@@ -435,7 +435,7 @@ def enhance(mbpo: MBPO, dynamics: Dynamics, state: Tensor, made: Transition) -> 
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.steps), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.steps)
     mbpo = run.restore(MBPO(args, env))
     explore, collect = run.capture(mbpo.explore, env), run.capture(mbpo.collect, env)
     learn = [run.capture(part) for part in (mbpo.fit, mbpo.imagine, mbpo.update)]
@@ -448,7 +448,7 @@ def train(args: Args) -> None:
                 metrics |= part()
             run.log(metrics)
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, mbpo.policy))
+            run.log_evaluation(evaluate(run.eval_env, mbpo.policy))
 
 
 @command

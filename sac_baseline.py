@@ -286,13 +286,13 @@ def soft_bellman(reward: Tensor, next_soft_value: Tensor, terminated: Tensor, ga
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.steps), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.steps)
     sac = run.restore(SAC(args, env))
     explore, learn = run.capture(sac.explore, env), run.capture(sac.learn, env)
     for iteration in run:
         run.log(explore() if iteration * args.steps <= args.seed_steps else learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, sac.policy))
+            run.log_evaluation(evaluate(run.eval_env, sac.policy))
 
 
 @command
