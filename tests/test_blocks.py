@@ -26,7 +26,7 @@ COUNT = BLOCK + 1
 
 def case(name: str, rng: np.random.Generator):
     """A scene and states of COUNT environments in which all of its laws act; most are other tests' scenes."""
-    if name in ("linear", "hill"):
+    if name == "hill":
         return grounded_states(leg_scene(name, grounded=True), COUNT, rng)
     if name == "fish":
         scene = parse(FISH)
@@ -61,9 +61,8 @@ def step(scene, states, dtype, integration, weights=None, **options):
     "name, integration, options",
     [
         ("ant", SEMI, {}),
-        ("hopper", EXTRAPOLATED, {}),
+        ("hopper", EXTRAPOLATED, {"forces": True}),
         ("fish", SEMI, {}),
-        ("linear", IMPLICIT, {"factors": True, "forces": True}),
         ("hill", IMPLICIT, {"factors": True}),
         ("hopper on hills", SEMI, {}),
         ("ball on hills", IMPLICIT, {}),
