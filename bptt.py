@@ -177,14 +177,14 @@ def bptt_loss(reward: Tensor, done: Tensor, gamma: float) -> Tensor:
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     bptt = run.restore(BPTT(args, env))
     update = run.capture(bptt.update, env)
     for iteration in run:
         bptt.set_learning_rate(iteration)
         run.log(update())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, bptt.policy))
+            run.log_evaluation(evaluate(run.eval_env, bptt.policy))
 
 
 @command

@@ -540,7 +540,7 @@ def evaluate(search: Search) -> Evaluation:
 
 def train(args: Args, learner: type[Search] = Search) -> None:
     run = Run(args)
-    search = run.restore(learner(args, run.make_eval_env()))
+    search = run.restore(learner(args, run.eval_env))
     if run.iteration == 0:
         run.log(search.prepare(run.message, run.directory / "plan.npz"), search.control_steps)
     for iteration in run:  # lines 5 to 18

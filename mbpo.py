@@ -172,14 +172,6 @@ class Actor(nn.Module):
         return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
 
 
-class Temperature(nn.Module):
-    """The weight of the entropy."""
-
-    def __init__(self, args: Args) -> None:
-        super().__init__()
-        self.log = nn.Parameter(torch.full((), math.log(args.initial_temperature)))
-
-
 class Models(nn.Module):
     """p(s' - s, r | s, a): Gaussians of E networks, in units in which changes and rewards have variance 1."""
 
@@ -238,7 +230,8 @@ class MBPO:
         critics = [mlp(obs_dim + action_dim, args.hidden, 1, nn.ReLU) for _ in range(2)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        self.temperature = Temperature(args).to(env.device)
+        log = torch.full((), math.log(args.initial_temperature))
+        self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
         self.models = Models(args, obs_dim, action_dim).to(env.device)
         self.policy = self.actor.deterministic()
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.actor_lr)
@@ -355,7 +348,7 @@ class MBPO:
             obs, next_obs = (self.actor.normalizer(x) for x in (batch.obs, batch.next_obs))
             metrics.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
         found = {name: torch.stack([row[name] for row in metrics]).mean() for name in metrics[0]}
-        return found | {"charts/temperature": self.temperature.log.detach().exp()}
+        return found | {"charts/temperature": self.temperature["log"].detach().exp()}
 
     def mixture(self) -> Transition:
         size = self.args.batch_size
@@ -368,7 +361,7 @@ class MBPO:
         args = self.args
         with torch.no_grad():
             action, density = self.actor(next_obs)
-            value = self.values(self.targets, next_obs, action).amin(0) - self.temperature.log.exp() * density
+            value = self.values(self.targets, next_obs, action).amin(0) - self.temperature["log"].exp() * density
             target = soft_bellman(batch.reward, value, batch.terminated, args.gamma)
         values = self.values(self.critics, obs, batch.action)
         loss = (values - target).square().mean(1).sum()
@@ -381,10 +374,10 @@ class MBPO:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         action, density = self.actor(obs)
         value = self.values(self.critics, obs, action).amin(0)
-        loss = (self.temperature.log.detach().exp() * density - value).mean()
+        loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = action.shape[1] - density.detach().mean()  # of entropy over the target
-        self.temperature_optimizer.step(self.temperature.log.exp() * surplus)
+        self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
 
     def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
@@ -442,7 +435,7 @@ def enhance(mbpo: MBPO, dynamics: Dynamics, state: Tensor, made: Transition) -> 
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.steps), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.steps)
     mbpo = run.restore(MBPO(args, env))
     explore, collect = run.capture(mbpo.explore, env), run.capture(mbpo.collect, env)
     learn = [run.capture(part) for part in (mbpo.fit, mbpo.imagine, mbpo.update)]
@@ -455,7 +448,7 @@ def train(args: Args) -> None:
                 metrics |= part()
             run.log(metrics)
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, mbpo.policy))
+            run.log_evaluation(evaluate(run.eval_env, mbpo.policy))
 
 
 @command

@@ -28,6 +28,7 @@ from diffsim.training import ClippedAdam, Ensemble, Run, command, distributed, e
 from diffsim.training.flags import ParallelFlags, parse
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Positive, Repeats, SomeWidths
+from diffsim.training.regression import Regression
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of ppo_baseline.py, shac.py and sac_baseline.py, so that only the policy differs.
@@ -584,6 +585,7 @@ class SHAC(Learner):
                 nn.init.orthogonal_(layer.weight, math.sqrt(2))
                 nn.init.zeros_(layer.bias)
         self.add_critic(critic)
+        self.regression = Regression(critic, self.critic_optimizer)
         sizes = (env.task.obs_dim,), ()  # normalized s_t; the value's target
         self.samples = [torch.zeros(args.horizon * env.num_envs, *size, device=env.device) for size in sizes]
 
@@ -637,9 +639,7 @@ class SHAC(Learner):
         for _ in range(self.args.epochs):
             rows = []  # of the last pass
             for obs, value in self.minibatches(slice(None)):
-                loss = F.mse_loss(self.critic(obs).squeeze(-1), value)
-                self.critic_optimizer.step(loss)
-                rows.append({"losses/critic": loss.detach()})
+                rows.append({"losses/critic": self.regression.step(obs, value)})
         self.follow()
         return self.end_iteration(rows)
 
@@ -723,14 +723,14 @@ ALGORITHMS: dict[str, type[PPO | SHAC | SAC]] = {"ppo": PPO, "shac": SHAC, "sac"
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     learner = run.restore(ALGORITHMS[args.algorithm](args, env))
     interact, learn = run.capture(learner.interact, env), run.capture(learner.learn)
     for iteration in run:
         learner.schedule(iteration)
         run.log(interact() | learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, learner.policy))
+            run.log_evaluation(evaluate(run.eval_env, learner.policy))
 
 
 @command

@@ -312,13 +312,13 @@ class PODS:
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     pods = run.restore(PODS(args, env))
     improve, imitate = run.capture(pods.improve), run.capture(pods.imitate)
     for _ in run:
         run.log(improve() | imitate(), pods.control_steps)
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, pods.policy))
+            run.log_evaluation(evaluate(run.eval_env, pods.policy))
 
 
 @command

@@ -293,13 +293,13 @@ def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) ->
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     ppo = run.restore(PPO(args, env))
     roll_out, update = run.capture(ppo.roll_out, env), run.capture(ppo.update)
     for _ in run:
         run.log(roll_out() | update())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, ppo.policy))
+            run.log_evaluation(evaluate(run.eval_env, ppo.policy))
 
 
 @command

@@ -173,14 +173,6 @@ class Actor(nn.Module):
         return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
 
 
-class Temperature(nn.Module):
-    """The weight of the entropy."""
-
-    def __init__(self, args: Args) -> None:
-        super().__init__()
-        self.log = nn.Parameter(torch.full((), math.log(args.initial_temperature)))
-
-
 # The algorithm --------------------------------------------------------------------------------------------------------
 
 
@@ -197,7 +189,8 @@ class SAC:
         critics = [mlp(obs_dim + action_dim, args, 1, args.layer_norm) for _ in range(args.critics)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        self.temperature = Temperature(args).to(env.device)
+        log = torch.full((), math.log(args.initial_temperature))
+        self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
         self.policy = self.actor.deterministic()
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.actor_lr)
         self.critic_optimizer = ClippedAdam(self.critics, args.max_grad_norm, lr=args.critic_lr)
@@ -222,7 +215,7 @@ class SAC:
         found = {name: torch.stack([row[name] for row in metrics]).mean() for name in (metrics[0] if learning else ())}
         optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
         found["grad/skipped"] = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
-        return found | {"charts/temperature": self.temperature.log.detach().exp()}
+        return found | {"charts/temperature": self.temperature["log"].detach().exp()}
 
     @torch.no_grad()
     def act(self, obs: Tensor, random: bool) -> Tensor:
@@ -256,7 +249,7 @@ class SAC:
             values = self.values(self.targets, next_obs, action)
             if args.critic_subset < args.critics:
                 values = values[torch.rand(args.critics, device=obs.device).argsort()[: args.critic_subset]]
-            entropy = -self.temperature.log.exp() * density
+            entropy = -self.temperature["log"].exp() * density
             target = soft_bellman(batch.reward, values.amin(0) + entropy, batch.terminated, args.gamma)
         values = self.values(self.critics, obs, batch.action)
         loss = (values - target).square().mean(1).sum()
@@ -271,10 +264,10 @@ class SAC:
         action, density = self.actor(obs)
         values = self.values(self.critics, obs, action)
         value = values.amin(0) if self.args.critic_subset == self.args.critics else values.mean(0)  # REDQ: the mean
-        loss = (self.temperature.log.detach().exp() * density - value).mean()
+        loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = -density.detach().mean() - self.args.target_entropy * action.shape[1]  # of entropy over the target
-        self.temperature_optimizer.step(self.temperature.log.exp() * surplus)
+        self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
 
     def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
@@ -293,13 +286,13 @@ def soft_bellman(reward: Tensor, next_soft_value: Tensor, terminated: Tensor, ga
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.steps), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.steps)
     sac = run.restore(SAC(args, env))
     explore, learn = run.capture(sac.explore, env), run.capture(sac.learn, env)
     for iteration in run:
         run.log(explore() if iteration * args.steps <= args.seed_steps else learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, sac.policy))
+            run.log_evaluation(evaluate(run.eval_env, sac.policy))
 
 
 @command

@@ -505,7 +505,7 @@ class Population(SAPO):
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     sapo = run.restore((Population if args.population > 1 else SAPO)(args, env))
     update_actor, update_critic = run.capture(sapo.update_actor, env), run.capture(sapo.update_critic)
     for iteration in run:
@@ -518,7 +518,7 @@ def train(args: Args) -> None:
             run.message(f"imitated {args.start_from}: squared error of the actions {errors[-1].item():.3g}")
         run.log(update_actor() | update_critic(), (1 + windows) * args.horizon * args.num_envs)
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, sapo.policy))
+            run.log_evaluation(evaluate(run.eval_env, sapo.policy))
 
 
 @command

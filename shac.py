@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, evaluate, evaluate_checkpoint
+from diffsim.training import ClippedAdam, ObsNormalizer, Regression, Run, command, evaluate, evaluate_checkpoint
 from diffsim.training.flags import ParallelFlags, parse
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
@@ -161,6 +160,7 @@ class SHAC:
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
         self.critic_optimizer = ClippedAdam(self.critic, args.max_grad_norm, args.betas)
+        self.regression = Regression(self.critic, self.critic_optimizer)  # of values on observations
         self.obs = torch.zeros(args.horizon * env.num_envs, obs_dim, device=env.device)  # the critic's samples
         self.value = torch.zeros(args.horizon * env.num_envs, device=env.device)
 
@@ -191,9 +191,7 @@ class SHAC:
             losses = []
             batches = self.obs.chunk(args.critic_minibatches), self.value.chunk(args.critic_minibatches)
             for obs, value in zip(*batches, strict=True):
-                loss = F.mse_loss(self.critic(obs).squeeze(-1), value)
-                self.critic_optimizer.step(loss)
-                losses.append(loss.detach())
+                losses.append(self.regression.step(obs, value))
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
         skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped
@@ -243,14 +241,14 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
 
 def train(args: Args) -> None:
     run = Run(args)
-    env, eval_env = run.make_env(args.num_envs, args.horizon), run.make_eval_env()
+    env = run.make_env(args.num_envs, args.horizon)
     shac = run.restore(SHAC(args, env))
     update_actor, update_critic = run.capture(shac.update_actor, env), run.capture(shac.update_critic)
     for iteration in run:
         shac.set_learning_rates(iteration)
         run.log(update_actor() | update_critic())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(eval_env, shac.policy))
+            run.log_evaluation(evaluate(run.eval_env, shac.policy))
 
 
 @command

@@ -48,6 +48,11 @@ class CommonFlags:
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
 
     @property
+    def measured(self) -> Sequence[Any]:
+        """The tasks to measure, or what a benchmark measures instead: none with --draw-only."""
+        return () if self.draw_only else self.env
+
+    @property
     def directory(self) -> Path:
         tree = RESULTS if self.update_results else OUTPUT
         return self.output.resolve() if self.output else tree / machine(self.device)
@@ -107,7 +112,7 @@ class CheckpointFlags(CommonFlags):
 
     @property
     def measured(self) -> tuple[Path, ...]:
-        """Those to measure: none with --draw-only. Without any the benchmark ends with one line."""
+        """Those to measure. Without any the benchmark ends with one line."""
         if not (self.checkpoints or self.draw_only):
             fail("of what? give a checkpoint or the directory of a run")
         return () if self.draw_only else self.checkpoints
@@ -188,20 +193,22 @@ class Part(NamedTuple):
     """One table of a benchmark: what measures it, and where it goes."""
 
     csv: str
-    measure: Callable[[Any, TaskName], Iterable[Row]]  # called with the flags and a task
+    measure: Callable[[Any, Any], Iterable[Row]]  # called with the flags, and a task or a checkpoint
     key: tuple[str, ...]  # columns in which a new row and the one that it replaces agree
     table: str = ""  # its name in a page
     page: str = ""
     shown: Callable[[list[dict[str, str]]], Sequence[Row]] = list  # what the page shows of the rows
+    everywhere: bool = False  # one table for all machines
 
 
 def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
-    """All rows of a part's csv file; those of the tasks asked for are measured, and each is kept at once."""
-    for env in () if args.draw_only else args.env:
-        for row in part.measure(args, env):
+    """All rows of a part's csv file, by their tasks; each of those asked for is kept as soon as it is measured."""
+    for case in args.measured:
+        for row in part.measure(args, case):
             args.keep(part.csv, row, part.key)
-    rows = sorted(args.read(part.csv), key=lambda row: LEARNT.index(row["task"].split()[0]))
-    args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
+    order: dict[str, int] = {name: place for place, name in enumerate(LEARNT)}
+    rows = sorted(args.read(part.csv), key=lambda row: order.get(row.get("task", "").partition(" ")[0], 0))
+    args.publish(part.table, tables.markdown(part.shown(rows)), part.page, part.everywhere)
     return rows
 
 

@@ -6,8 +6,9 @@
     python benchmarks/gps_experiments.py --list           a command for each plan, and for each run, to run side by side
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
 
-What follows "--" goes to gps.py. Writes gps_runs.csv (every iteration of all runs), gps_generalisation.csv (controllers
-from perturbed starts and under pushes), the table of gps.md, and pictures of the paper's Figures 2 and 3.
+Cases, plans and the suite of docs/gps.md are in cases.json; what follows "--" goes to gps.py. Writes gps_runs.csv
+(every iteration of all runs), gps_generalisation.csv (controllers from perturbed starts and under pushes), the table of
+gps.md, and pictures of the paper's Figures 2 and 3.
 """
 
 from __future__ import annotations
@@ -38,66 +39,11 @@ import gps
 from diffsim.planning import REAL, nearest_feedback
 from diffsim.training import checkpoint, command, fail, load_policy, parse_penalty
 
-# What a run is called, and its flags: the paper's algorithm and Figure 2's variants of it, feedback, and parts of it
-CASES = {"full": "--variant full --perturb 0"} | {name: f"--case {name}" for name in VARIANTS}
-CASES |= {"adaptive": "--variant full --perturb 0 --adaptive 10 --adaptive-iterations 10"}
-CASES |= {"full-80": "--variant full --perturb 0"}  # on a GPU
-CASES |= {"feedback": "--variant feedback --perturb 0", "feedback-start": "--variant feedback"}
-CASES |= {"feedback-short": "--variant feedback --perturb 0 --horizon 160"}
-CASES |= {"feedback-few": "--variant feedback --perturb 0 --samples 4 --guiding-samples 10 --active 40"}
-CASES |= {"feedback-long": "--variant feedback --samples 20 --active 120"}  # on a GPU
-# On which ground the walker trains: one slope, as in Figure 3; rough ground, as in Figure 4; many terrains, with a
-# guide each, and random ones of their kinds; without the random ones; without guides but that of level ground
-SLOPES = "level incline:10 incline:-10 incline:5 incline:-5 step:5 step:-5"
-ROUGH = "rough:10:1:1 rough:10:1:2 rough:10:2:1 rough:10:2:2"
-RANDOM = "--practice incline:12 step:7 rough:12:1 rough:12:2"
-GROUNDS = {"slope": "--terrain incline:10", "rough": f"--terrain {ROUGH} --practice rough:12:1 rough:12:2"}
-GROUNDS |= {"terrain": f"--terrain {SLOPES} {ROUGH} {RANDOM}"}
-GROUNDS |= {"guides": f"--terrain {SLOPES} {ROUGH}", "practice": RANDOM}
-MORE = "--horizon 160 --guiding-samples 44 --samples 40 --active 160"
-CASES |= {f"feedback-{name}": f"--variant feedback {MORE} {flags}" for name, flags in GROUNDS.items()}
-FIVE, THREE, TWO, ONE = (1, 2, 3, 4, 5), (1, 2, 3), (1, 2), (1,)
-OTHERS = "unregularized nonguided restart single-example dagger"
-HOPPER, WALKER, SWIMMER = (
-    f"--demonstration benchmarks/plans/{name}_500.npz" for name in ("hopper", "walker", "swimmer")
-)
-BRIEF, LONGER = "--ilqr-iterations 2", "--ilqr-iterations 40"
-TERRAIN = f"--demonstration benchmarks/plans/walker_terrain_160.npz {BRIEF} --imitation 23 --iterations 26"
-PLANS = {  # of benchmarks/plans/: runs of gps.py that write such a plan.npz; see results/README.md for the others
-    "hopper_500": "--env hopper --window 50 --restarts 8 --seed 2 --iterations 1",
-    "walker_500": "--env walker --restarts 8 --ilqr-iterations 40 --iterations 1",
-    "walker_terrain_160": f"--env walker --horizon 160 --terrain {SLOPES} {ROUGH} {WALKER} --ilqr-iterations 20 "
-    "--samples 11 --iterations 1",
-}
-# What docs/gps.md shows, per task: cases, seeds, flags. Other seeds run as the first of their case
-SUITE: dict[str, list[tuple[str, tuple[int, ...], str]]] = {
-    "cartpole": [
-        ("full", FIVE, "--iterations 24"),
-        (f"{OTHERS} policy-gradient", THREE, "--iterations 24"),
-    ],
-    "hopper": [
-        ("feedback", FIVE, f"{HOPPER} {BRIEF} --imitation 14 --iterations 19"),
-        ("feedback-few", TWO, f"{HOPPER} {BRIEF} --imitation 16 --iterations 22"),
-        (f"full {OTHERS}", THREE, f"{HOPPER} {LONGER} --iterations 25"),
-        ("policy-gradient", THREE, f"{HOPPER} {LONGER} --iterations 40"),
-        ("full-80", ONE, f"{HOPPER} {BRIEF} --iterations 80 --device cuda"),
-        ("feedback-start", TWO, f"{HOPPER} {BRIEF} --imitation 14 --iterations 19"),
-    ],
-    "walker": [
-        ("feedback", FIVE, f"{WALKER} {BRIEF} --imitation 28 --iterations 31"),
-        ("feedback-short", FIVE, f"{WALKER} {BRIEF} --imitation 24 --iterations 34"),
-        (f"full {OTHERS} policy-gradient adaptive", THREE, f"{WALKER} {BRIEF} --horizon 160 --iterations 24"),
-        ("feedback-long", FIVE, f"{WALKER} {BRIEF} --imitation 60 --iterations 90 --device cuda"),
-        ("feedback-start", TWO, f"{WALKER} {BRIEF} --horizon 160 --imitation 24 --iterations 34"),
-        ("feedback-terrain", FIVE, TERRAIN),
-        ("feedback-slope feedback-rough feedback-guides feedback-practice", TWO, TERRAIN),
-    ],
-    "swimmer": [
-        ("feedback", (1,), f"{SWIMMER} {BRIEF} --horizon 160 --hidden 200 --imitation 20 --iterations 24"),
-        ("feedback", (2,), f"{SWIMMER} {BRIEF} --horizon 160 --hidden 100 --noise 0.03 --imitation 20 --iterations 24"),
-        ("feedback-start", TWO, f"{SWIMMER} {BRIEF} --horizon 160 --iterations 24"),
-    ],
-}
+GPS = json.loads((ROOT / "benchmarks" / "cases.json").read_text())["gps"]
+CASES: dict[str, str] = GPS["cases"]  # what a run is called, and its flags
+PLANS: dict[str, str] = GPS["plans"]  # runs of gps.py that write a plan of benchmarks/plans/; others: results/README.md
+# What docs/gps.md shows, per task: cases, seeds, flags. Other seeds run as the first of their case.
+SUITE: dict[str, list[tuple[str, list[int], str]]] = GPS["suite"]
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
@@ -186,11 +132,11 @@ def jobs(args: Args) -> dict[str, list[str]]:
     """The flags of each run, by its name."""
     result = {}
     for env in args.env:
-        suite = SUITE.get(env, [("full", ONE, "--iterations 30")])
+        suite = SUITE.get(env, [("full", [1], "--iterations 30")])
         known = {(case, seed): flags for cases, seeds, flags in suite for case in cases.split() for seed in seeds}
         default, first = suite[0][2], {case: flags for cases, _, flags in reversed(suite) for case in cases.split()}
         for case in args.cases or dict.fromkeys(case for case, _ in known):
-            for seed in args.seeds or [seed for own, seed in known if own == case] or ONE:
+            for seed in args.seeds or [seed for own, seed in known if own == case] or [1]:
                 flags = known.get((case, seed), first.get(case, default))
                 result[f"{env}__{case}__{seed}"] = [*flags.split(), *args.arguments]
     return result

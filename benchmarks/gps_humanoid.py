@@ -15,9 +15,9 @@ from pathlib import Path
 from statistics import mean
 
 import torch
-from common import CheckpointFlags, checkpoint_of, run
+from common import CheckpointFlags, Part, checkpoint_of, measured, run
 from gps_experiments import CONTROLLERS, RUN, Act, controllers, environment, grouped, load_search
-from tables import Row, digits, markdown
+from tables import Row
 from torch import Tensor
 
 import gps
@@ -51,8 +51,9 @@ def noisy(act: Act, noise: Tensor) -> Act:
     return lambda t, x: act(t, x) + noise[:, t]
 
 
-def measure(path: Path) -> Iterator[Row]:
+def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:
     """One row for each case, size and controller."""
+    path = checkpoint_of(path)
     about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
     level, policy, guide = System(env, 1), search.network, search.guides[0]
     T = min(round(SECONDS / level.control_dt), search.args.horizon)
@@ -88,11 +89,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def main(args: CheckpointFlags) -> None:
-    for path in args.measured:
-        for row in measure(checkpoint_of(path)):
-            print(", ".join(digits(value) for value in row.values()), flush=True)
-            args.merge("gps_humanoid", [row], KEY)
-    args.publish("gps humanoid", markdown(table(args.read("gps_humanoid"))), "gps_terrain.md", everywhere=True)
+    measured(args, Part("gps_humanoid", measure, KEY, "gps humanoid", "gps_terrain.md", table, everywhere=True))
 
 
 if __name__ == "__main__":

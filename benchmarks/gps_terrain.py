@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
-from common import CheckpointFlags, checkpoint_of, run
+from common import CheckpointFlags, Part, checkpoint_of, measured, run
 from gps_experiments import RUN, controllers, environment, load_search
-from tables import Row, digits, markdown
+from tables import Row
 from torch import Tensor
 
 from diffsim.planning import System
@@ -64,8 +64,9 @@ def until_fall(x: Tensor, height: int) -> tuple[Tensor, Tensor]:
     return up[..., -1].bool(), (x[..., 0].gather(-1, last) - x[..., :1, 0]).squeeze(-1)
 
 
-def measure(path: Path) -> Iterator[Row]:
+def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:
     """One row for each terrain, size and controller."""
+    path = checkpoint_of(path)
     about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
     steps, height, guides = search.args.horizon, 2 if search.system.scene.floating else 1, search.guide_return[0]
     way = mean((guide.x[-1, 0] - guide.x[0, 0]).item() for guide in search.guides)
@@ -84,7 +85,8 @@ def measure(path: Path) -> Iterator[Row]:
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A row for each terrain, a column for the policies trained on each ground, and two for the last one's guides."""
+    """A row for each terrain, a column for the walkers trained on each ground, and two for the last one's guides."""
+    rows = [row for row in rows if row["env"] == "walker"]
     cases = [case for case in GROUNDS if any(row["variant"] == case for row in rows)]
     columns = {GROUNDS[case]: (case, "policy") for case in cases}
     columns |= {name.upper(): (cases[-1], name) for name in ("ddp", "tbdp") if cases}
@@ -101,12 +103,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def main(args: CheckpointFlags) -> None:
-    for path in args.measured:
-        for row in measure(checkpoint_of(path)):
-            print(", ".join(digits(value) for value in row.values()), flush=True)
-            args.merge("gps_terrain", [row], KEY)
-    rows = [row for row in args.read("gps_terrain") if row["env"] == "walker"]
-    args.publish("gps terrain", markdown(table(rows)), "gps_terrain.md")
+    measured(args, Part("gps_terrain", measure, KEY, "gps terrain", "gps_terrain.md", table))
 
 
 if __name__ == "__main__":

@@ -10,13 +10,14 @@ ones geometrically, as --anneal takes them, and on to four times those. Writes g
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import common
 import torch
-from common import Line, Panel, parse, plot
-from tables import markdown
+from common import Line, Panel, Part, measured, plot, run
+from tables import Row
 from torch import Tensor
 
 import diffsim
@@ -83,8 +84,8 @@ def agreement(gradients: Tensor) -> float:
     return float((cosines.sum() - cosines.trace()) / (len(unit) * (len(unit) - 1)))
 
 
-def measure(path: Path, args: Args) -> None:
-    """Rows of one policy, each in the csv as soon as it is measured."""
+def measure(args: Args, path: Path) -> Iterator[Row]:
+    """Rows of one policy."""
     case = common.load_case(path, 1, "cpu")
     task = case.env.task.name
     if "contact" not in case.env.scene.features:
@@ -103,7 +104,7 @@ def measure(path: Path, args: Args) -> None:
             env.sim.factors.copy_(factors)
             each, groups = window_gradients(env, case.saved.network, horizon, args)
             norms = each.flatten(1).norm(dim=1)
-            row = {
+            yield {
                 "task": task,
                 "learner": case.saved.script,
                 "horizon": horizon,
@@ -115,16 +116,19 @@ def measure(path: Path, args: Args) -> None:
                 "cosine": agreement(groups),
                 "environments": args.num_envs,
             }
-            print("  " + ", ".join(f"{column} {value}" for column, value in row.items()), flush=True)
-            args.merge("gradients", [row], KEY)
+
+
+def shown(rows: list[dict[str, str]]) -> list[Row]:
+    """What the page has of the rows."""
+    ends, columns = {"soft", "firm", f"{FIRMER:g} x firm"}, ("task", "horizon", "ground", *COLUMNS)
+    own = (row for row in rows if row["ground"] in ends and row["horizon"] in ("8", "32"))
+    return [{name: row[name] for name in columns} for row in own]
 
 
 def main(args: Args) -> None:
     if args.num_envs % GROUPS:
         fail(f"--num-envs {args.num_envs} is not a multiple of {GROUPS}, the groups that are compared")
-    for path in args.measured:
-        measure(path, args)
-    rows = args.read("gradients")
+    rows = measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
     tasks = [name for name in common.TASKS if any(row["task"] == name for row in rows)]
     grid = list[list[Panel]]()
     for column, (text, log) in COLUMNS.items():
@@ -139,11 +143,7 @@ def main(args: Args) -> None:
         grid.append(panels)
     if tasks:
         plot(args.picture("gradients"), grid)
-    ends = {"soft", "firm", f"{FIRMER:g} x firm"}
-    shown = [row for row in rows if row["ground"] in ends and row["horizon"] in ("8", "32")]
-    columns = ("task", "horizon", "ground", *COLUMNS)
-    args.publish("gradients", markdown(shown, columns), "transfer.md")
 
 
 if __name__ == "__main__":
-    main(parse(Args, __doc__))
+    run(main, Args, __doc__)

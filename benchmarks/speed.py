@@ -194,7 +194,7 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
                 "task": name,
                 "environments": num_envs,
                 "scene": scene_name,
-                "kernel": kernel,
+                "kernel": kind,
                 "device": place,
             }
             row |= {f"{what} (us/substep)": microseconds / per_substep for what, microseconds in t.items()}

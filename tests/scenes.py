@@ -130,9 +130,8 @@ CONSTANTS = {"k_n": 4e3, "k_d": 4e3, "k_t": 300, "mu": 0.6, "k_limit": 300, "d_l
 MUSCLES = {"gluteus": (400, 0.18), "hamstring": (300, 0.52), "iliacus": (250, 0.55), "zigzag": (100, 1.1)}  # N, m
 
 
-@cache
-def leg_scene(model: str, grounded: bool = False) -> Scene:
-    """With MuJoCo's <muscle> if "hill"; if "linear" with the same forces as plain actuators."""
+def leg(model: str, grounded: bool = False) -> str:
+    """Its MJCF with MuJoCo's <muscle> if "hill"; if "linear" with the same forces as plain actuators."""
     actuators = ['<motor joint="knee" gear="7"/>'] * (len(MUSCLES) + 1)
     for n, (name, (force, length)) in enumerate(MUSCLES.items()):
         if model == "hill":
@@ -143,7 +142,12 @@ def leg_scene(model: str, grounded: bool = False) -> Scene:
         actuators[n + (n >= 2)] = muscle
     custom = f'<text name="muscle_model" data="{model}"/>'
     custom += "".join(f'<numeric name="{name}" data="{value}"/>' for name, value in CONSTANTS.items() if grounded)
-    return parse((GROUNDED if grounded else LEG).format(custom=custom, actuators="".join(actuators)))
+    return (GROUNDED if grounded else LEG).format(custom=custom, actuators="".join(actuators))
+
+
+@cache
+def leg_scene(model: str, grounded: bool = False) -> Scene:
+    return parse(leg(model, grounded))
 
 
 def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
@@ -155,12 +159,11 @@ def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple
 
 
 def varied_robot(name: str, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
-    """A robot for the factors, all of which matter in its states: "linear" and "hill" legs, "planar" tree, "hopper"."""
+    """A robot for the factors, all of which matter in its states: "linear" and "hill" legs, "hopper"."""
     if name == "hopper":
         scene = task_scene(name).with_penalty({"d_limit": 500.0})
         return scene, acting_states(scene, count, rng)
-    scene = tree_scene("planar", 0) if name == "planar" else leg_scene(name, grounded=True)
-    return grounded_states(scene, count, rng)
+    return grounded_states(leg_scene(name, grounded=True), count, rng)
 
 
 # A pendulum on a cart that is pulled from the wall.

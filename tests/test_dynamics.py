@@ -73,8 +73,8 @@ def mujoco_acceleration(scene, qpos, qvel, ctrl, forces=None):
     return qacc
 
 
-def check_against_mujoco(scene, dtype, rng):
-    states = [torch.as_tensor(x).to(dtype).double().numpy() for x in free_states(scene, 64, rng)]
+def check_against_mujoco(scene, dtype, rng, count=64):
+    states = [torch.as_tensor(x).to(dtype).double().numpy() for x in free_states(scene, count, rng)]
     qacc = acceleration(without_ground(scene), *states, dtype=dtype)
     tolerance = {torch.float64: 1e-10, torch.float32: 1e-4}[dtype]
     assert relative_error(qacc, mujoco_acceleration(scene, *states)) < tolerance
@@ -83,7 +83,9 @@ def check_against_mujoco(scene, dtype, rng):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_task_accelerations_are_mujocos(name, dtype, rng):
-    check_against_mujoco(task_scene(name), dtype, rng)
+    """In float32 in blocks of 16 or of 8, of which other tests compile the kernels."""
+    large = dtype == torch.float64 or name in ("hopper", "ant", "swimmer")
+    check_against_mujoco(task_scene(name), dtype, rng, 64 if large else 15)
 
 
 @pytest.mark.parametrize("base, seed", TREES)
@@ -249,14 +251,14 @@ def test_free_flight_keeps_momentum_and_energy_to_first_order(base, rng):
 def test_motion_is_the_same_far_from_the_origin(name, rng):
     """Horizontally, 10 km away: the position is rounded to float32's spacing there, nothing else notices."""
     scene, steps, substeps = task_scene(name), 4, 16
-    qpos, qvel, ctrl = acting_states(scene, 8, rng)
+    qpos, qvel, ctrl = acting_states(scene, 16, rng)
     horizontal = [0, 1] if scene.floating else [0]
     weights = [torch.tensor(rng.normal(size=x.shape), dtype=torch.float32) for x in (qpos, qvel)]
 
     def motion(place):
         qpos[:, horizontal] = place
         inputs = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (qpos, qvel, ctrl)]
-        sim = Simulator(scene, 8, Integration(substeps=substeps), horizon=steps)
+        sim = Simulator(scene, 16, Integration(substeps=substeps), horizon=steps)
         q, v, u = inputs
         for _ in range(steps):
             q, v = sim.step(q, v, u)

@@ -37,7 +37,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 
 def test_own_robot() -> None:
-    first, last = load("own_robot").train(iterations=3, num_envs=4)
+    first, last = load("own_robot").train(iterations=3, num_envs=16)
     assert first.returns.isfinite().all() and (last.returns != first.returns).any()
     assert (last.lengths == 300).all()
 
@@ -49,7 +49,7 @@ def test_trajectory_optimisation() -> None:
 
 
 def test_learned_controller() -> None:
-    distances = load("learned_controller").train(num_envs=8, iterations=35)
+    distances = load("learned_controller").train(num_envs=16, iterations=35)
     assert np.mean(distances[-5:]) < 0.3 * np.mean(distances[:5])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import task_scene
+from scenes import leg, parse
 
 import diffsim
 from diffsim.kernels.backward import backward_kernel
@@ -19,48 +20,40 @@ from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
 from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
-from diffsim.sim.launcher import default_division
 from diffsim.sim.simulator import Simulator
 from diffsim.terrain import rough
 
 HORIZON = 32
+KNEE = '<joint name="knee"'
 
 
-def compiled(module: wp.Module, arch: int) -> Path:
-    """The folder with a module's source and binary; kept beside Warp's own cache, since to compile takes seconds."""
+def compiled(module: wp.Module, arch: int) -> str:
+    """A module's source once it is compiled to PTX; both stay beside Warp's own cache, since that takes seconds."""
     wp.init()
     folder = Path(wp.config.kernel_cache_dir) / f"sm{arch}"
     result = folder / module.get_module_identifier()
     if not result.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder) as temporary:
-            wp.compile_aot_module(module, device=None, arch=arch, module_dir=f"{temporary}/new")
+            wp.compile_aot_module(module, device=None, arch=arch, module_dir=f"{temporary}/new", use_ptx=True)
             os.replace(f"{temporary}/new", result)
-    return result
+    assert any(path.stat().st_size > 10_000 for path in result.glob("*.ptx"))
+    (source,) = result.glob("*.cu")
+    return source.read_text()
 
 
-# With the ant below these have every feature of a kernel.
-@pytest.mark.parametrize("name", ["humanoid_mtu", "swimmer"])
-def test_kernels_compile_for_a_gpu_without_one(name: str) -> None:
-    """And they hold no code for what the scene lacks."""
-    scene = task_scene(name)
-    spec = kernel_spec(scene, default_division(scene, 64), wp.float32, implicit=False, env_last=True)
-    functions = {"add_pull": "muscle", "measure": "hill", "place_balls": "ball", "sphere_state": "contact"}
-    functions["drag_wrench"] = "drag"
+def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
+    """A leg whose knee slides, too, in a fluid and on terrain, with factors and forces; threads share its limb."""
+    text = leg("hill", grounded=True).replace(KNEE, f'<joint type="slide" axis="0 0 1"/> {KNEE}')
+    scene = dataclasses.replace(parse(text).with_terrain(rough(0)), density=1.0)
+    kind = dict(implicit=True, env_last=True, varied=True, forced=True)
+    spec = kernel_spec(scene, divide(scene, 8, 4), wp.float32, **kind)
+    everything = "floating hinge slide ball contact terrain limit stiffness damping motor muscle hill drag"
+    assert spec.features == {*everything.split()}
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
-        directory = compiled(kernel.module, arch=90)
-        assert any(path.stat().st_size > 10_000 for path in (*directory.glob("*.cubin"), *directory.glob("*.ptx")))
-        (source,) = directory.glob("*.cu")
-        code = source.read_text()
-        for function, feature in functions.items():
-            assert (function in code) == (feature in scene.features), function
-
-
-def test_kernels_with_factors_forces_and_terrain_compile_for_a_gpu_without_one() -> None:
-    scene = task_scene("ant").with_terrain(rough(0))
-    spec = kernel_spec(scene, divide(scene, 4), wp.float32, implicit=True, env_last=True, varied=True, forced=True)
-    for kernel in (forward_kernel(spec), backward_kernel(spec)):
-        compiled(kernel.module, arch=90)
+        source = compiled(kernel.module, arch=90)
+        for function in ("add_pull", "measure", "place_balls", "sphere_on_terrain", "drag_wrench", "add_forces"):
+            assert function in source, function
 
 
 def episode(

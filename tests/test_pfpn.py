@@ -166,8 +166,8 @@ def head(*arguments: str) -> tuple[pfpn.Head, pfpn.Resampling, ClippedAdam, Tens
             parameter += 0.3 * torch.randn_like(parameter)
     resampling, optimizer = pfpn.Resampling(args, own).double(), ClippedAdam(own, 1.0, lr=1e-3)
     features = torch.randn(50, 4, dtype=torch.float64)
-    first, second = torch.randn_like(optimizer.vector), torch.rand_like(optimizer.vector)
-    optimizer.adam.state[optimizer.vector] = {"step": torch.tensor(1.0), "exp_avg": first, "exp_avg_sq": second}
+    optimizer.exp_avg.normal_()
+    optimizer.exp_avg_sq.uniform_()
     return own, resampling, optimizer, features
 
 
@@ -266,7 +266,7 @@ def test_nothing_is_moved(case: str, flags: str, dead: int) -> None:
         kill(own, DEAD)
     if case != "nothing recorded":
         moving.record(own(features))
-    state = [*own.parameters(), *optimizer.adam.state[optimizer.vector].values()]
+    state = [*own.parameters(), optimizer.exp_avg, optimizer.exp_avg_sq]
     before = [x.clone() for x in state]
     metrics = moving.end_iteration(own, optimizer)
     assert all(torch.equal(x, was) for x, was in zip(state, before, strict=True))

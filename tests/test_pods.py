@@ -21,7 +21,7 @@ from diffsim.sim.simulator import Simulator
 from diffsim.training import export_policy, parse
 
 SMALL = (
-    "--env cartpole --num-envs 3 --horizon 80 --iterations 6 --candidates 4 --batch-size 100 --hidden 16 --device cpu "
+    "--env cartpole --num-envs 3 --horizon 80 --iterations 6 --candidates 2 --batch-size 100 --hidden 16 --device cpu "
     "--eval-every 4 --eval-episodes 2 --threads 1 --quiet"
 ).split()
 
@@ -251,7 +251,7 @@ def test_a_run_resumes_bitwise(order: list[str], tmp_path: Path) -> None:
         assert_same(part[name], whole[name])
     rows = read_progress(tmp_path / "part")
     assert whole["control_steps"] == int(rows[-1]["control_steps"])
-    count = 3 * 80 * (1 + 1 + (4 if not order else 4 + 11))
+    count = 3 * 80 * (1 + 1 + (2 if not order else 4 + 11))
     assert [int(row["control_steps"]) for row in rows] == [count * (k + 1) for k in range(len(rows))]
     assert [row["length"] for row in rows] == ["", "", *["240.0"] * (len(rows) - 2)]
     assert all(float(row["pods_improved_return"]) >= float(row["pods_return"]) for row in rows)
@@ -259,7 +259,7 @@ def test_a_run_resumes_bitwise(order: list[str], tmp_path: Path) -> None:
 
 def test_first_order_learns_to_swing(tmp_path: Path) -> None:
     """A wrong sign gets worse, and without imitation nothing changes."""
-    flags = "--env cartpole --num-envs 16 --iterations 12 --candidates 6 --eval-every 0 --eval-episodes 8 --quiet"
+    flags = "--env cartpole --num-envs 16 --iterations 12 --candidates 6 --eval-every 0 --eval-episodes 16 --quiet"
     run(pods, tmp_path, *flags.split())
     rows = read_progress(tmp_path)
     assert float(rows[0]["return"]) < -2200 and float(rows[-1]["eval_return"]) > -2000

@@ -134,7 +134,6 @@ def test_learning_rates_decay_linearly() -> None:
         left = (11 - iteration) / 10
         assert learner.actor_optimizer.lr.item() == pytest.approx(1e-5 + (1e-2 - 1e-5) * left)
         assert learner.critic_optimizer.lr.item() == pytest.approx(1e-5 + (5e-4 - 1e-5) * left)
-        assert learner.actor_optimizer.adam.param_groups[0]["lr"] is learner.actor_optimizer.lr
 
 
 @pytest.mark.parametrize(
@@ -178,7 +177,7 @@ def test_without_critic_only_the_rewards_of_the_window_count(tmp_path: Path, mon
     monkeypatch.setattr(shac, "actor_loss", recorded)
     without = run(shac, tmp_path / "without", *SMALL["shac"], "--no-critic", "--stop-after", 2)["modules"]
     assert len(next_values) == 2 and not any(value.any() for value in next_values)
-    assert not without["critic_optimizer"]["adam"]  # never stepped
+    assert not without["critic_optimizer"]["adam"][0]["step"]
     assert_same(without["critic"], without["target"])
     run(shac, tmp_path / "with", *SMALL["shac"], "--stop-after", 1)
     assert next_values[2].any()

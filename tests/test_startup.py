@@ -28,9 +28,20 @@ assert len(results) == 4 and results == results[:1] * 4
 print(results[0])
 """
 
+# After which MuJoCo warns of a huge number.
+DIVERGE = """
+import mujoco
+model = diffsim.make("cartpole").scene.mj_model
+data = mujoco.MjData(model)
+data.qpos[:] = 1e20
+mujoco.mj_step(model, data)
+"""
+
 
 def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Where MUJOCO_GL names an OpenGL that may not be there: nothing is drawn."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(folder / "kernels")}
+    environment["MUJOCO_GL"] = "osmesa"
     folder = folder / "here"
     folder.mkdir(exist_ok=True)
     command = [sys.executable, "-c", program]
@@ -38,25 +49,30 @@ def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_threads_may_take_first_steps_and_a_damaged_cache_is_compiled_anew(tmp_path: Path) -> None:
+    """Only a compilation is announced, and MuJoCo's warnings go to stderr instead of a file in the user's folder."""
     first = run(THREADS, tmp_path)
     assert first.stderr == "compiling kernels for cartpole (once, about 10 s) ...\n"
-    assert run(THREADS, tmp_path).stdout == first.stdout
+    second = run(THREADS + DIVERGE, tmp_path)
+    assert second.stdout == first.stdout and second.stdout.count("\n") == 1
+    assert second.stderr.startswith("MuJoCo: Nan, Inf or huge value") and second.stderr.count("\n") == 1
     modules = sorted(tmp_path.glob("kernels/**/wp_*.o"))
     assert len(modules) == 2
     os.truncate(modules[0], 2000)
     modules[1].with_name(modules[1].name.partition(".")[0] + ".meta").write_text("{")
     again = run(THREADS, tmp_path)
     assert again.stdout == first.stdout and "compiling kernels for cartpole" in again.stderr
-
-
-def test_mujocos_warnings_leave_no_file(tmp_path: Path) -> None:
-    mujocos_warning = """
-import diffsim, mujoco
-model = diffsim.load_scene(f"{diffsim.__path__[0]}/assets/cartpole.xml").mj_model
-data = mujoco.MjData(model)
-data.qpos[:] = 1e20
-mujoco.mj_step(model, data)
-"""
-    result = run(mujocos_warning, tmp_path)
-    assert "MuJoCo: Nan, Inf or huge value" in result.stderr
     assert not list((tmp_path / "here").iterdir())
+
+
+def test_a_training_starts_without_pytorchs_compiler(tmp_path: Path) -> None:
+    """It takes 1.2 s to import, and torch.optim would. Nor are the environments of evaluations made before they run."""
+    program = """
+import gc, sys, shac, warp
+warp.config.optimization_level = 0
+assert gc.isenabled()
+arguments = "--env cartpole --num-envs 2 --horizon 4 --iterations 2 --stop-after 1 --eval-episodes 2 --quiet"
+shac.Run.eval_env = None
+shac.main([*arguments.split(), "--device", "cpu", "--run-dir", "run"])
+print([name for name in ("torch._dynamo", "sympy") if name in sys.modules])
+"""
+    assert run(program, tmp_path).stdout.splitlines()[-1] == "[]"

@@ -58,7 +58,7 @@ def test_substeps_are_those_of_the_training_unless_given(tiny_run: Path) -> None
         ("{run} --web {new}/a.html --seconds 0", "--seconds, --episodes, --substeps and --size must be positive"),
         ("{run} {run} --web {new}/a.html", "--video, --web and --viewer show one checkpoint; several are for --plot"),
         ("{run} --viewer --web {new}/a.html", "--viewer goes without --video and --web"),
-        ("{run} --web {run}/progress.csv/a.html", "File exists"),
+        ("{run} --episodes 3 --web {run}/progress.csv/a.html", "File exists"),
         ("{new} --plot {new}/a.png", "no such file: {new}/progress.csv; --plot takes directories of runs"),
         ("{run} --plot {new}/a.xyz", "xyz"),
         ("{run} --viewer", "--viewer: display :77 does not answer; --web and --video need none"),
@@ -95,7 +95,8 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, hard))
         with pytest.raises(SystemExit) as exit:
-            view.main([str(tiny_run), *flags.format(tmp_path).split(), "--seconds", "0.5", "--size", "64", "48"])
+            options = [*"--episodes 3 --seconds 0.5 --size 64 48".split(), *flags.format(tmp_path).split()]
+            view.main([str(tiny_run), *options])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     error = capsys.readouterr().err

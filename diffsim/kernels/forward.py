@@ -1,6 +1,6 @@
 """One control step: all substeps of all environments in one launch.
 
-An environment has one thread or, on a GPU, several (lanes.py); no thread serves two.
+On a GPU an environment has one thread or several (lanes.py). On a CPU one thread serves a block of them (wide.py).
 
 A substep is Featherstone's articulated-body algorithm (RBDA, Table 7.1) about the carrier's current position in world
 axes, then semi-implicit Euler with the exact quaternion exponential. Its factorisation (U and 1/d of each joint, the

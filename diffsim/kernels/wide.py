@@ -83,6 +83,8 @@ def module_options(spec: KernelSpec) -> dict[str, Any]:
     """Warp's options of a kernel's module."""
     # On the CPU unrolling buys no speed and costs a second of compilation; a GPU keeps small matrices in registers.
     options: dict[str, Any] = {"enable_backward": False, "max_unroll": 6 if spec.env_last else 1}
+    if not spec.env_last:
+        options["block_dim"] = 1  # as Warp launches on a CPU: for its default of 256 it would hash the module once more
     if spec.block > 1:
         preamble = PREAMBLE.replace("BLOCK", str(spec.block))
         options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=preamble)

@@ -25,5 +25,6 @@ from diffsim.training.ranges import (
     SomeWidths,
     Widths,
 )
+from diffsim.training.regression import Regression
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run

@@ -113,7 +113,7 @@ class EnsembleAdam(ClippedAdam):
         self.members, self.tied = members, tied
         super().__init__(module, max_norm, betas, skip_norm=skip_norm)
 
-    def _flatten(self, tensors: Sequence[Tensor]) -> Tensor:
+    def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
         """(networks, members, P)"""
         return torch.cat([tensor.reshape(-1, self.members, tensor[0].numel()) for tensor in tensors], dim=-1)
 
@@ -126,18 +126,17 @@ class EnsembleAdam(ClippedAdam):
 
     def step(self, loss: Tensor) -> Tensor:
         """One descent step of each; returns the gradients' largest norm () before clipping."""
-        gradient = distributed.average(self._flatten(torch.autograd.grad(loss, self.parameters)))
+        gradient = distributed.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
         if self.tied is not None:
             gradient = torch.where(self.tied > 0, gradient.mean(1, keepdim=True), gradient)
         norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
         good = norm < self.skip_norm
-        self.vector.grad = torch.where(good, gradient / (norm / self.max_norm).clamp(min=1.0), 0.0)
-        self.adam.step()
+        self.step_count += 1
+        self._update(torch.where(good, gradient / (norm / self.max_norm).clamp(min=1.0), 0.0))
         self.skipped += (~good).sum()
         return norm.max()
 
     def tie(self, member: int) -> None:
         """Give all members the weights and moments of one."""
-        for tensor in (self.vector, *self.adam.state[self.vector].values()):
-            if tensor.shape == self.vector.shape:
-                tensor.copy_(tensor[:, member : member + 1].clone().expand_as(tensor))
+        for tensor in (self.vector, self.exp_avg, self.exp_avg_sq):
+            tensor.copy_(tensor[:, member : member + 1].clone().expand_as(tensor))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import re
 import sys
@@ -48,6 +49,8 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
     @functools.wraps(main)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         report, threading.excepthook = threading.excepthook, _report_in_thread
+        if main.__module__ == "__main__":
+            gc.freeze()  # what a script has imported stays: the collector need not look through it
         try:
             main(*args, **kwargs)
         except BrokenPipeError:

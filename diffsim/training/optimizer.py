@@ -10,27 +10,26 @@ from torch import Tensor, nn
 
 from diffsim.training import distributed
 
-
-class ScaledAdam(torch.optim.Adam):
-    """Fused Adam with GradScaler's hooks: it divides by grad_scale and, where found_inf is 1, changes nothing."""
-
-    grad_scale: Tensor | None = None
-    found_inf: Tensor | None = None
+PLAIN: dict[str, Any] = dict(weight_decay=0.0, eps=1e-8, amsgrad=False, maximize=False)  # torch.optim.Adam's defaults
 
 
 class ClippedAdam:
     """Adam on the gradient, averaged over the ranks and clipped to a norm; bad gradients are counted and skipped.
 
     The module's parameters become views of one vector, so a step is a dozen operations for any network; none of them
-    waits for the device, so a step can be captured into a CUDA graph.
+    waits for the device, so a step can be captured into a CUDA graph. The update is torch's own fused kernel. It is
+    called here because torch.optim.Adam costs three times its time on a CPU, and imports a compiler when it is made.
 
     Args:
         module: whose parameters that require a gradient are optimised.
         max_norm: to which gradients are clipped.
         betas: Adam's decay rates of the gradient's first and second moment.
+        lr: initial learning rate.
         skip_norm: a gradient whose norm is not below this, or not a number, is skipped.
 
     Attributes:
+        vector: the parameters, and `exp_avg` and `exp_avg_sq` of its shape their moments.
+        step_count: () how many steps were taken, a tensor like `lr`.
         lr: () the learning rate, a tensor: a captured graph reads its present value.
         skipped: () how many gradients were skipped.
     """
@@ -44,14 +43,14 @@ class ClippedAdam:
         skip_norm: float = 1e6,
     ) -> None:
         self.parameters = [p for p in module.parameters() if p.requires_grad]
-        self.vector = self._flatten(self.parameters).detach()
+        self.vector = self.flatten(self.parameters).detach()
         self._adopt(self.vector)
+        self.exp_avg, self.exp_avg_sq = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
         self.lr = torch.full((), lr, device=self.vector.device)
-        self.adam = ScaledAdam([self.vector], self.lr, betas, fused=True, capturable=self.vector.is_cuda)
-        self.max_norm, self.skip_norm = max_norm, skip_norm
-        self.skipped = torch.zeros_like(self.lr)
+        self.step_count, self.skipped = torch.zeros_like(self.lr), torch.zeros_like(self.lr)
+        self.betas, self.max_norm, self.skip_norm = betas, max_norm, skip_norm
 
-    def _flatten(self, tensors: Sequence[Tensor]) -> Tensor:
+    def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
         """All numbers in one tensor."""
         return torch.cat([tensor.flatten() for tensor in tensors])
 
@@ -61,35 +60,46 @@ class ClippedAdam:
 
     def step(self, loss: Tensor) -> Tensor:
         """One descent step; returns the gradient's norm () before clipping."""
-        gradients = torch.autograd.grad(loss, self.parameters)
-        self.vector.grad = distributed.average(self._flatten(gradients))
-        norm = torch.linalg.vector_norm(self.vector.grad)
-        bad = (~(norm < self.skip_norm)).to(norm.dtype)
-        self.adam.grad_scale = (norm / self.max_norm).clamp(min=1.0)
-        self.adam.found_inf = bad
-        self.adam.step()
+        return self.descend(self.flatten(torch.autograd.grad(loss, self.parameters)))
+
+    def descend(self, gradient: Tensor) -> Tensor:
+        """`step` along a gradient of the form of `vector`, which becomes the mean of all ranks'."""
+        gradient = distributed.average(gradient)
+        norm = torch.linalg.vector_norm(gradient)
+        good = norm < self.skip_norm
+        bad = (~good).to(norm.dtype)
+        self.step_count += good
+        self._update(gradient, grad_scale=(norm / self.max_norm).clamp(min=1.0), found_inf=bad)
         self.skipped += bad
         return norm
 
+    def _update(self, gradient: Tensor, **scaled: Any) -> None:
+        """Adam's update along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
+        state: Any = [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]
+        options: dict[str, Any] = dict(lr=self.lr, beta1=self.betas[0], beta2=self.betas[1]) | PLAIN | scaled
+        torch._fused_adam_([self.vector], [gradient], *state, **options)
+
     def moments(self, parameter: Tensor) -> list[Tensor]:
-        """Views of a parameter's moments (numel,), first and second; none before the first step."""
-        start, state = parameter.storage_offset(), self.adam.state[self.vector]
-        names = (name for name in ("exp_avg", "exp_avg_sq") if name in state)
-        return [state[name][start : start + parameter.numel()] for name in names]
+        """Views of a parameter's moments (numel,), first and second."""
+        start = parameter.storage_offset()
+        return [moment[start : start + parameter.numel()] for moment in (self.exp_avg, self.exp_avg_sq)]
+
+    def _state(self) -> dict[str, Tensor]:
+        return {"step": self.step_count, "exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq}
 
     def state_dict(self) -> dict[str, Any]:
         """The moments, the learning rate and the count; not what the constructor is given."""
-        return {"adam": self.adam.state_dict()["state"], "lr": self.lr, "skipped": self.skipped}
+        return {"adam": {0: self._state()}, "lr": self.lr, "skipped": self.skipped}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Raises a ValueError where moments are missing or of another shape."""
-        shapes = {name: value.shape for name, value in state["adam"].get(0, {}).items()}
-        shape = self.vector.shape
-        if shapes and shapes != {"step": torch.Size(()), "exp_avg": shape, "exp_avg_sq": shape}:
+        own = self._state()  # an earlier version saved none before the first step
+        saved = state["adam"].get(0, {name: torch.zeros_like(value) for name, value in own.items()})
+        if {name: value.shape for name, value in saved.items()} != {name: value.shape for name, value in own.items()}:
             raise ValueError("the state of an optimizer")
         if not bool(state["skipped"].isfinite()):
             raise ValueError("the count of skipped updates")
-        self.adam.load_state_dict(self.adam.state_dict() | {"state": state["adam"]})
-        self.adam.param_groups[0]["lr"] = self.lr  # not a copy of it
+        for name, value in own.items():
+            value.copy_(saved[name])
         self.lr.copy_(state["lr"])
         self.skipped.copy_(state["skipped"])

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -131,6 +132,8 @@ class Run:
         self._samples = num_envs * horizon
         seed = self.args.seed + distributed.rank() * RANK_SEED
         args, size = self.args, num_envs // distributed.size()
+        if args.eval_episodes > size:
+            self.eval_env.detach()  # makes them now: an error of what does not fit should not wait
         if not isinstance(args, ParallelFlags) or not (args.contact == "firm" or args.randomise):
             self._env = make_env(args, size, horizon, seed)
             return self._env
@@ -140,7 +143,9 @@ class Run:
         self._variation = Variation(self._env, start, parse_ranges(args.randomise), (begin, end), args.redraw, seed)
         return self._env
 
-    def make_eval_env(self) -> DiffEnv:
+    @cached_property
+    def eval_env(self) -> DiffEnv:
+        """The environments of evaluations, made when they are first needed."""
         return make_env(self.args, self.args.eval_episodes)
 
     def restore(self, learner: L) -> L:

@@ -149,11 +149,17 @@ def lower_quality(model: mujoco.MjModel) -> None:
     quality.numslices, quality.numstacks, quality.numquads = 16, 8, 1
 
 
+def activations(model: mujoco.MjModel, ctrl: ArrayLike) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """The tendons (m,) of a model's muscles, and their activation (..., m) in [0, 1] by ctrl (..., nu) in [-1, 1]."""
+    muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
+    force = np.asarray(ctrl, dtype=np.float64)[..., muscles].clip(-1, 1)
+    return model.actuator_trnid[muscles, 0], (force + 1) / 2
+
+
 def colour_muscles(model: mujoco.MjModel, ctrl: ArrayLike) -> None:
     """Colour the tendons of a model by the activation of their muscles, ctrl (nu,) in [-1, 1]."""
-    muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
-    force = (np.asarray(ctrl)[muscles, None].clip(-1, 1) + 1) / 2
-    model.tendon_rgba[model.actuator_trnid[muscles, 0]] = force * FULL_FORCE + (1 - force) * AT_REST
+    tendons, force = activations(model, ctrl)
+    model.tendon_rgba[tendons] = np.outer(force, FULL_FORCE) + np.outer(1 - force, AT_REST)
 
 
 def _camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera:

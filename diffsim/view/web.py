@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Scene
-from diffsim.view.render import GROUND, orbit, whole_file
+from diffsim.view.render import GROUND, activations, orbit, whole_file
 from diffsim.view.slabs import slabs
 
 MAX_BYTES = 700_000  # of poses; a longer motion keeps every second control step, or fewer
@@ -58,10 +58,8 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
     model, qpos = scene.mj_model, np.asarray(qpos, dtype=np.float64)
     stride = 1 + len(qpos) * model.nbody * 28 // MAX_BYTES
     poses, track = _poses(model, qpos[::stride])
-    muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
-    activation = np.zeros((len(poses), len(muscles)))
-    if ctrl is not None:
-        activation = (np.asarray(ctrl, dtype=np.float64)[::stride, muscles].clip(-1, 1) + 1) / 2
+    relaxed = np.full((len(qpos), model.nu), -1.0)
+    tendons, activation = activations(model, (relaxed if ctrl is None else np.asarray(ctrl))[::stride])
     planes, painted = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, model.geom_matid >= 0
     rgba = model.geom_rgba.copy()
     rgba[painted] = model.mat_rgba[model.geom_matid[painted]]
@@ -79,7 +77,7 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
         "bodies": model.nbody,
         "floor": float(model.geom_pos[planes][0, 2]) if planes.any() and scene.terrain is None else None,
         "geoms": geoms,
-        "muscles": [_muscle(model, model.actuator_trnid[k, 0]) for k in muscles],
+        "muscles": [_muscle(model, tendon) for tendon in tendons],
         "camera": orbit(model),
         "poses": _base64(poses.astype("<f4")),
         "track": _base64(track.astype("<f4")),

@@ -70,10 +70,10 @@ def test_the_command_trains_measures_and_draws(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(landscape, "WARMUP", 2)
-    flags = "--env cartpole --iterations 2 --trajectories 2 --points 5 --side 3 --horizon 40 --device cpu".split()
+    flags = "--env cartpole --iterations 2 --trajectories 1 --points 5 --side 4 --horizon 40 --device cpu".split()
     places = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]
     landscape.main(parse(landscape.Args, None, [*flags, *places]))
-    for name, count in (("gradients", 1), ("weight", 5), ("surface", 9)):
+    for name, count in (("gradients", 1), ("weight", 5), ("surface", 16)):
         assert len(read_csv(tmp_path / f"landscape_cartpole_{name}.csv")) == count
         assert (tmp_path / f"landscape_cartpole_{name}.png").stat().st_size > 5_000
     assert "landscape_cartpole_surface.png" in capsys.readouterr().out

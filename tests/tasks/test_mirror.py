@@ -49,7 +49,7 @@ def errors(env: DiffEnv, scene: Scene, steps: int = 5) -> tuple[float, float, fl
 
 @pytest.mark.parametrize("name, dtype", [("ant", torch.float32), ("humanoid", torch.float64)])
 def test_the_image_moves_like_the_robot(name: str, dtype: torch.dtype) -> None:
-    env = diffsim.make(name, num_envs=8, horizon=1, dtype=dtype)
+    env = diffsim.make(name, num_envs=7, horizon=1, dtype=dtype)
     observation, reward, back = errors(env, env.scene)
     tolerance = 1e-12 if dtype == torch.float64 else 3e-5
     assert observation < tolerance and reward < tolerance and back == 0

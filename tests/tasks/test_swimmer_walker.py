@@ -58,10 +58,10 @@ def test_swimmer_is_carried_by_its_fluid() -> None:
 
 def test_walker_stands_on_its_feet_for_a_moment() -> None:
     """It drops 5 cm to the ground, which carries its weight; nothing passes through."""
-    env, heights = diffsim.make("walker", 1, stochastic_init=False), []
+    env, heights = diffsim.make("walker", 2, stochastic_init=False), []
     with torch.no_grad():
         for _ in range(24):
-            env.step(torch.zeros(1, 6))
+            env.step(torch.zeros(2, 6))
             heights.append(env.qpos[0, 1].item())
     assert -0.12 < min(heights) < -0.03 and abs(env.qvel[0, 1].item()) < 1.0
 

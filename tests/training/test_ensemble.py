@@ -76,9 +76,9 @@ def test_tied_members_are_one_learner_with_the_samples_of_all() -> None:
     singles = [Ensemble([ensemble[e]]) for e in (1, 4)]
     optimizers = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in singles]
     for group, optimizer in enumerate(optimizers):
-        state = together.adam.state[together.vector]
-        moments = {name: state[name][group, 1].clone() for name in ("exp_avg", "exp_avg_sq")}
-        optimizer.adam.state[optimizer.vector].update(moments | {"step": state["step"].clone()})
+        optimizer.exp_avg.copy_(together.exp_avg[group, 1])
+        optimizer.exp_avg_sq.copy_(together.exp_avg_sq[group, 1])
+        optimizer.step_count.copy_(together.step_count)
     for _ in range(3):
         x = torch.randn(6, 9, 3)
         together.step(loss(ensemble(x)))

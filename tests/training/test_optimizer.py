@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import Any
 
+import pytest
 import torch
 from learners import assert_same
 from torch import nn
@@ -37,6 +39,30 @@ def test_it_is_adam_after_clipping_and_skips_bad_gradients() -> None:
         for p, q in zip(ours.parameters(), theirs.parameters(), strict=True):
             torch.testing.assert_close(p, q)
     assert optimizer.skipped == 3
+
+
+def test_it_is_bitwise_what_torchs_fused_adam_computes() -> None:
+    """Whose hooks for a GradScaler clip and skip; with a learning rate that decays."""
+    torch.manual_seed(0)
+    module = network()
+    optimizer = ClippedAdam(module, 0.5, (0.7, 0.95))
+    reference = nn.Parameter(optimizer.vector.clone())
+    lr = torch.tensor(0.0)
+    adam = torch.optim.Adam([reference], lr, betas=(0.7, 0.95), fused=True)
+    hooks: Any = adam
+    for k, scale in enumerate((1.0, 1e-3, math.nan, 10.0, 1e9, 0.1, 1.0)):
+        lr.fill_(1e-2 * (1 - k / 10))
+        optimizer.lr.copy_(lr)
+        loss = scale * module(torch.randn(20, 3)).square().mean()
+        gradients = torch.autograd.grad(loss, optimizer.parameters, retain_graph=True)
+        reference.grad = torch.cat([g.flatten() for g in gradients])
+        norm = optimizer.step(loss)
+        hooks.grad_scale, hooks.found_inf = (norm / 0.5).clamp(min=1.0), (~(norm < 1e6)).float()
+        adam.step()
+        state = optimizer.state_dict()["adam"]
+        assert_same(state, adam.state_dict()["state"])
+        assert torch.equal(optimizer.vector, reference.detach())
+    assert optimizer.step_count == 5 and optimizer.skipped == 2
 
 
 def test_with_an_infinite_bound_large_gradients_are_followed_and_infinite_ones_skipped() -> None:
@@ -98,3 +124,16 @@ def test_it_goes_on_from_its_state() -> None:
     assert torch.equal(go_on((0.7, 0.95)), optimizer.vector)
     assert not torch.equal(go_on((0.9, 0.999)), optimizer.vector)
     assert torch.equal(go_on((0.7, 0.95), 0.0), torch.cat([weight.flatten() for weight in weights.values()]))
+
+
+def test_a_state_without_moments_is_that_of_the_first_step() -> None:
+    """As in checkpoints of an earlier version, saved before the optimizer's first step."""
+    torch.manual_seed(0)
+    module = network()
+    optimizer = ClippedAdam(module, 1.0, lr=1e-2)
+    first = copy.deepcopy(optimizer.state_dict())
+    optimizer.step(module(torch.randn(4, 3)).square().sum())
+    optimizer.load_state_dict(first | {"adam": {}})
+    assert_same(optimizer.state_dict(), first)
+    with pytest.raises(ValueError, match="the state of an optimizer"):
+        optimizer.load_state_dict(first | {"adam": {0: first["adam"][0] | {"exp_avg": torch.zeros(3)}}})

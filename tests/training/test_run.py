@@ -322,12 +322,12 @@ class Counter:
 def count(args: bptt.Args) -> Counter:
     """Control steps are counted by the learner, numbers of the host are logged beside those of the device."""
     run = Run(args)
-    eval_env, counter = run.make_eval_env(), run.restore(Counter())
+    counter = run.restore(Counter())
     update = run.capture(counter.update)
     for iteration in run:
         run.log(update() | {"charts/square": iteration**2}, control_steps=100)
         if run.evaluation_due:
-            evaluation = evaluate(eval_env, counter.policy)
+            evaluation = evaluate(run.eval_env, counter.policy)
             evaluation.others["further"] = 3.5
             run.log_evaluation(evaluation)
     return counter

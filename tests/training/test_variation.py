@@ -119,7 +119,7 @@ def test_contact_decides_constants_and_integration() -> None:
 
 
 def test_firm_runs_resume_bitwise_and_are_evaluated_on_firm_ground(tmp_path: Path) -> None:
-    flags = "--env hopper --contact firm --num-envs 4 --horizon 8 --iterations 4 --redraw 1 --eval-episodes 2 --quiet"
+    flags = "--env hopper --contact firm --num-envs 16 --horizon 8 --iterations 4 --redraw 1 --eval-episodes 2 --quiet"
     flags += " --device cpu --critic-iterations 2 --threads 1"
     whole = run(shac, tmp_path / "whole", *flags.split())
     run(shac, tmp_path / "part", *flags.split(), "--stop-after", 2)
@@ -143,9 +143,9 @@ def test_learners_without_gradient_vary_too(tmp_path: Path, monkeypatch: pytest.
         seen.append(self.factors.clone())
 
     monkeypatch.setattr(Variation, "set", watch)
-    flags = "--env hopper --randomise mass=0.5:2 --num-envs 4 --horizon 8 --iterations 2 --redraw 1 --quiet --epochs 1"
+    flags = "--env hopper --randomise mass=0.5:2 --num-envs 16 --horizon 8 --iterations 2 --redraw 1 --quiet --epochs 1"
     flags += " --integrator implicit"  # whose kernels with factors other tests compile
-    run(ppo_baseline, tmp_path, *flags.split(), "--device", "cpu", "--minibatch-size", "16", "--eval-episodes", "2")
+    run(ppo_baseline, tmp_path, *flags.split(), "--device", "cpu", "--minibatch-size", "64", "--eval-episodes", "2")
     assert len(seen) == 2 and not torch.equal(*seen)
     mass = FACTORS.index("mass")
     assert all((factors[:, mass] != 1).all() and (factors[:, :mass] == 1).all() for factors in seen)

@@ -255,10 +255,10 @@ def test_gait_of_the_shipped_policies(name: str) -> None:
 
 def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = str(PACKAGE / "policies" / "ant.pt")
-    SCRIPTS["sapo"].main(["--evaluate", path, "--eval-episodes", "1", "--device", "cpu", "--run-dir", str(tmp_path)])
+    SCRIPTS["sapo"].main(["--evaluate", path, "--eval-episodes", "2", "--device", "cpu", "--run-dir", str(tmp_path)])
     returns, finer, words = capsys.readouterr().out.splitlines()
     found = json.loads((tmp_path / "evaluation.json").read_text())
-    assert returns.startswith("ant, 1 episodes") and words.startswith(f"gait: {found['gait']['verdict']}; duty factor ")
+    assert returns.startswith("ant, 2 episodes") and words.startswith(f"gait: {found['gait']['verdict']}; duty factor ")
     assert finer == f"explicit with 32 substeps: return median {found['finer']['return']:.1f}, " + (
         f"{found['finer']['kept']:.1%} kept"
     )

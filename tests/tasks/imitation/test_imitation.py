@@ -19,6 +19,7 @@ import diffsim
 import gps
 import mbpo
 import pods
+import ppo_baseline
 import shac
 from diffsim import Clip, read_clip
 from diffsim.tasks.imitation.task import END_EFFECTORS, STRAY, HumanoidImitation
@@ -276,7 +277,7 @@ def test_the_phase_is_kept_in_single_precision() -> None:
 
 
 def test_the_environment_keeps_the_clock() -> None:
-    env = diffsim.make("humanoid_imitation", 8, seed=0, horizon=4, integrator="implicit", substeps=1)
+    env = diffsim.make("humanoid_imitation", 7, seed=0, horizon=4)
     task, step = env.task, env.first_step.clone()
     assert isinstance(task, HumanoidImitation) and len(set(step.tolist())) > 3
     assert torch.equal(task.frame(env.reset(seed=0)[0]), env.first_step) and torch.equal(step, env.first_step)
@@ -284,21 +285,21 @@ def test_the_environment_keeps_the_clock() -> None:
     for _ in range(60):
         before = env.first_step + env.episode_step
         with torch.no_grad():
-            obs, reward, terminated, _, info = env.step(torch.randn(8, NU, generator=generator))
+            obs, reward, terminated, _, info = env.step(torch.randn(7, NU, generator=generator))
         assert torch.equal(task.frame(info["final_obs"]), (before + 1) % task.period)
         assert torch.equal(task.frame(obs), (env.first_step + env.episode_step) % task.period)
         assert torch.equal(env.first_step[~terminated] + env.episode_step[~terminated], before[~terminated] + 1)
         torch.testing.assert_close(task.reward(obs, obs)[terminated], torch.ones(int(terminated.sum())))
         ends += int(terminated.sum())
     assert ends > 8
-    other = diffsim.make("humanoid_imitation", 8, seed=1, horizon=4, integrator="implicit", substeps=1)
+    other = diffsim.make("humanoid_imitation", 7, seed=1, horizon=4)
     other.load_state_dict(env.state_dict())
     other.detach(), env.detach()
     for _ in range(30):
         with torch.no_grad():
-            actions = torch.randn(8, NU, generator=generator)
+            actions = torch.randn(7, NU, generator=generator)
             assert torch.equal(env.step(actions)[0], other.step(actions)[0])
-    env.reset(options={"reset_mask": torch.arange(8) == 2})
+    env.reset(options={"reset_mask": torch.arange(7) == 2})
     assert env.episode_step[2] == 0 and task.frame(env._obs)[2] == env.first_step[2]
     assert torch.equal(env.set_state(env.qpos, env.qvel), env._obs)
     calm = diffsim.make("humanoid_imitation", 2, stochastic_init=False)
@@ -333,7 +334,7 @@ def test_a_motion_that_does_not_loop_ends() -> None:
     assert task.terminated(obs).tolist() == [False] * 60 + [True]
     assert task.first_step(torch.rand(2000, 1, dtype=REAL)).unique().tolist() == list(range(60))
     env = diffsim.make(  # without early termination, too; it does not go round
-        "humanoid_imitation", 2, clip=clip, early_termination=False, integrator="implicit", substeps=1, horizon=4
+        "humanoid_imitation", 2, clip=clip, early_termination=False, horizon=4
     )
     for _ in range(60):
         left = 60 - env.first_step - env.episode_step
@@ -348,19 +349,21 @@ def test_a_motion_that_does_not_loop_ends() -> None:
 def test_checkpoints_hold_the_clip(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path / "mine.npz", qpos=stroll(2, 30, True), fps=30)
     clip, run, there = read_clip(file), tmp_path / "run", str(tmp_path / "run" / "checkpoint.pt")
-    flags = "--env humanoid_imitation --integrator implicit --substeps 1 --num-envs 4 --horizon 2 --eval-episodes 2"
+    flags = "--env humanoid_imitation --num-envs 4 --horizon 2 --minibatch-size 4 --eval-episodes 2"
     options = [*flags.split(), "--device", "cpu", "--quiet", "--iterations", "2", "--run-dir", str(run)]
-    shac.main([*options, "--clip", str(file), "--stop-after", "1"])
+    ppo_baseline.main([*options, "--clip", str(file), "--stop-after", "1"])
     assert '"clip": "mine"' in (run / "args.json").read_text()
     file.unlink()
-    shac.main(["--resume", there, "--quiet"])
-    assert parse(shac.Args, ["--evaluate", there]).clip == clip
+    ppo_baseline.main(["--resume", there, "--quiet"])
+    assert parse(ppo_baseline.Args, ["--evaluate", there]).clip == clip
     export_policy(run / "checkpoint.pt", tmp_path / "policy.pt")
     for path in (run / "checkpoint.pt", tmp_path / "policy.pt"):
         env = make_policy_env(load_policy(path), 2)
         assert isinstance(env.task, HumanoidImitation) and env.task.clip == clip and str(env.task.clip) == "mine"
-    shac.main(["--evaluate", there, "--no-finer", "--eval-episodes", "2", "--run-dir", str(tmp_path / "evaluation")])
-    line = refusal(lambda: shac.main(["--evaluate", there, "--clip", "humanoid_run"]), capsys)
+    ppo_baseline.main(
+        ["--evaluate", there, "--no-finer", "--eval-episodes", "2", "--run-dir", str(tmp_path / "evaluation")]
+    )
+    line = refusal(lambda: ppo_baseline.main(["--evaluate", there, "--clip", "humanoid_run"]), capsys)
     assert f"{there} has --clip mine, not humanoid_run" in line
 
 
