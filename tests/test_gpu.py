@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import leg, parse
+from scenes import leg, parse, task_scene
 
 import diffsim
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
 from diffsim.kernels.spec import kernel_spec
+from diffsim.robot.constraint import constrained
 from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -54,6 +55,13 @@ def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
         source = compiled(kernel.module, arch=90)
         for function in ("add_pull", "measure", "place_balls", "sphere_on_terrain", "drag_wrench", "add_forces"):
             assert function in source, function
+
+
+def test_kernels_with_constraints_compile_for_a_gpu_without_one() -> None:
+    scene = constrained(task_scene("ant"), 1 / 240)
+    spec = kernel_spec(scene, divide(scene, 4), wp.float32, implicit=False, env_last=True, varied=True, passes=4)
+    for kernel in (forward_kernel(spec), backward_kernel(spec)):
+        compiled(kernel.module, arch=90)
 
 
 def episode(
