@@ -15,7 +15,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it to w
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest looks for the marks that are asked for
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:  # of the benchmarks' tests, those that write files run commands
+        commands = item.path.parent.name == "benchmarks" and item.path.name != "test_tables.py"
+        if commands and "tmp_path" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("gpu"):

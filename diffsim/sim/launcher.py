@@ -20,8 +20,9 @@ from diffsim.robot.scene import Scene
 from diffsim.sim.options import BLOCKS, WARP_DTYPE, Options
 
 # Waking a thread between two torch operations costs a fraction of a millisecond: below this many link-substeps per
-# thread (about 1 ms) it saves nothing. A whole iteration of 64 ants takes 0.22 s with two threads, 0.26 s with one.
-MIN_WORK_PER_THREAD = 4_000
+# thread it saves nothing. Blocks do five times as many meanwhile: with two threads 64 humanoids are faster, 64 ants are
+# not (results/cpu/speed_physics.csv).
+MIN_WORK_PER_THREAD, IN_BLOCKS = 4_000, 20_000
 # Beyond as many GPU threads, an environment is left to one of them: there are enough environments to fill the GPU.
 MAX_THREADS = 65_536
 MUSCLE_SHARERS = 4
@@ -67,7 +68,8 @@ class Launcher:
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
         work = num_envs * options.integration.substeps * scene.nlink
-        wanted = 1 if cuda else options.threads or min(available_cores(), max(1, work // MIN_WORK_PER_THREAD))
+        least = MIN_WORK_PER_THREAD if block == 1 else IN_BLOCKS
+        wanted = 1 if cuda else options.threads or min(available_cores(), max(1, work // least))
         count = min(wanted, self.num_blocks)
         bounds = [self.num_blocks * k // count for k in range(count + 1)]
         self._shares = list(zip(bounds, bounds[1:], strict=False))  # blocks of each thread: first, end

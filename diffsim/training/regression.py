@@ -21,7 +21,9 @@ class Regression:
 
     def __init__(self, network: nn.Sequential, optimizer: ClippedAdam) -> None:
         if wrong := [type(layer).__name__ for layer in network if not isinstance(layer, KINDS)]:
-            raise TypeError(f"no regression of {wrong[0]}: only of Linear, ELU and LayerNorm")
+            raise TypeError(
+                f"no regression of {wrong[0]}: only of Linear, ELU and LayerNorm; fit others by optimizer.step(loss)"
+            )
         self.layers, self.optimizer = list(network), optimizer
 
     @torch.no_grad()
