@@ -1,11 +1,11 @@
-"""What firm contact does to gradients: their size and their agreement, against horizon and stiffness.
+"""What hard contact does to gradients: their size and their agreement, against horizon and time constant.
 
-    python benchmarks/gradients.py runs/learning/shac_firm/*__1        policies of tasks with ground, one of each
+    python benchmarks/gradients.py runs/learning/shac/*__1        policies of tasks with ground, one of each
 
 A policy acts with noise from states that it visits. The gradient of a window's reward is taken with respect to
 the window's own actions: how long it is in each environment; and with respect to a shift of the policy's output: how
-well the gradients of separate groups of environments agree. Ground and limits go from the soft constants to the firm
-ones geometrically, as --anneal takes them, and on to four times those. Writes gradients.csv and gradients.png.
+well the gradients of separate groups of environments agree. The grounds are the paper's springs and MuJoCo's own
+contact, with multiples of the file's time constant. Writes gradients.csv and gradients.png.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import common
 import torch
@@ -23,15 +24,16 @@ from torch import Tensor
 import diffsim
 from diffsim import DiffEnv
 from diffsim.robot.scene import FACTORS
+from diffsim.tasks import Contact
 from diffsim.training import Count, NonNegative, fail
 from diffsim.training.evaluation import SEED
-from diffsim.training.variation import VARIED, soft_factors
 
 GROUPS = 16  # of environments, whose gradients are compared
-FIRMER = 4.0  # the last ground's constants in multiples of the firm ones
-GROUNDS = {"soft": 0.0, "25 % firm": 0.25, "50 % firm": 0.5, "75 % firm": 0.75, "firm": 1.0}  # of the way to firm
+# By their names in the csv file: the contact, and the factor of k_n, which divides the square of the time constant
+GROUNDS: dict[str, tuple[Contact, float]] = {"soft": ("soft", 1.0)}
+GROUNDS |= {f"mujoco, time constant x{time:g}": ("mujoco", time**-2) for time in (8.0, 4.0, 2.0, 1.0, 0.5)}
 COLUMNS = {"norm": ("norm, median", "y"), "norm 95 %": ("norm, 95 %", "y"), "cosine": ("cosine", "")}
-KEY = ("task", "learner", "horizon", "stiffness")
+KEY = ("task", "learner", "horizon", "ground")
 
 
 @dataclass
@@ -40,17 +42,6 @@ class Args(common.CheckpointFlags):
     horizons: tuple[Count, ...] = (4, 8, 16, 32, 64)  # control steps of a window
     warmup: Count = 100  # control steps before it
     noise: NonNegative = 0.2  # standard deviation of the noise on the actions
-
-
-def grounds(env: DiffEnv) -> dict[str, Tensor]:
-    """Factors (len(FACTORS),) of the firm constants, by the name of the ground."""
-    soft = torch.tensor([soft_factors(env.scene).get(name, 1.0) for name in FACTORS])
-    found = {}
-    # A limit's damping, which is none where it is soft, goes with the share, as in Variation.
-    for name, share in GROUNDS.items():
-        found[name] = torch.where(soft > 0, soft.clamp(min=1e-30) ** (1 - share), share)
-    varied = torch.tensor([name in VARIED["stiffness"] for name in FACTORS])
-    return found | {f"{FIRMER:g} x firm": torch.where(varied, FIRMER, 1.0)}
 
 
 def window_gradients(env: DiffEnv, policy: torch.nn.Module, horizon: int, args: Args) -> tuple[Tensor, Tensor]:
@@ -90,27 +81,19 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     task = case.env.task.name
     if "contact" not in case.env.scene.features:
         fail(f"{path} was trained on {task}, which has no ground")
-    integration = case.env.task.integration("default", "firm")
     for horizon in args.horizons:
-        env = diffsim.make(
-            task,
-            args.num_envs,
-            horizon=horizon,
-            contact="firm",
-            substeps=integration.substeps,
-            factors=True,
-        )
-        for k, (name, factors) in enumerate(grounds(env).items()):
-            env.sim.factors.copy_(factors)
+        kinds: tuple[Contact, ...] = get_args(Contact)
+        envs = {kind: diffsim.make(task, args.num_envs, horizon=horizon, contact=kind, factors=True) for kind in kinds}
+        for name, (kind, factor) in GROUNDS.items():
+            env = envs[kind]
+            env.sim.factors[:, FACTORS.index("k_n")] = factor
             each, groups = window_gradients(env, case.saved.network, horizon, args)
             norms = each.flatten(1).norm(dim=1)
             yield {
                 "task": task,
                 "learner": case.saved.script,
                 "horizon": horizon,
-                "stiffness": k,
                 "ground": name,
-                "k_n": float(env.scene.k_n * factors[FACTORS.index("k_n")]),
                 "norm": float(norms.median()),
                 "norm 95 %": float(norms.quantile(0.95)),
                 "cosine": agreement(groups),
@@ -120,9 +103,8 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
     """What the page has of the rows."""
-    ends, columns = {"soft", "firm", f"{FIRMER:g} x firm"}, ("task", "horizon", "ground", *COLUMNS)
-    own = (row for row in rows if row["ground"] in ends and row["horizon"] in ("8", "32"))
-    return [{name: row[name] for name in columns} for row in own]
+    own = (row for row in rows if row["horizon"] in ("8", "32"))
+    return [{name: row[name] for name in ("task", "horizon", "ground", *COLUMNS)} for row in own]
 
 
 def main(args: Args) -> None:
@@ -135,10 +117,10 @@ def main(args: Args) -> None:
         panels = list[Panel]()
         for task in tasks:
             lines = list[Line]()
-            for ground in dict.fromkeys(row["ground"] for row in rows):
+            for k, ground in enumerate(GROUNDS):
                 own = [row for row in rows if (row["task"], row["ground"]) == (task, ground)]
                 x, y = ([float(row[name]) for row in own] for name in ("horizon", column))
-                lines.append(Line(x, y, f"C{own[0]['stiffness']}o-", ground) if own else Line([], []))
+                lines.append(Line(x, y, f"C{k}o-", ground) if own else Line([], []))
             panels.append(Panel(lines, task, "horizon (control steps)", text, log))
         grid.append(panels)
     if tasks:

@@ -70,20 +70,18 @@ class PolicyFlags(CommonFlags):
 class Case:
     """A task (float64), its scene, and a policy with the states that it visits."""
 
-    def __init__(self, args: PolicyFlags, name: TaskName, penalty: dict[str, float] | None = None) -> None:
+    def __init__(self, args: PolicyFlags, name: TaskName) -> None:
         self.task, self.n = diffsim.TASKS[name](dtype=torch.float64), args.states
-        self.scene = diffsim.make(name, num_envs=1, penalty=penalty).scene
+        self.scene = diffsim.make(name, num_envs=1).scene
         self.policy, called = args.policy(name)
-        self.qpos, self.qvel = visited_states(name, self.policy, args.states, penalty)
+        self.qpos, self.qvel = visited_states(name, self.policy, args.states)
         print(f"{name}: states of {called}", flush=True)
 
 
 @torch.no_grad()
-def visited_states(
-    name: str, policy: nn.Module, count: int, penalty: dict[str, float] | None = None
-) -> tuple[Tensor, Tensor]:
+def visited_states(name: str, policy: nn.Module, count: int) -> tuple[Tensor, Tensor]:
     """(count, nq), (count, nv) in float64: a quarter each after 0.25, 0.5, 1 and 2 s of episodes under the policy."""
-    env = diffsim.make(name, num_envs=count, seed=0, penalty=penalty)
+    env = diffsim.make(name, num_envs=count, seed=0)
     obs, _ = env.reset(seed=0)
     qpos, qvel = env.qpos.double(), env.qvel.double()
     for first, steps in enumerate((15, 15, 30, 60)):

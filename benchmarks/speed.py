@@ -4,7 +4,7 @@
     python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
     python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
-    python benchmarks/speed.py --parts training --env ant -- --contact firm    what follows "--" goes to the script
+    python benchmarks/speed.py --parts training --env ant -- --contact mujoco    what follows "--" goes to the script
     python benchmarks/speed.py --parts training --script pfpn -- --policy gaussian
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.

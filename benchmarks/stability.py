@@ -2,7 +2,6 @@
 
     python benchmarks/stability.py                         every task and integrator, a quarter of an hour
     python benchmarks/stability.py --parts long --steps 100_000
-    python benchmarks/stability.py --contact firm          on firm ground, beside the rows of the soft one
 
 Writes stability_*.csv, stability.png and, with --update-results, the tables of docs/stability.md, which explains them.
 All is float32, from states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below
@@ -34,7 +33,6 @@ from torch import Tensor
 
 import diffsim
 from diffsim import Scene, Simulator
-from diffsim.tasks import Contact
 from diffsim.training import Count
 
 PartName = Literal["step", "sweeps", "horizon", "long", "energy"]
@@ -62,22 +60,15 @@ CHAINS, CHAIN_SUBSTEPS = (1, 5, 20), (16, 32, 64)  # links; substeps
 @dataclass
 class Args(PolicyFlags):
     parts: tuple[PartName, ...] = ("step", "sweeps", "horizon", "long", "energy")  # tables to measure
-    contact: Contact = "soft"  # constants of contact and limits; firm of the tasks that have such
     states: Count = 8  # start states
     steps: Count = 1_000_000  # control steps of the table "long", over all of its 64 environments
-
-
-def label(args: Args, name: TaskName) -> str:
-    """What the csv files call a task."""
-    return name if args.contact == "soft" else f"{name} {args.contact}"
 
 
 class Case(motions.Case):
     """A motion with MuJoCo's model for its energies, and a reference so fine that it is stable."""
 
     def __init__(self, args: Args, name: TaskName) -> None:
-        super().__init__(args, name, diffsim.TASKS[name].penalty(args.contact))
-        self.label = label(args, name)
+        super().__init__(args, name)
         self.model = mujoco.MjModel.from_xml_path(self.scene.path)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 
@@ -98,7 +89,7 @@ class Case(motions.Case):
 def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
     case = Case(args, name)
     limit = case.kinetic(case.reference, case.actions)[0]
-    default = case.task.integration("default", args.contact).substeps
+    default = case.task.substeps
     for integrator in INTEGRATORS:
         stable: dict[int, bool] = {}
         for count in (c for c in COUNTS if c <= 4 * default and (integrator != "extrapolated" or c % 2 == 0)):
@@ -107,7 +98,7 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
             stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        row: Row = {"task": case.label, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
+        row: Row = {"task": name, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
         yield {**row, "largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
 
 
@@ -195,7 +186,7 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
                 *path, bad = replay(sim, qpos, qvel, actions)
                 within = bounded(scene, model, *path)
             norm, lost = gradient_norm(sim, qpos, qvel, actions)
-            row: Row = {"task": case.label, "integrator": integrator, "sweep": sweep, "value": float(value)}
+            row: Row = {"task": name, "integrator": integrator, "sweep": sweep, "value": float(value)}
             row = {**row, "finite": bad == 0, "contained": bad, "energy bounded": within}
             yield {**row, "gradient": norm, "gradients not finite": lost}
 
@@ -235,14 +226,14 @@ def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
                 bad += int(sim.nonfinite.sum())
                 total = total + task.reward(task.observe(q, v, action), action).mean() / horizon
             found = [g.flatten() for g in torch.autograd.grad(total, weights, allow_unused=True) if g is not None]
-            row: Row = {"task": case.label, "integrator": integrator, "horizon": horizon}
+            row: Row = {"task": name, "integrator": integrator, "horizon": horizon}
             row = {**row, "gradient": torch.cat(found).norm().item()}
             yield {**row, "gradients not finite": int(sim.nonfinite_gradients.sum()) - before, "contained": bad}
 
 
 @torch.no_grad()
 def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
-    env = diffsim.make(name, num_envs=64, seed=0, contact=args.contact)
+    env = diffsim.make(name, num_envs=64, seed=0)
     policy, returns = args.policy(name)[0].float(), list[float]()
     obs, _ = env.reset(seed=0)
     bad, fastest = torch.zeros((), dtype=torch.long), torch.zeros(())
@@ -251,7 +242,7 @@ def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
         bad += info["nonfinite"].sum()
         fastest = torch.maximum(fastest, env.qvel.abs().max())
         returns += info["episode"]["r"][info["_episode"]].tolist()
-    row: Row = {"task": label(args, name), "control steps": 64 * math.ceil(args.steps / 64), "contained": int(bad)}
+    row: Row = {"task": name, "control steps": 64 * math.ceil(args.steps / 64), "contained": int(bad)}
     row = {**row, "largest velocity": fastest.item(), "episodes": len(returns)}
     yield {**row, "median return": float(np.median(returns)) if returns else math.nan}
 
@@ -316,8 +307,6 @@ PARTS: dict[PartName, Part] = {
 
 
 def main(args: Args) -> None:
-    if args.contact == "firm":
-        args.env = tuple(name for name in args.env if hasattr(diffsim.TASKS[name], "firm"))
     for part in args.parts:
         if part == "energy":
             args.publish(part, markdown(energies(args)), "stability.md")

@@ -66,9 +66,8 @@ def make(
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
             docs/accuracy.md has what each costs and how much it errs.
         substeps, integrator, theta, passes: each in place of the preset's, if given.
-        contact: "soft" (the paper's), "firm" (springs fitted to MuJoCo's motion) or "mujoco" (MuJoCo's own constraints,
-            see Integration): the laws of contact and limits and how they are integrated; docs/transfer.md has what the
-            first two cost and how much of a policy's speed is true.
+        contact: "soft" (the paper's springs) or "mujoco" (MuJoCo's own constraints, see Integration): the laws of
+            contact and limits and how they are integrated; docs/transfer.md has what policies keep of their speed.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
             of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
@@ -95,7 +94,7 @@ def make(
     integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes)
     if penalty and integration.integrator == "mujoco":
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
-    scene = scene.with_penalty(task.penalty(contact) | dict(penalty or {}))
+    scene = scene.with_penalty(penalty or {})
     return DiffEnv(
         task,
         scene if terrain is None else scene.with_terrain(terrain),

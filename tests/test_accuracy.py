@@ -80,9 +80,19 @@ def test_presets_that_are_not_there_are_named(monkeypatch):
     class Bare(diffsim.tasks.Task):
         name, substeps = "bare", 8
 
-    assert Bare.integration("default") == ("semi_implicit", 8, 0.0)
+    assert Bare.integration("default") == Integration("semi_implicit", 8)
     with pytest.raises(ValueError, match="'bare' has no preset 'fast'"):
         Bare.integration("fast")
+
+
+def test_contact_decides_the_integration():
+    for name, task in TASKS.items():
+        for accuracy, substeps in (("fast", 4), ("default", 4), ("accurate", 16)):
+            assert task.integration(accuracy, "mujoco") == Integration("mujoco", substeps), name
+    with pytest.raises(ValueError, match="unknown contact 'hard'; choose from soft, mujoco"):
+        diffsim.make("hopper", contact="hard")
+    with pytest.raises(ValueError, match="^firm contact is gone: choose mujoco, MuJoCo's own$"):
+        diffsim.make("hopper", contact="firm")
 
 
 def test_penalty_constants_replace_the_files():

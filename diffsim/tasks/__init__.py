@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from diffsim.tasks.ant import Ant
-from diffsim.tasks.base import Accuracy, Contact, Firm, Task
+from diffsim.tasks.base import Accuracy, Contact, Task
 from diffsim.tasks.cartpole import CartPole
 from diffsim.tasks.half_cheetah import HalfCheetah
 from diffsim.tasks.hopper import Hopper
@@ -20,4 +20,4 @@ TASKS: dict[str, type[Task]] = {
 # Those of the SHAC paper, which have presets of every accuracy
 SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
 
-__all__ = ["SHAC_TASKS", "TASKS", "Accuracy", "Contact", "Firm", "HumanoidImitation", "Task"]
+__all__ = ["SHAC_TASKS", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task"]

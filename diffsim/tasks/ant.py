@@ -5,7 +5,6 @@ from __future__ import annotations
 from torch import Tensor
 
 from diffsim.sim.integration import Integration
-from diffsim.tasks.base import Firm
 from diffsim.tasks.locomotion import Locomotion
 
 
@@ -17,7 +16,6 @@ class Ant(Locomotion):
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)
-    firm = Firm(k_n=3.4e5, k_d=8e5, k_t=1.7e3, k_limit=4.8e3, d_limit=3.9e3, integration=Integration("implicit", 8))
     obs_dim = 37
     num_random = 29
     min_height = 0.27

@@ -7,7 +7,7 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, NamedTuple, get_args
+from typing import ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -16,28 +16,8 @@ from diffsim.sim.integration import Integration
 from diffsim.tasks.mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
-Contact = Literal["soft", "firm", "mujoco"]
-
-
-class Firm(NamedTuple):
-    """Contact and limits as firm as MuJoCo's, fitted to its motion: docs/transfer.md. The soft ones are the paper's.
-
-    Attributes:
-        k_n, k_d, k_t, k_limit, d_limit: in place of the file's, see scene.PENALTY_CONSTANTS.
-        integration: on which they are stable.
-    """
-
-    k_n: float
-    k_d: float
-    k_t: float
-    k_limit: float
-    d_limit: float
-    integration: Integration
-
-    @property
-    def penalty(self) -> dict[str, float]:
-        """The constants alone."""
-        return {name: value for name, value in self._asdict().items() if name != "integration"}
+Contact = Literal["soft", "mujoco"]
+FIRM_IS_GONE = "firm contact is gone: choose mujoco, MuJoCo's own"
 
 
 class Task:
@@ -51,7 +31,6 @@ class Task:
     substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy, semi-implicit Euler
     fast: ClassVar[Integration]  # the other two, chosen by measurement: docs/accuracy.md
     accurate: ClassVar[Integration]
-    firm: ClassVar[Firm]  # tasks without contact have none
     obs_dim: ClassVar[int]
     num_random: ClassVar[int]  # random numbers per reset
     timed: ClassVar[bool] = False  # whether observations depend on the time: see first_step and observe_at
@@ -67,40 +46,23 @@ class Task:
 
     @classmethod
     def integration(cls, accuracy: str, contact: str = "soft") -> Integration:
-        """The preset "fast", "default" (the paper's) or "accurate"; with firm contact the first two are one.
+        """The preset "fast", "default" (the paper's) or "accurate"; with MuJoCo's contact the first two are one.
 
         Raises:
-            ValueError: another name, or a preset or a contact that the task has not.
+            ValueError: another name, or a preset that the task has not.
         """
-        cls.penalty(contact)
+        if contact not in get_args(Contact):
+            names = ", ".join(get_args(Contact))
+            raise ValueError(FIRM_IS_GONE if contact == "firm" else f"unknown contact {contact!r}; choose from {names}")
         if accuracy not in get_args(Accuracy):
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
         if contact == "mujoco":
-            exact = Integration("mujoco", 4)
-            return exact._replace(substeps=16) if accuracy == "accurate" else exact
-        if contact == "firm":
-            firm = cls.firm.integration
-            return firm._replace(substeps=4 * firm.substeps) if accuracy == "accurate" else firm
+            return Integration("mujoco", 16 if accuracy == "accurate" else 4)
         if accuracy == "default":
             return Integration("semi_implicit", cls.substeps)
         if not hasattr(cls, accuracy):
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
         return getattr(cls, accuracy)
-
-    @classmethod
-    def penalty(cls, contact: str) -> dict[str, float]:
-        """The constants of contact and limits that "soft" or "mujoco" (none) or "firm" puts in place of the file's.
-
-        Raises:
-            ValueError: another name, or firm contact of a task that has none.
-        """
-        if contact not in get_args(Contact):
-            raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(get_args(Contact))}")
-        if contact in ("soft", "mujoco"):
-            return {}
-        if not hasattr(cls, "firm"):
-            raise ValueError(f"task {cls.name!r} has no firm contact; choose soft")
-        return cls.firm.penalty
 
     @classmethod
     def falls(cls) -> bool:

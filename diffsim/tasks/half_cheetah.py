@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from diffsim.sim.integration import Integration
-from diffsim.tasks.base import Firm, Planar
+from diffsim.tasks.base import Planar
 
 
 class HalfCheetah(Planar):
@@ -16,7 +16,6 @@ class HalfCheetah(Planar):
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)
-    firm = Firm(k_n=6e4, k_d=6e4, k_t=900, k_limit=3e3, d_limit=4e3, integration=Integration("implicit", 8))
     obs_dim = 17
     num_random = 18
     start = (0.0, -0.2) + (0.0,) * 16

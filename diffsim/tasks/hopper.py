@@ -7,7 +7,7 @@ import math
 from torch import Tensor
 
 from diffsim.sim.integration import Integration
-from diffsim.tasks.base import Firm, Planar, height_reward
+from diffsim.tasks.base import Planar, height_reward
 
 
 class Hopper(Planar):
@@ -18,7 +18,6 @@ class Hopper(Planar):
     substeps = 16
     fast = Integration("semi_implicit", 8)
     accurate = Integration("extrapolated", 32)
-    firm = Firm(k_n=1.4e5, k_d=4e5, k_t=500, k_limit=3.3e3, d_limit=5.8e3, integration=Integration("implicit", 8))
     obs_dim = 11
     num_random = 12
     min_height = -0.45

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from diffsim.sim.integration import Integration
-from diffsim.tasks.base import Firm, height_reward
+from diffsim.tasks.base import height_reward
 from diffsim.tasks.locomotion import Locomotion
 
 
@@ -17,7 +17,6 @@ class Humanoid(Locomotion):
     substeps = 48
     fast = Integration("implicit", 24)
     accurate = Integration("extrapolated", 96)
-    firm = Firm(k_n=8e4, k_d=8e4, k_t=700, k_limit=2.4e3, d_limit=1.5e3, integration=Integration("implicit", 16))
     obs_dim = 76
     num_random = 55
     min_height = 0.74

@@ -31,7 +31,7 @@ class HumanoidImitation(Task):
 
     name = "humanoid_imitation"
     asset = Humanoid.asset
-    substeps, fast, accurate, firm = Humanoid.substeps, Humanoid.fast, Humanoid.accurate, Humanoid.firm
+    substeps, fast, accurate = Humanoid.substeps, Humanoid.fast, Humanoid.accurate
     obs_dim = 57
     num_random = 1
     timed = True
