@@ -1,11 +1,11 @@
-"""What hard contact does to gradients: their size and their agreement, against horizon and time constant.
+"""What hard contact does to gradients: their size and their agreement, against horizon and hardness.
 
     python benchmarks/gradients.py runs/learning/shac/*__1        policies of tasks with ground, one of each
 
 A policy acts with noise from states that it visits. The gradient of a window's reward is taken with respect to
 the window's own actions: how long it is in each environment; and with respect to a shift of the policy's output: how
 well the gradients of separate groups of environments agree. The grounds are the paper's springs and MuJoCo's own
-contact, with multiples of the file's time constant. Writes gradients.csv and gradients.png.
+contact, as hard as the file's and softer, from where --anneal may begin. Writes gradients.csv and gradients.png.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ from diffsim.robot.scene import FACTORS
 from diffsim.tasks import Contact
 from diffsim.training import Count, NonNegative, fail
 from diffsim.training.evaluation import SEED
+from diffsim.training.variation import SOFT
 
 GROUPS = 16  # of environments, whose gradients are compared
-# By their names in the csv file: the contact, and the factor of k_n, which divides the square of the time constant
+# By their names in the csv file: the contact, and the factor of k_d, which in MuJoCo's contact multiplies all force
 GROUNDS: dict[str, tuple[Contact, float]] = {"soft": ("soft", 1.0)}
-GROUNDS |= {f"mujoco, time constant x{time:g}": ("mujoco", time**-2) for time in (8.0, 4.0, 2.0, 1.0, 0.5)}
+GROUNDS |= {f"mujoco x{factor:g}": ("mujoco", factor) for factor in (SOFT["k_d"], 0.1, 1.0)}
 COLUMNS = {"norm": ("norm, median", "y"), "norm 95 %": ("norm, 95 %", "y"), "cosine": ("cosine", "")}
 KEY = ("task", "learner", "horizon", "ground")
 
@@ -86,7 +87,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         envs = {kind: diffsim.make(task, args.num_envs, horizon=horizon, contact=kind, factors=True) for kind in kinds}
         for name, (kind, factor) in GROUNDS.items():
             env = envs[kind]
-            env.sim.factors[:, FACTORS.index("k_n")] = factor
+            env.sim.factors[:, FACTORS.index("k_d")] = factor
             each, groups = window_gradients(env, case.saved.network, horizon, args)
             norms = each.flatten(1).norm(dim=1)
             yield {

@@ -34,8 +34,8 @@ Recording = tuple[Tensor, Tensor, Tensor]  # qpos, qvel and ctrl
 class Args:
     recording: Path | None = None  # .npz file (default: a motion in MuJoCo of a robot that the fit does not know)
     env: str = "hopper"  # the task of the robot
-    fit: tuple[Literal["mu", "k_n", "k_limit", "mass", "motor"], ...] = ("mu", "k_n", "mass", "motor")
-    # factors to find; those of k_n and k_limit divide the squares of the time constants of contact and limits
+    fit: tuple[Literal["mu", "k_n", "k_d", "k_limit", "mass", "motor"], ...] = ("mu", "k_n", "mass", "motor")
+    # factors to find; k_n and k_limit divide the squares of time constants, k_d multiplies all force of a contact
     segments: int = 256  # in each iteration
     iterations: int = 12
 
