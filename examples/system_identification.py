@@ -101,10 +101,11 @@ def identify(args: Args, sim: diffsim.Simulator, recording: Recording) -> Tensor
         error = (qvel[e, t + STEPS] - v).detach()
         # Some segments' Jacobians explode in contact, and some errors are large: the influence of both is bounded.
         size, miss = J.flatten(1).norm(dim=1), error.norm(dim=1)
-        weight = 1 / ((1 + (size / size.median()).square()) * (1 + miss / miss.median())).sqrt()[:, None]
+        size, large = (x / x.median().clamp(min=1e-9) for x in (size, miss))
+        weight = 1 / ((1 + size.square()) * (1 + large)).sqrt()[:, None]
         A, b = (weight[:, None] * J).flatten(0, 1), (weight * error).flatten()
         print(f"iteration {iteration}: median error {miss.median():.2e}, {describe(args, logs.exp())}")
-        logs = logs + torch.linalg.lstsq(A, b[:, None]).solution[:, 0].clamp(-0.5, 0.5)
+        logs = logs + torch.linalg.lstsq(A, b[:, None], driver="gelsd").solution[:, 0].clamp(-0.5, 0.5)
     return logs.exp()
 
 
@@ -113,6 +114,8 @@ def describe(args: Args, factors: Tensor) -> str:
 
 
 def main(args: Args) -> Tensor:
+    if args.env not in diffsim.TASKS:
+        fail(f"unknown task {args.env!r}: choose from {', '.join(diffsim.TASKS)}")
     env = diffsim.make(args.env, args.segments, horizon=STEPS, contact="mujoco", factors=True)
     if args.recording:
         recording = read(args.recording, env.scene)
