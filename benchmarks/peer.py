@@ -27,9 +27,9 @@ from transfer import FASTEST, mujoco_model
 
 import diffsim
 import ppo_baseline
-from diffsim import Simulator
 from diffsim.training import Count, Positive, Run, fail, graph, parse
 
+PartName = Literal["speed", "train"]
 Name = Literal["hopper", "half_cheetah", "ant", "humanoid"]
 # Contacts and rows of constraints for which mujoco_warp has room in a world; `lost` tells whether they are too few.
 ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64), "humanoid": (24, 96)}
@@ -40,34 +40,33 @@ HORIZON = 32  # control steps of a timed window
 @dataclass
 class Args(ScriptFlags):
     env: tuple[Name, ...] = ("ant", "humanoid")  # tasks
-    parts: tuple[Literal["speed", "train"], ...] = ("speed",)  # what to measure
+    parts: tuple[PartName, ...] = ("speed",)  # what to measure
     num_envs: tuple[Count, ...] = (1024, 4096)  # batch sizes of the speed
     repeats: Count = 10  # windows of 32 control steps; the fastest counts
     seed: int = 1  # seed of the training, which writes to {runs}/ppo_mujoco_warp/{env}__{seed}
     seconds: Positive = 100.0  # of training, after which it stops and saves
 
 
-class MuJoCoWarp(Simulator):
+class MuJoCoWarp(diffsim.Simulator):
     """mujoco_warp in place of a simulator of a task; its steps have no gradients. On a GPU each is one CUDA graph."""
 
-    def __init__(self, sim: Simulator, name: Name) -> None:
+    def __init__(self, sim: diffsim.Simulator, name: Name) -> None:
         import mujoco_warp
 
         super().__init__(sim.scene, sim.num_envs, control_dt=sim.control_dt, **sim.options._asdict())
-        substeps, (contacts, rows) = sim.integration.substeps, ROOM[name]
-        model = mujoco_model(sim.scene, sim.control_dt, substeps)
+        model, (contacts, rows) = mujoco_model(sim.scene, sim.control_dt, sim.integration.substeps), ROOM[name]
         model.opt.iterations, model.opt.ls_iterations = 10, 20  # of Newton's method, which is MuJoCo's default
         kinds, place = mujoco_warp.OverflowType, wp.device_from_torch(self.device)
         self._dropped = int(kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE)
         with wp.ScopedDevice(place):
             m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, sim.num_envs, contacts, njmax=rows)
         m.opt.warn_overflow = 0  # printing from kernels is slow
-        arrays = d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, d.overflow
-        self._qpos, self._qvel, self._ctrl, self._warmstart, self._overflow = map(wp.to_torch, arrays)
+        self._qpos, self._qvel, self._ctrl = map(wp.to_torch, (d.qpos, d.qvel, d.ctrl))
+        self._warmstart, self._overflow = map(wp.to_torch, (d.qacc_warmstart, d.overflow))
 
         def advance() -> None:
             with wp.ScopedDevice(place):
-                for _ in range(substeps):
+                for _ in range(self.integration.substeps):
                     mujoco_warp.step(m, d)
 
         self._advance = advance
@@ -76,8 +75,9 @@ class MuJoCoWarp(Simulator):
             torch.cuda.synchronize(self.device)
             with wp.ScopedDevice(place), wp.ScopedCapture() as capture:
                 advance()
-            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-            self._advance = partial(wp.capture_launch, capture.graph, stream)
+            wp.capture_launch(capture.graph)  # instantiates it
+            torch.cuda.synchronize(self.device)
+            self._advance = partial(wp.capture_launch, capture.graph, wp.stream_from_torch(self.device))
 
     @torch.no_grad()
     def step(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor) -> tuple[Tensor, Tensor]:
