@@ -23,7 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.factors import K_N, MU
+from diffsim.kernels.factors import K_D, K_N, MU
 from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -123,7 +123,10 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         of = constants(m, law, c)
         state = row(numbers, of[0], wp.min(distance - T(numbers[10]), T(0.0)))
         jar = point_velocity(B, p) + of[1] * point_velocity(V, p) + vec3(T(0.0), T(0.0), state[2])
-        return p, jar, vec4(on * state[0], state[1], state[2], state[3]), of
+        D = on * state[0]
+        if wp.static(VARIED):
+            D = law.k_d * D
+        return p, jar, vec4(D, state[1], state[2], state[3]), of
 
     @wp.func
     def add_contacts(
@@ -185,6 +188,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(V, p)) + g_jar[2] * state[2]
                     by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)
                     adj_factors[K_N] = adj_factors[K_N] + by_k / of[0]
+                    adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / law.k_d
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_numbers[c][2]) * by_mu
                 G = force_at(p, g_jar)
                 wrench = force_at(p, f)

@@ -26,7 +26,8 @@ def environment_law(spec: KernelSpec) -> wp.Function:
     def law_of(m: Model, factors: t.array2, e: int):
         law = Law()
         if wp.static(CONTACT and CONSTRAINED and VARIED):
-            law.k_n = read(factors, e, K_N)  # of stiffness over inertia, so of the time constant's inverse square
+            law.k_n = read(factors, e, K_N)  # of the time constant's inverse square
+            law.k_d = read(factors, e, K_D)  # of D, and so of all of a contact's force for one motion
             law.mu = read(factors, e, MU)
         if wp.static(CONTACT and not CONSTRAINED):
             law.k_n = T(m.k_n)

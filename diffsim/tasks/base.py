@@ -16,7 +16,7 @@ from diffsim.sim.integration import Integration
 from diffsim.tasks.mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
-Contact = Literal["soft", "firm", "mujoco"]
+Contact = Literal["soft", "mujoco"]
 
 
 class Firm(NamedTuple):

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 import tyro
 
 from diffsim.sim.integration import PASSES
-from diffsim.tasks import TASKS, HumanoidImitation
+from diffsim.tasks import TASKS, Contact, HumanoidImitation
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
@@ -21,7 +21,6 @@ from diffsim.training.ranges import Count, Fraction, Natural, Range, check_range
 from diffsim.training.variation import parse_ranges
 from diffsim.view import render
 
-RANDOMISED = ("stiffness=0.45:2.2", "friction=0.85:1.17")  # with --contact firm
 ClipFile = Annotated[
     Clip | None,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -51,8 +50,8 @@ class SimulatorFlags:
     """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
     passes: Count = PASSES
     """of Newton's method on the constraints in each substep, with --integrator mujoco"""
-    contact: Literal["soft", "firm", "mujoco"] = "soft"
-    """contact and limits: the paper's springs, firm ones fitted to MuJoCo (docs/transfer.md), or MuJoCo's own"""
+    contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
+    """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md)"""
     penalty: tuple[str, ...] = ()
     """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
     early_termination: bool = True
@@ -133,8 +132,8 @@ class ParallelFlags(Flags):
     """parallel environments N, over all processes of torchrun (per task)"""
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
-    anneal: tuple[Fraction, Fraction] = (0.2, 0.55)
-    """with --contact firm, shares of the iterations between which contact goes from soft to firm"""
+    anneal: tuple[Fraction, Fraction] = (0.0, 0.0)
+    """with --contact mujoco, shares of the iterations between which contact hardens to the robot file's"""
     randomise: tuple[str, ...] = ()
     """ranges of factors drawn for each environment: friction=0.7:1.3 stiffness mass motor (per --contact)"""
     redraw: Count = 10
@@ -144,6 +143,8 @@ class ParallelFlags(Flags):
         super().check()
         if self.anneal[0] > self.anneal[1]:
             fail(f"--anneal {self.anneal[0]} {self.anneal[1]} are the wrong way round")
+        if any(self.anneal) and self.contact != "mujoco":
+            fail(f"--anneal hardens the contact of --contact mujoco; with {self.contact} leave it at 0 0")
         try:
             parse_ranges(self.randomise)
         except ValueError as error:
@@ -201,9 +202,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 
 def _presets(args: Flags) -> dict[str, Any]:
     """What --accuracy and --contact stand for."""
-    ranges = {"randomise": RANDOMISED if args.contact == "firm" else ()} if isinstance(args, ParallelFlags) else {}
     try:
-        return ranges | TASKS[args.env].integration(args.accuracy, args.contact)._asdict()
+        return TASKS[args.env].integration(args.accuracy, args.contact)._asdict()
     except ValueError as error:
         fail(error)
 
@@ -224,10 +224,7 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     words = {word.partition("=")[0] for word in argv}
     if chosen := {name: getattr(given, name) for name in ("accuracy", "contact") if flag(name) in words}:
         # A preset replaces the saved numbers.
-        presets = _presets(dataclasses.replace(defaults, **chosen))
-        if "contact" not in chosen:
-            presets.pop("randomise", None)
-        defaults = dataclasses.replace(defaults, **presets)
+        defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
     for field in dataclasses.fields(kind):

@@ -25,8 +25,8 @@ from diffsim.training.checkpoint import Learner
 from diffsim.training.directory import EpisodeStatistics, Lock, ProgressLog, check_writable
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, make_env, write_evaluation
-from diffsim.training.flags import Flags, ParallelFlags, parse_penalty
-from diffsim.training.variation import Variation, parse_ranges, soft_factors
+from diffsim.training.flags import Flags, ParallelFlags
+from diffsim.training.variation import SOFT, Variation, parse_ranges
 
 L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
@@ -137,12 +137,12 @@ class Run:
         args, size = self.args, num_envs // distributed.size()
         if args.eval_episodes > size:
             self.eval_env.detach()  # makes them now: an error of what does not fit should not wait
-        if not isinstance(args, ParallelFlags) or not (args.contact == "firm" or args.randomise):
+        if not isinstance(args, ParallelFlags) or not (any(args.anneal) or args.randomise):
             self._env = make_env(args, size, horizon, seed)
             return self._env
         self._env = make_env(args, size, horizon, seed, factors=True)
-        begin, end = (share * args.iterations for share in args.anneal) if args.contact == "firm" else (0.0, 0.0)
-        start = soft_factors(self._env.scene, parse_penalty(args.penalty))
+        begin, end = (share * args.iterations for share in args.anneal)
+        start = SOFT if any(args.anneal) else {}
         self._variation = Variation(self._env, start, parse_ranges(args.randomise), (begin, end), args.redraw, seed)
         return self._env
 

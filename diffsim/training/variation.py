@@ -1,22 +1,19 @@
-"""Constants that differ between environments and change over a training: firm contact by degrees, robots of many kinds.
+"""Constants that differ between environments and change over a training: hardening contact, robots of many kinds.
 
-On a ground as firm as a real one gradients are steep before there is a gait. A soft one teaches gaits that only it can
-carry. So the constants begin soft, become firm while the policy learns, and are then
-drawn at random, which keeps the policy from living on one ground's own errors.
+On ground as hard as MuJoCo's gradients are steep before there is a gait. So contact may begin soft and harden while the
+policy learns. Constants drawn at random keep the policy from living on one ground's own errors.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
 from diffsim.env import DiffEnv
-from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import FACTORS, PENALTY_CONSTANTS, Scene
+from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import is_real
 
 # What --randomise may name, and the factors of the simulator that it draws, each by itself.
@@ -26,6 +23,7 @@ VARIED = {
     "mass": ("mass",),
     "motor": ("motor",),
 }
+SOFT = {"k_d": 0.01}  # where --anneal begins: a contact's force at a given motion, as a factor
 SEEDS = 15_485_863  # between the random numbers of one drawing and the next; ranks are 1_000_003 apart
 
 
@@ -57,22 +55,11 @@ def parse_ranges(items: Sequence[str]) -> dict[str, Range]:
     return ranges
 
 
-def soft_factors(scene: Scene, kept: Collection[str] = ()) -> dict[str, float]:
-    """The robot file's own constants of contact and limits, as factors of the scene's; those kept are left out."""
-    soft, factors = load_scene(scene.path), {}
-    for name in PENALTY_CONSTANTS.keys() - kept:
-        (own, firm) = (np.atleast_1d(getattr(s, name)) for s in (soft, scene))
-        used = firm > 0
-        if used.any():
-            factors[name] = float(np.median(own[used] / firm[used]))
-    return factors
-
-
 class Variation:
     """Sets the factors of an environment's constants, before each iteration, as the iteration alone decides.
 
     With progress t from 0 to 1 a constant is start^(1 - t) of its own, times a random factor whose range opens as t
-    does; damping of a limit, which the soft limit lacks, goes with t.
+    does.
 
     Args:
         env: made with factors.
@@ -112,5 +99,4 @@ class Variation:
         self._present = t, drawing
         generator = torch.Generator().manual_seed(self.seed + SEEDS * drawing)
         uniform = torch.rand(self.factors.shape, generator=generator)
-        base = torch.where(self.start > 0, self.start.clamp(min=1e-30) ** (1 - t), torch.full_like(self.start, t))
-        self.factors.copy_(base * (t * (self.least + self.width * uniform)).exp())
+        self.factors.copy_(self.start ** (1 - t) * (t * (self.least + self.width * uniform)).exp())
