@@ -4,8 +4,8 @@
     python benchmarks/peer.py --parts train --env ant --seconds 100      ppo_baseline.py, trained in mujoco_warp
     python benchmarks/transfer.py runs/learning/ppo_mujoco_warp/ant__1   judges its policy here and in MuJoCo
 
-It needs `pip install -e ".[peer]"`. What follows "--" goes to ppo_baseline.py. mujoco_warp has at most 10 iterations of
-Newton's method, 20 of the line search, as in its own benchmark of a humanoid; this simulator has four passes.
+What follows "--" goes to ppo_baseline.py. mujoco_warp has at most 10 iterations of Newton's method and 20 of the line
+search, as in its own benchmark of a humanoid; this simulator has four passes.
 """
 
 from __future__ import annotations
@@ -82,15 +82,15 @@ class MuJoCoWarp(diffsim.Simulator):
     @torch.no_grad()
     def step(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor) -> tuple[Tensor, Tensor]:
         """As a Simulator's; a robot that was put elsewhere since the last step, by a reset, has no warm start."""
-        moved = (qpos != self._qpos).any(1, keepdim=True) | (qvel != self._qvel).any(1, keepdim=True)
-        self._warmstart.masked_fill_(moved, 0.0)
+        moved = (qpos != self._qpos).any(1) | (qvel != self._qvel).any(1)
+        self._warmstart.masked_fill_(moved[:, None], 0.0)
         self._qpos.copy_(qpos)
         self._qvel.copy_(qvel)
         self._ctrl.copy_(ctrl)  # the range of all motors of these tasks is [-1, 1]
         self._advance()
-        fine = (self._qvel.abs() < FASTEST).all(1, keepdim=True) & self._qpos.isfinite().all(1, keepdim=True)
-        self.nonfinite.copy_(~fine.squeeze(1))
-        return torch.where(fine, self._qpos, qpos), torch.where(fine, self._qvel, qvel)
+        lost = ~((self._qvel.abs() < FASTEST).all(1) & self._qpos.isfinite().all(1))
+        self.nonfinite.copy_(lost)
+        return self._qpos.where(~lost[:, None], qpos), self._qvel.where(~lost[:, None], qvel)
 
     def lost(self) -> Tensor:
         """() how many robots have ever had contacts that found no room."""
@@ -102,24 +102,24 @@ def measure_speed(args: Args, name: Name) -> Iterator[Row]:
     for num_envs in args.num_envs:
         env = diffsim.make(name, num_envs, args.device, seed=0, horizon=HORIZON, contact="mujoco")
         first, actions = 2 * torch.rand(2, HORIZON, num_envs, env.scene.nu, device=env.device) - 1
-        with torch.no_grad():
-            for action in first:
-                env.step(action)
+        for action in first:
+            env.step(action)
         peer, start = MuJoCoWarp(env.sim, name), (env.qpos, env.qvel, actions.requires_grad_())
         (theirs, *_), (forward, _, both) = windows(peer, *start), windows(env.sim, *start)
         calls = theirs, *(graph.capture(call, env.device) for call in (forward, both))
         other, here, backward = (HORIZON * num_envs / min(timed(call, env.device, 3, args.repeats)) for call in calls)
-        row = {"task": name, "environments": num_envs, "mujoco_warp": other, "here": here}
-        row |= {"forward and backward": backward, "ratio": here / other, "ratio of both": backward / other}
-        yield row | {"lost": int(peer.lost()), "version": metadata.version("mujoco-warp")}
+        row = {"task": name, "environments": num_envs, "mujoco_warp": other, "here": here, "ratio": here / other}
+        row |= {"forward and backward": backward, "ratio of both": backward / other, "lost": int(peer.lost())}
+        yield row | {"version": metadata.version("mujoco-warp")}
         graph.release()
 
 
 def train(args: Args, name: Name) -> Iterator[Row]:
     """ppo_baseline.py's training, for some seconds. Its rollout is no CUDA graph: each control step in it is one."""
-    folder = args.runs / "ppo_mujoco_warp" / f"{name}__{args.seed}"
     flags = f"--env {name} --seed {args.seed} --device {args.device} --contact mujoco {PPO} --run-dir".split()
-    settings = parse(ppo_baseline.Args, [*flags, str(folder), *args.arguments])
+    settings = parse(ppo_baseline.Args, [*flags, f"{args.runs}/ppo_mujoco_warp/{name}__{args.seed}", *args.arguments])
+    if settings.contact != "mujoco" or settings.randomise or any(settings.anneal):
+        fail("mujoco_warp has its own contact, which does not vary: leave out --contact, --randomise and --anneal")
     training = Run(settings)
     training.simulator = "mujoco_warp"
     env = training.make_env(settings.num_envs, settings.horizon)
@@ -130,7 +130,7 @@ def train(args: Args, name: Name) -> Iterator[Row]:
         training.log(ppo.roll_out() | update() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
         if training.seconds >= args.seconds:
             training.last = settings.iterations = iteration
-    yield {"task": name, "seed": args.seed, **read_csv(folder / "progress.csv")[-1]}
+    yield {"task": name, "seed": args.seed, **read_csv(training.directory / "progress.csv")[-1]}
 
 
 PARTS = {

@@ -10,6 +10,7 @@ import pytest
 import torch
 import transfer
 from common import parse
+from learners import refusal
 from tables import read_csv
 
 import diffsim
@@ -52,3 +53,8 @@ def test_the_commands(tmp_path: Path) -> None:
     saved = load_policy(tmp_path / "ppo_mujoco_warp" / "hopper__1" / "checkpoint.pt")
     assert (saved.simulator, saved.script, saved.iteration) == ("mujoco_warp", "ppo_baseline", int(row["iteration"]))
     assert make_policy_env(saved, 1).sim.integration == diffsim.Integration("mujoco", 4)
+
+
+def test_what_mujoco_warp_does_not_vary(capsys: pytest.CaptureFixture[str]) -> None:
+    args = parse(peer.Args, None, "--device cpu --env hopper --parts train -- --randomise friction=0.7:1.3".split())
+    assert "leave out --contact, --randomise and --anneal" in refusal(lambda: peer.main(args), capsys)
