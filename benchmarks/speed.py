@@ -228,6 +228,21 @@ def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
             yield time_window(name, num_envs, horizon, technique)
 
 
+def windows(
+    sim: Simulator, qpos: torch.Tensor, qvel: torch.Tensor, actions: torch.Tensor
+) -> tuple[Callable[[], torch.Tensor], ...]:
+    """Control steps with actions (H, N, nu) from a state: without gradients, differentiably, with the backward pass."""
+
+    def forward() -> torch.Tensor:
+        sim.rewind()
+        q, v = qpos, qvel
+        for action in actions.unbind():
+            q, v = sim.step(q, v, action)
+        return q.sum() + v.sum()
+
+    return torch.no_grad()(forward), forward, lambda: torch.autograd.grad(forward(), actions)[0]
+
+
 def time_window(name: TaskName, num_envs: int, horizon: int, technique: str) -> Row:
     """A window of control steps without gradients, differentiably, and with its backward pass."""
     device = torch.device("cuda" if "cuda" in technique else "cpu")
@@ -242,17 +257,8 @@ def time_window(name: TaskName, num_envs: int, horizon: int, technique: str) -> 
     sim = simulator(
         env.scene, default, num_envs, horizon=horizon, device=device.type, threads=threads, division=division
     )
-    start_qpos, start_qvel = env.qpos.clone(), env.qvel.clone()
     actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()
-
-    def forward() -> torch.Tensor:
-        sim.rewind()
-        qpos, qvel = start_qpos, start_qvel
-        for action in actions.unbind():
-            qpos, qvel = sim.step(qpos, qvel, action)
-        return qpos.sum() + qvel.sum()
-
-    calls = (torch.no_grad()(forward), forward, lambda: torch.autograd.grad(forward(), actions)[0])
+    calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)
     captured = [graph.capture(call, device) if "graph" in technique else call for call in calls]
     no_grad, one_way, both = (min(timed(call, device, warmup=3, calls=4)) for call in captured)
     return {

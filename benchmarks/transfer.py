@@ -1,4 +1,4 @@
-"""What policies keep of their speed in MuJoCo: the accuracy of the contact model, not of the integration.
+"""What policies keep of their speed in another simulator: of those trained here in MuJoCo, and the other way round.
 
     python benchmarks/transfer.py runs/learning/shac/ant__1            a run, or a checkpoint of any learner's script
     python benchmarks/transfer.py runs/learning/*/* --friction 0.5 0.7 1 1.3 1.5
@@ -6,10 +6,13 @@
 
 A policy acts from the same start states in several worlds, of which each step changes one thing:
 
-    here        this simulator, as in training
-    finer       this simulator with finer, explicit steps: the integration
-    MuJoCo x1   MuJoCo with its own contact and limits on the same file: the model of contact and limits
-    MuJoCo x0.5 and so on, with other friction
+    here         this simulator, as in training
+    finer        this simulator with finer steps, explicit ones unless its contact is MuJoCo's: the integration
+    MuJoCo same  of contact mujoco: MuJoCo with the substeps and the elliptic cones of the training: the same law
+    MuJoCo x1    MuJoCo with its own contact and limits, cones and timestep on the same file
+    MuJoCo x0.5  and so on, with other friction
+
+A policy that peer.py trained in mujoco_warp was trained in "MuJoCo same", and what it keeps is its share of that speed.
 
 Writes transfer.csv, a row for each policy and world, and with --update-results the table of docs/transfer.md. The video
 shows the same start here (left) and in MuJoCo (right).
@@ -18,7 +21,7 @@ shows the same start here (left) and in MuJoCo (right).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -39,6 +42,7 @@ from diffsim import DiffEnv, Integration, Scene, Simulator, load_scene
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Task
 from diffsim.training import Count, Positive, fail
+from diffsim.training.checkpoint import HOME
 from diffsim.training.evaluation import FINER, SEED, travels
 from diffsim.view import gait, render
 
@@ -46,6 +50,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 KEY = (*ABOUT[:-1], "condition")
+SAME = "MuJoCo same"  # with the law and the substeps of contact mujoco
 FASTEST = 1e5  # m/s or rad/s; beyond it a robot is lost, as in Simulator
 
 mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable, which World.step says
@@ -81,21 +86,44 @@ class Here:
         return q, v, alive & self.sim.nonfinite.numpy(force=True)
 
 
+def mujoco_model(scene: Scene, control_dt: float, substeps: int | None = None) -> mujoco.MjModel:
+    """A scene's file as MuJoCo reads it, with the fewest steps of equal length that are no longer than the file's.
+
+    Given substeps of a control step, with those and elliptic cones: the law of --contact mujoco.
+    """
+    model = mujoco.MjModel.from_xml_path(scene.path)
+    if substeps is not None:
+        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    model.opt.timestep = control_dt / (substeps or math.ceil(control_dt / model.opt.timestep - 1e-6))
+    return model
+
+
 class MuJoCo:
     """N robots in MuJoCo with its own contact and limits on a scene's file.
 
     Args:
         scene: its file is read again, whose mu is the friction of all geoms, whatever the scene's own is.
         num_envs: number of robots N.
-        control_dt: s of a control step, which takes the fewest steps that are no longer than the file's.
-        friction: factor on that mu.
+        control_dt: s of a control step.
+        friction: factor on that friction.
+        own_friction: each geom keeps the friction that the file gives it, in place of the springs' mu.
+        substeps: see mujoco_model.
     """
 
-    def __init__(self, scene: Scene, num_envs: int, control_dt: float, friction: float = 1.0) -> None:
-        self.model = mujoco.MjModel.from_xml_path(scene.path)
-        self.model.geom_friction[:, 0] = friction * load_scene(scene.path).mu
-        self.substeps = math.ceil(control_dt / self.model.opt.timestep - 1e-6)
-        self.model.opt.timestep = control_dt / self.substeps
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int,
+        control_dt: float,
+        friction: float = 1.0,
+        own_friction: bool = False,
+        substeps: int | None = None,
+    ) -> None:
+        self.model = mujoco_model(scene, control_dt, substeps)
+        self.substeps = round(control_dt / self.model.opt.timestep)
+        if not own_friction:
+            self.model.geom_friction[:, 0] = load_scene(scene.path).mu
+        self.model.geom_friction[:, 0] *= friction
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
         low, high = self.model.actuator_ctrlrange.T
@@ -214,14 +242,19 @@ def measure(motion: Motion, scene: Scene, control_dt: float) -> dict[str, object
     return row | {"penetration": middle, "penetration 95 %": most}
 
 
-def conditions(case: Case, args: Args) -> Iterator[tuple[str, World]]:
-    """The worlds, by the names that the csv gives them."""
-    env, scene, n = case.env, case.env.scene, case.env.num_envs
-    yield "here", Here(env.sim)
-    finer = Integration("semi_implicit", args.finer * env.task.substeps)
-    yield "finer", Here(Simulator(scene, n, finer, env.control_dt, device=env.device))
+def conditions(case: Case, args: Args) -> dict[str, World]:
+    """The worlds, by the names that the csv gives them; the first is that of the training."""
+    env, scene, n, how = case.env, case.env.scene, case.env.num_envs, case.env.sim.integration
+    exact, dt = how.integrator == "mujoco", env.control_dt
+    finer = how._replace(substeps=args.finer * how.substeps)
+    if not exact:
+        finer = Integration("semi_implicit", args.finer * env.task.substeps)
+    worlds: dict[str, World] = {SAME: MuJoCo(scene, n, dt, 1.0, exact, how.substeps)} if exact else {}
+    worlds |= {"here": Here(env.sim), "finer": Here(Simulator(scene, n, finer, dt, device=env.device))}
+    first = SAME if exact and case.saved.simulator != HOME else "here"
     for friction in args.friction if scene.ncontact else (1.0,):
-        yield f"MuJoCo x{friction:g}", MuJoCo(scene, n, env.control_dt, friction)
+        worlds[f"MuJoCo x{friction:g}"] = MuJoCo(scene, n, dt, friction, own_friction=exact)
+    return {first: worlds[first], **worlds}
 
 
 def compare(case: Case, args: Args) -> dict[str, Motion]:
@@ -230,13 +263,14 @@ def compare(case: Case, args: Args) -> dict[str, Motion]:
     env.reset(seed=SEED)
     qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
     task, motions, own = type(env.task)(dtype=torch.float64), dict[str, Motion](), math.nan
-    for name, world in conditions(case, args):
+    for name, world in conditions(case, args).items():
         motion = motions[name] = act(world, task, case.saved.network, qpos, qvel, env.scene.nu, args.steps)
         found = measure(motion, env.scene, env.control_dt)
         if isinstance(value := found["speed"], float):
-            own = value if name == "here" else own
+            own = value if len(motions) == 1 else own
             found["kept"] = value / own
-        row = case.about | {"integrator": how.integrator, "substeps": how.substeps, "condition": name}
+        row = case.about | {"trained in": case.saved.simulator, "condition": name}
+        row |= {"integrator": how.integrator, "substeps": how.substeps}
         row |= found | {column: getattr(args, column) for column in ("episodes", "steps", "finer")}
         args.keep("transfer", row, KEY)
     return motions
@@ -253,7 +287,8 @@ def middle(rows: Sequence[dict[str, str]], column: str, form: str) -> str:
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task, contact and learner, over its seeds: medians of the speed in each world in m/s, or of the
-    return of a robot that does not travel, mean shares of whole episodes in MuJoCo, medians of the feet's penetration.
+    return of a robot that does not travel, what is kept of the training's own speed in the world that judges, mean
+    shares of whole episodes here and in MuJoCo, medians of the feet's penetration.
 
     Runs that are not named {learner}/{task}__{seed} have a line each.
     """
@@ -262,17 +297,20 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft")):
         folder, _, run = row["checkpoint"].rpartition("/")
         learner = folder if run == f"{row['task']}__{row['seed']}" else row["checkpoint"]
-        key = row["task"], row["contact"], learner
+        key = row["task"], row["contact"], learner, row.get("trained in") or HOME
         groups.setdefault(key, {}).setdefault(row["condition"], []).append(row)
-    names = {name for group in groups.values() for name in group if name.startswith("MuJoCo")}
+    names = {name for group in groups.values() for name in group if name.startswith("MuJoCo x")}
     order, lines = sorted(names, key=lambda name: float(name.partition("x")[2])), list[Row]()
-    for (task, contact, learner), group in groups.items():
+    same = [SAME] if any(SAME in group for group in groups.values()) else []
+    for (task, contact, learner, home), group in groups.items():
         here, there = group["here"], group.get("MuJoCo x1", [])
         unit = ("speed", ".2f") if here[0]["speed"] else ("return", ".0f")
-        kept = [float(row["kept"]) for row in there if row["kept"]]
-        shares = [mean(float(row["whole"]) for row in group[name]) for name in order if name in group]
+        trained, judge = ("here", "MuJoCo x1") if home == HOME else (home, "here")
+        kept = [float(row["kept"]) for row in group.get(judge, []) if row["kept"]]
+        shares = [mean(float(row["whole"]) for row in group[name]) for name in ("here", *order) if name in group]
         line: Row = {"task": task, "contact": contact, "learner": learner, "seeds": len(here)}
-        line = {**line, **{name: middle(group.get(name, []), *unit) for name in ("here", *order)}}
+        line = {**line, **{name: middle(group.get(name, []), *unit) for name in ("here", *same, *order)}}
+        line = {**line, "trained in": trained, "judged in": judge}
         line = {**line, "kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
         line = {**line, "whole": " / ".join(f"{share:.0%}" for share in shares)}
         depths = {"depth here": here, "depth MuJoCo x1": there}

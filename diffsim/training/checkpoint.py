@@ -22,6 +22,7 @@ from diffsim.training.layers import Likeliest, ObsNormalizer
 from diffsim.training.ranges import fits
 
 FORMAT = 2
+HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one
 
 # What a policy may consist of, and the attributes that its constructor takes.
 LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
@@ -52,12 +53,14 @@ class SavedPolicy:
     Attributes:
         network: observations (..., obs_dim) -> actions (..., nu).
         script, args, iteration: which script trained it, with which arguments (env among them), for how long.
+        simulator: in which it was trained.
     """
 
     network: nn.Sequential
     script: str
     args: dict[str, Any]
     iteration: int
+    simulator: str = HOME
 
 
 def parts(learner: Learner) -> dict[str, Any]:
@@ -206,13 +209,14 @@ def load_policy(path: Path) -> SavedPolicy:
         network.load_state_dict({name: w.to(kinds[name]) for name, w in weights.items()}, assign=True)
     except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers or its task")
-    return SavedPolicy(network, state["script"], state["args"], state["iteration"])
+    return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))
 
 
 def export_policy(path: Path, output: Path) -> None:
     """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB."""
     state = load(path)
-    _write(output, {name: state[name] for name in ("format", "script", "args", "iteration", "policy")})
+    names = ("format", "script", "args", "iteration", "simulator", "policy")
+    _write(output, {name: state[name] for name in names if name in state})
 
 
 def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:

@@ -90,7 +90,10 @@ class Run:
         iteration: the present one.
         directory: where it writes.
         device: where it computes.
+        simulator: which one its environments have, see SavedPolicy.
     """
+
+    simulator = checkpoint.HOME
 
     def __init__(self, args: Flags) -> None:
         assert args.run_dir
@@ -361,6 +364,7 @@ class Run:
         args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
         state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
+        state |= dict(simulator=self.simulator)
         with self._writing():
             checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
         self._saved = self.iteration

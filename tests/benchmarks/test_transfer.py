@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -92,6 +93,39 @@ def test_friction_is_that_of_the_file_times_a_factor() -> None:
     assert world.model.geom_friction[:, 0] == pytest.approx(1.5 * 0.75)
     assert world.substeps == 16 and world.substeps * world.model.opt.timestep == pytest.approx(DT)
     assert transfer.MuJoCo(diffsim.make("walker", 1).scene, 1, DT).substeps == 17  # of 1 ms at most
+    assert transfer.MuJoCo(scene, 1, DT, 1.5, own_friction=True).model.geom_friction[:, 0] == pytest.approx(1.5)
+
+
+def test_the_same_law_differs_from_the_file_in_cones_and_steps_alone() -> None:
+    scene = diffsim.make("hopper", 1, contact="mujoco").scene
+    own, same = (transfer.MuJoCo(scene, 1, DT, 1.0, True, substeps) for substeps in (None, 4))
+    assert (own.substeps, same.substeps) == (16, 4) and same.model.opt.timestep == pytest.approx(DT / 4)
+    assert (own.model.opt.cone, same.model.opt.cone) == (
+        mujoco.mjtCone.mjCONE_PYRAMIDAL,
+        mujoco.mjtCone.mjCONE_ELLIPTIC,
+    )
+    file = mujoco.MjModel.from_xml_path(scene.path)
+    assert (own.model.geom_friction == file.geom_friction).all() and own.model.opt.timestep == file.opt.timestep
+
+
+@pytest.mark.parametrize("simulator", ["diffsim", "mujoco_warp"])
+def test_what_is_kept_counts_from_the_world_of_the_training(simulator: str, tmp_path: Path) -> None:
+    state = torch.load(POLICIES / "hopper.pt", weights_only=True)
+    exact = {"contact": "mujoco", "integrator": "mujoco", "substeps": 4, "theta": 0.0, "passes": 4}
+    path, folder = tmp_path / "ppo" / "hopper__1" / "checkpoint.pt", tmp_path / "csv"
+    path.parent.mkdir(parents=True)
+    args = state["args"] | exact | {"seed": 1}
+    torch.save(state | {"args": args} | ({"simulator": simulator} if simulator != "diffsim" else {}), path)
+    flags = "--episodes 2 --steps 20 --friction 1 --output".split()
+    transfer.main(parse(transfer.Args, None, [str(path), *flags, str(folder)]))
+    rows = {row["condition"]: row for row in read_csv(folder / "transfer.csv")}
+    trained, judge = ("here", "MuJoCo x1") if simulator == "diffsim" else ("MuJoCo same", "here")
+    assert {*rows} == {"here", "finer", "MuJoCo same", "MuJoCo x1"} and [*rows][0] == trained
+    kept = float(rows[judge]["speed"]) / float(rows[trained]["speed"])
+    assert float(rows[trained]["kept"]) == 1 and float(rows[judge]["kept"]) == pytest.approx(kept, rel=0.01)
+    assert float(rows["here"]["speed"]) == pytest.approx(float(rows["MuJoCo same"]["speed"]), rel=0.01)  # one law
+    (line,) = transfer.table([*rows.values()])
+    assert (line["judged in"], line["kept"]) == (judge, f"{float(rows[judge]['kept']):.0%}")
 
 
 # The command ----------------------------------------------------------------------------------------------------------
@@ -113,8 +147,8 @@ def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.
     assert all(row["return"] and not row["speed"] + row["penetration"] for row in cartpole)
     alone, travelling = transfer.table(rows)
     assert markdown([alone, travelling]) in capsys.readouterr().out
-    assert [*alone] == ["task", "contact", "learner", "seeds", "here", "MuJoCo x0.5", "MuJoCo x1", "kept", "worst"] + [
-        *("whole", "depth here", "depth MuJoCo x1")
+    assert [*alone] == ["task", "contact", "learner", "seeds", "here", "MuJoCo x0.5", "MuJoCo x1", "trained in"] + [
+        *("judged in", "kept", "worst", "whole", "depth here", "depth MuJoCo x1")
     ]
     # Cartpole touches nothing: a return, the same in MuJoCo.
     assert float(alone["here"]) == pytest.approx(float(alone["MuJoCo x1"]), rel=0.02) and alone["kept"] == ""
@@ -131,7 +165,10 @@ def test_the_table_joins_seeds() -> None:
             row = own | {"condition": name, "speed": str(value), "return": "5", "kept": kept, "penetration": depth}
             rows.append(row | {"whole": str(whole)})
     (line,) = transfer.table(rows)
-    assert [*map(str, line.values())] == "ant firm shac_firm 3 3.00 2.00 90% 50% 80% 30.0 20.0".split()
+    assert [*map(str, line.values())] == [
+        *"ant firm shac_firm 3 3.00 2.00 here".split(),
+        *("MuJoCo x1", "90%", "50%", "80% / 80%", "30.0", "20.0"),
+    ]
 
 
 @pytest.mark.parametrize(

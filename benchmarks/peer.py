@@ -1,0 +1,150 @@
+"""mujoco_warp, MuJoCo's own simulator for GPUs, beside this one with --contact mujoco: the same law and substeps.
+
+    python benchmarks/peer.py                                            control steps per second of both
+    python benchmarks/peer.py --parts train --env ant --seconds 100      ppo_baseline.py, trained in mujoco_warp
+    python benchmarks/transfer.py runs/learning/ppo_mujoco_warp/ant__1   judges its policy here and in MuJoCo
+
+What follows "--" goes to ppo_baseline.py. mujoco_warp has at most 10 iterations of Newton's method and 20 of the line
+search, as in its own benchmark of a humanoid; this simulator has four passes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib import metadata, util
+from typing import Literal
+
+import torch
+import warp as wp
+from common import Part, measured, run
+from runner import ScriptFlags
+from speed import timed, windows
+from tables import Row, read_csv
+from torch import Tensor
+from transfer import FASTEST, mujoco_model
+
+import diffsim
+import ppo_baseline
+from diffsim.training import Count, Positive, Run, fail, graph, parse
+
+PartName = Literal["speed", "train"]
+Name = Literal["hopper", "half_cheetah", "ant", "humanoid"]
+# Contacts and rows of constraints for which mujoco_warp has room in a world; `lost` tells whether they are too few.
+ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64), "humanoid": (24, 96)}
+PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
+HORIZON = 32  # control steps of a timed window
+
+
+@dataclass
+class Args(ScriptFlags):
+    env: tuple[Name, ...] = ("ant", "humanoid")  # tasks
+    parts: tuple[PartName, ...] = ("speed",)  # what to measure
+    num_envs: tuple[Count, ...] = (1024, 4096)  # batch sizes of the speed
+    repeats: Count = 10  # windows of 32 control steps; the fastest counts
+    seed: int = 1  # seed of the training, which writes to {runs}/ppo_mujoco_warp/{env}__{seed}
+    seconds: Positive = 100.0  # of training, after which it stops and saves
+
+
+class MuJoCoWarp(diffsim.Simulator):
+    """mujoco_warp in place of a simulator of a task; its steps have no gradients. On a GPU each is one CUDA graph."""
+
+    def __init__(self, sim: diffsim.Simulator, name: Name) -> None:
+        import mujoco_warp
+
+        super().__init__(sim.scene, sim.num_envs, control_dt=sim.control_dt, **sim.options._asdict())
+        model, (contacts, rows) = mujoco_model(sim.scene, sim.control_dt, sim.integration.substeps), ROOM[name]
+        model.opt.iterations, model.opt.ls_iterations = 10, 20  # of Newton's method, which is MuJoCo's default
+        kinds, place = mujoco_warp.OverflowType, wp.device_from_torch(self.device)
+        self._dropped = int(kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE)
+        with wp.ScopedDevice(place):
+            m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, sim.num_envs, contacts, njmax=rows)
+        m.opt.warn_overflow = 0  # printing from kernels is slow
+        self._qpos, self._qvel, self._ctrl = map(wp.to_torch, (d.qpos, d.qvel, d.ctrl))
+        self._warmstart, self._overflow = map(wp.to_torch, (d.qacc_warmstart, d.overflow))
+
+        def advance() -> None:
+            with wp.ScopedDevice(place):
+                for _ in range(self.integration.substeps):
+                    mujoco_warp.step(m, d)
+
+        self._advance = advance
+        if self.device.type == "cuda":
+            advance()  # compiles and loads all kernels, which a capture cannot
+            torch.cuda.synchronize(self.device)
+            with wp.ScopedDevice(place), wp.ScopedCapture() as capture:
+                advance()
+            wp.capture_launch(capture.graph)  # instantiates it
+            torch.cuda.synchronize(self.device)
+            self._advance = partial(wp.capture_launch, capture.graph, wp.stream_from_torch(self.device))
+
+    @torch.no_grad()
+    def step(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor) -> tuple[Tensor, Tensor]:
+        """As a Simulator's; a robot that was put elsewhere since the last step, by a reset, has no warm start."""
+        moved = (qpos != self._qpos).any(1) | (qvel != self._qvel).any(1)
+        self._warmstart.masked_fill_(moved[:, None], 0.0)
+        self._qpos.copy_(qpos)
+        self._qvel.copy_(qvel)
+        self._ctrl.copy_(ctrl)  # the range of all motors of these tasks is [-1, 1]
+        self._advance()
+        lost = ~((self._qvel.abs() < FASTEST).all(1) & self._qpos.isfinite().all(1))
+        self.nonfinite.copy_(lost)
+        return self._qpos.where(~lost[:, None], qpos), self._qvel.where(~lost[:, None], qvel)
+
+    def lost(self) -> Tensor:
+        """() how many robots have ever had contacts that found no room."""
+        return ((self._overflow & self._dropped) != 0).sum()
+
+
+def measure_speed(args: Args, name: Name) -> Iterator[Row]:
+    """Control steps per second of physics, under the same random actions from states to which such actions have led."""
+    for num_envs in args.num_envs:
+        env = diffsim.make(name, num_envs, args.device, seed=0, horizon=HORIZON, contact="mujoco")
+        first, actions = 2 * torch.rand(2, HORIZON, num_envs, env.scene.nu, device=env.device) - 1
+        for action in first:
+            env.step(action)
+        peer, start = MuJoCoWarp(env.sim, name), (env.qpos, env.qvel, actions.requires_grad_())
+        (theirs, *_), (forward, _, both) = windows(peer, *start), windows(env.sim, *start)
+        calls = theirs, *(graph.capture(call, env.device) for call in (forward, both))
+        other, here, backward = (HORIZON * num_envs / min(timed(call, env.device, 3, args.repeats)) for call in calls)
+        row = {"task": name, "environments": num_envs, "mujoco_warp": other, "here": here, "ratio": here / other}
+        row |= {"forward and backward": backward, "ratio of both": backward / other, "lost": int(peer.lost())}
+        yield row | {"version": metadata.version("mujoco-warp")}
+        graph.release()
+
+
+def train(args: Args, name: Name) -> Iterator[Row]:
+    """ppo_baseline.py's training, for some seconds. Its rollout is no CUDA graph: each control step in it is one."""
+    flags = f"--env {name} --seed {args.seed} --device {args.device} --contact mujoco {PPO} --run-dir".split()
+    settings = parse(ppo_baseline.Args, [*flags, f"{args.runs}/ppo_mujoco_warp/{name}__{args.seed}", *args.arguments])
+    if settings.contact != "mujoco" or settings.randomise or any(settings.anneal):
+        fail("mujoco_warp has its own contact, which does not vary: leave out --contact, --randomise and --anneal")
+    training = Run(settings)
+    training.simulator = "mujoco_warp"
+    env = training.make_env(settings.num_envs, settings.horizon)
+    env.sim = peer = MuJoCoWarp(env.sim, name)
+    ppo = training.restore(ppo_baseline.PPO(settings, env))
+    update = training.capture(ppo.update)
+    for iteration in training:
+        training.log(ppo.roll_out() | update() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
+        if training.seconds >= args.seconds:
+            training.last = settings.iterations = iteration
+    yield {"task": name, "seed": args.seed, **read_csv(training.directory / "progress.csv")[-1]}
+
+
+PARTS = {
+    "speed": Part("peer_speed", measure_speed, ("task", "environments"), "peer_speed", "performance.md"),
+    "train": Part("peer_train", train, ("task", "seed")),
+}
+
+
+def main(args: Args) -> None:
+    if not util.find_spec("mujoco_warp"):
+        fail("mujoco_warp is missing: pip install -e '.[peer]'")
+    for part in args.parts:
+        measured(args, PARTS[part])
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)

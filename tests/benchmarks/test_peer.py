@@ -1,0 +1,60 @@
+"""mujoco_warp as the simulator of a task, and what benchmarks/peer.py makes of it. Slow: it compiles for a minute."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import peer
+import pytest
+import torch
+import transfer
+from common import parse
+from learners import refusal
+from tables import read_csv
+
+import diffsim
+from diffsim.training import load_policy, make_policy_env
+
+pytest.importorskip("mujoco_warp")
+
+
+@pytest.mark.slow
+@torch.no_grad()
+def test_a_step_is_mujoco_s_and_ours() -> None:
+    """Through a fall to the ground, with a reset; and a robot that is lost stays where it was."""
+    env = diffsim.make("hopper", 2, seed=0, contact="mujoco", max_episode_steps=40)
+    other = peer.MuJoCoWarp(env.sim, "hopper")
+    world = transfer.MuJoCo(env.scene, 2, env.control_dt, 1.0, True, env.sim.integration.substeps)
+    errors, touching = [], 0
+    for _ in range(60):
+        action = 2 * torch.rand(2, 3, generator=env.generator) - 1
+        state = (x.double().numpy() for x in (env.qpos, env.qvel, action))
+        expected = world.step(*state, np.ones(2, bool))[:2]
+        found = [sim.step(env.qpos, env.qvel, action) for sim in (other, env.sim)]
+        errors.append([[np.abs(x.numpy() - y).max() for x, y in zip(f, expected, strict=True)] for f in found])
+        touching += sum(data.ncon for data in world.data)
+        env.step(action)
+    assert (np.quantile(errors, 0.95, axis=0) < 1e-4).all()  # rounding decides when a contact begins
+    assert touching and other.lost() == 0 and not other.nonfinite.any()
+    qvel = torch.tensor([[0.0] * 6, [2e5] + [0.0] * 5])
+    assert (other.step(env.qpos, qvel, action)[0][1] == env.qpos[1]).all() and other.nonfinite.tolist() == [False, True]
+
+
+def test_the_commands(tmp_path: Path) -> None:
+    flags = ["--device", "cpu", "--env", "hopper", "--output", str(tmp_path)]
+    peer.main(parse(peer.Args, None, [*flags, "--num-envs", "2", "--repeats", "1"]))
+    (row,) = read_csv(tmp_path / "peer_speed.csv")
+    assert row["lost"] == "0" and all(float(row[name]) > 0 for name in ("mujoco_warp", "here", "forward and backward"))
+    own = "--num-envs 2 --minibatch-size 8 --horizon 4 --eval-episodes 2 --quiet".split()
+    training = ["--parts", "train", "--seconds", "0.1", "--runs", str(tmp_path), "--", *own]
+    peer.main(parse(peer.Args, None, [*flags, *training]))
+    (row,) = read_csv(tmp_path / "peer_train.csv")
+    saved = load_policy(tmp_path / "ppo_mujoco_warp" / "hopper__1" / "checkpoint.pt")
+    assert (saved.simulator, saved.script, saved.iteration) == ("mujoco_warp", "ppo_baseline", int(row["iteration"]))
+    assert make_policy_env(saved, 1).sim.integration == diffsim.Integration("mujoco", 4)
+
+
+def test_what_mujoco_warp_does_not_vary(capsys: pytest.CaptureFixture[str]) -> None:
+    args = parse(peer.Args, None, "--device cpu --env hopper --parts train -- --randomise friction=0.7:1.3".split())
+    assert "leave out --contact, --randomise and --anneal" in refusal(lambda: peer.main(args), capsys)
