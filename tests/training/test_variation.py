@@ -8,41 +8,31 @@ from pathlib import Path
 import pytest
 import torch
 from learners import assert_same, refusal, run
-from scenes import ROBOTS
 
 import diffsim
 import ppo_baseline
 import shac
-from diffsim import TASKS
 from diffsim.robot.scene import FACTORS
 from diffsim.training import parse
-from diffsim.training.flags import RANDOMISED
-from diffsim.training.variation import Range, Variation, parse_ranges, soft_factors
-
-FIRM = sorted(name for name in ROBOTS if hasattr(TASKS[name], "firm"))
+from diffsim.training.variation import SOFT, Range, Variation, parse_ranges
 
 
 @pytest.fixture(scope="module")
 def env() -> diffsim.DiffEnv:
-    return diffsim.make("hopper", 2000, contact="firm", factors=True)
+    return diffsim.make("hopper", 2000, contact="mujoco", factors=True)
 
 
 def column(env: diffsim.DiffEnv, name: str) -> torch.Tensor:
     return env.sim.factors[:, FACTORS.index(name)]
 
 
-def test_contact_goes_from_the_files_to_the_firm_one(env: diffsim.DiffEnv) -> None:
-    soft = diffsim.make("hopper", 1).scene
-    variation = Variation(env, soft_factors(env.scene), {}, (100.0, 300.0), 10, 1)
+def test_contact_hardens_to_the_files(env: diffsim.DiffEnv) -> None:
+    variation = Variation(env, SOFT, {}, (100.0, 300.0), 10, 1)
     for iteration, share in ((1, 0.0), (100, 0.0), (150, 0.25), (300, 1.0), (400, 1.0)):
         variation.set(iteration)
-        for name in ("k_n", "k_d", "k_t"):
-            begin, end = getattr(soft, name), getattr(env.scene, name)
-            expected = begin ** (1 - share) * end**share
-            torch.testing.assert_close(end * column(env, name), torch.full((2000,), expected), msg=f"{name} {share}")
-        torch.testing.assert_close(column(env, "d_limit"), torch.full((2000,), share))  # the file's is 0
-        for name in ("mu", "mass", "motor"):
-            assert (column(env, name) == 1).all()
+        for name in FACTORS:
+            expected = SOFT.get(name, 1.0) ** (1 - share)
+            torch.testing.assert_close(column(env, name), torch.full((2000,), expected), msg=f"{name} {share}")
 
 
 def test_factors_are_drawn_for_each_environment_and_constant(env: diffsim.DiffEnv) -> None:
@@ -93,45 +83,30 @@ def test_wrong_ranges_are_refused(items: str, message: str, capsys: pytest.Captu
     assert message in refusal(lambda: shac.main(["--env", "hopper", "--randomise", items]), capsys)
 
 
-@pytest.mark.parametrize("flags", ["--env cartpole --contact firm", "--env swimmer --contact firm"])
-def test_tasks_without_contact_have_no_firm_one(flags: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "has no firm contact; choose soft" in refusal(lambda: shac.main(flags.split()), capsys)
-
-
 def test_the_span_must_be_the_right_way_round(capsys: pytest.CaptureFixture[str]) -> None:
     error = refusal(lambda: shac.main("--env ant --anneal 0.5 0.2".split()), capsys)
     assert "--anneal 0.5 0.2 are the wrong way round" in error
 
 
-def test_contact_decides_constants_and_integration() -> None:
-    with pytest.raises(ValueError, match="unknown contact 'hard'; choose from soft, firm"):
-        diffsim.make("hopper", 1, contact="hard")  # type: ignore[arg-type]
-    for name in FIRM:
-        task = TASKS[name]
-        firm, soft = (diffsim.make(name, 1, contact=contact) for contact in ("firm", "soft"))
-        assert firm.sim.integration == task.firm.integration and soft.sim.integration == task.integration("default")
-        assert {key: getattr(firm.scene, key) for key in ("k_n", "k_d", "k_t")}.items() <= task.firm.penalty.items()
-        assert firm.scene.mu == soft.scene.mu and firm.scene.k_limit.max() == task.firm.k_limit
-        assert firm.scene.k_n > soft.scene.k_n
-    other = diffsim.make("ant", 1, contact="firm", penalty={"k_n": 7.0})
-    assert other.scene.k_n == 7.0 and other.scene.k_d == TASKS["ant"].firm.k_d
-    assert TASKS["ant"].integration("accurate", "firm").substeps == 4 * TASKS["ant"].firm.integration.substeps
+def test_hardening_needs_the_contact_that_hardens(capsys: pytest.CaptureFixture[str]) -> None:
+    error = refusal(lambda: shac.main("--env ant --anneal 0.2 0.5".split()), capsys)
+    assert "--anneal hardens the contact of --contact mujoco; with soft leave it at 0 0" in error
 
 
-def test_firm_runs_resume_bitwise_and_are_evaluated_on_firm_ground(tmp_path: Path) -> None:
-    flags = "--env hopper --contact firm --num-envs 16 --horizon 8 --iterations 4 --redraw 1 --eval-episodes 2 --quiet"
-    flags += " --device cpu --critic-iterations 2 --threads 1"
+def test_runs_whose_contact_hardens_resume_bitwise_and_are_evaluated_on_the_files(tmp_path: Path) -> None:
+    flags = "--env hopper --contact mujoco --num-envs 16 --horizon 8 --iterations 4 --redraw 1 --eval-episodes 2"
+    flags += " --anneal 0 1 --randomise mass=0.9:1.1 --device cpu --critic-iterations 2 --threads 1 --quiet"
     whole = run(shac, tmp_path / "whole", *flags.split())
     run(shac, tmp_path / "part", *flags.split(), "--stop-after", 2)
     part = run(shac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
     assert_same(part["modules"], whole["modules"])
-    assert whole["args"]["randomise"] == RANDOMISED and whole["args"]["integrator"] == "implicit"
-
-    saved, own = str(tmp_path / "part" / "checkpoint.pt"), ("mass=0.9:1.1",)
-    state = torch.load(saved, weights_only=True)
-    torch.save(state | {"args": state["args"] | {"randomise": own}}, saved)
-    for flags, ranges in (("--accuracy accurate", own), ("--contact soft", ()), ("", own)):
-        assert parse(shac.Args, ["--evaluate", saved, *flags.split()]).randomise == ranges
+    assert whole["args"]["anneal"] == (0.0, 1.0) and whole["args"]["integrator"] == "mujoco"
+    hard = run(shac, tmp_path / "hard", *flags.replace("--anneal 0 1", "--anneal 0 0").split())
+    assert any(
+        not torch.equal(hard["modules"]["actor"][name], value) for name, value in whole["modules"]["actor"].items()
+    )
+    saved = str(tmp_path / "part" / "checkpoint.pt")
+    assert parse(shac.Args, ["--evaluate", saved, "--accuracy", "accurate"]).substeps == 16
 
 
 def test_learners_without_gradient_vary_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
