@@ -131,6 +131,10 @@ class Args(ParallelFlags):
         if self.device == "cpu":
             values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
             values |= ON_CPU.get(self.env, {})
+        if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
+            values["horizon"] = 8
+            if self.device == "cpu":
+                values["num_envs"] = 4 * values["num_envs"]
         if (self.accuracy, self.contact) == ("default", "soft") and self.env in INTEGRATION:
             values |= INTEGRATION[self.env]._asdict()
         return values

@@ -88,6 +88,8 @@ class Args(ParallelFlags):
         values = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
         if self.general_hyperparameters:
             values = {name: value for name, value in values.items() if name == "iterations"}
+        if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
+            values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
         return values
 
 

@@ -49,6 +49,7 @@ def make(
     integrator: str | None = None,
     theta: float | None = None,
     passes: int | None = None,
+    touchdown: bool | None = None,
     accuracy: Accuracy = "default",
     contact: Contact = "soft",
     penalty: Mapping[str, float] | None = None,
@@ -65,7 +66,7 @@ def make(
         seed, horizon: see DiffEnv.
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
             docs/accuracy.md has what each costs and how much it errs.
-        substeps, integrator, theta, passes: each in place of the preset's, if given.
+        substeps, integrator, theta, passes, touchdown: each in place of the preset's, if given.
         contact: "soft" (the paper's springs) or "mujoco" (MuJoCo's own constraints, see Integration): the laws of
             contact and limits and how they are integrated; docs/transfer.md has what policies keep of their speed.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
@@ -91,7 +92,7 @@ def make(
     else:
         raise ValueError(f"task {name!r} tracks no clip; {HumanoidImitation.name} does")
     scene = load_scene(str(files("diffsim") / "assets" / task.asset))
-    integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes)
+    integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes, touchdown)
     if penalty and integration.integrator == "mujoco":
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
     scene = scene.with_penalty(penalty or {})

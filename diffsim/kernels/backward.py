@@ -275,7 +275,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 )
                 if wp.static(CONSTRAINED and CONTACT):
                     lv, lw, lp, l_twist = constraint.add_contacts_adjoint(
-                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, lv, lw, lp, adj_factors
+                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, h, lv, lw, lp, adj_factors
                     )
                     adj_b[i] = l_twist
                 adj_a[i] = la

@@ -16,6 +16,12 @@ is one pass of the articulated-body algorithm with each contact's block X'HX add
 joint's: `add_contacts` and `joint_constraint`.
 
 The adjoint begins at phi = -f . w with w the velocity of the point under lambda: `add_contacts_adjoint`.
+
+A contact begins with a jump of its force, which no derivative within the law sees: where a sphere that sinks by s in a
+substep has just met the ground, ds / s of such substeps join or leave as its height changes by ds, each with the
+acceleration that f gives the robot without this contact. Under lambda the point then moves with w + A H w. A is its
+inverse inertia, for which the inverse weight stands. This is the saltation of hybrid systems (Kong et al., "Saltation
+Matrices", Proceedings of the IEEE 112(6), 2024).
 """
 
 from functools import cache
@@ -28,6 +34,8 @@ from diffsim.kernels.model import types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
+
+LEAST_SINKING = 1e-3  # m in a substep: a sphere that grazes the ground has a jump without bound, which is noise
 
 
 @cache
@@ -169,6 +177,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         B: vec6,
         W: vec6,
         height: T,
+        h: T,
         adj_v: vec6,
         adj_w: vec6,
         adj_p: vec6,
@@ -184,6 +193,11 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 w = point_velocity(W, p)
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
+                if wp.static(spec.touchdown):
+                    numbers = m.contact_numbers[c]
+                    sinks = wp.max(-h * point_velocity(V, p)[2], T(LEAST_SINKING))
+                    jump = wp.dot(f, w + T(numbers[4]) * g_jar) / sinks
+                    g_r = g_r + pick(T(numbers[10]) - distance, sinks, jump, T(0.0))
                 if wp.static(VARIED):
                     by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(V, p)) + g_jar[2] * state[2]
                     by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)

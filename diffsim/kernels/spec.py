@@ -30,6 +30,7 @@ class KernelSpec:
     slots: int
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
     passes: int  # of Newton's method on MuJoCo's constraints (constraint.py), 0 with the laws of springs and dampers
+    touchdown: bool  # see Integration
 
     @property
     def floating(self) -> bool:
@@ -78,6 +79,7 @@ def kernel_spec(
     forced: bool = False,
     block: int = 1,
     passes: int = 0,
+    touchdown: bool = True,
 ) -> KernelSpec:
     limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
     return KernelSpec(
@@ -98,4 +100,5 @@ def kernel_spec(
         slots=division.slots,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
         passes=passes,
+        touchdown=touchdown and passes > 0,
     )

@@ -21,15 +21,23 @@ class Integration(NamedTuple):
         substeps: integration steps in one control step; even if extrapolated.
         theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); 0 unless implicit.
         passes: of Newton's method on MuJoCo's constraints, in each substep; not read by the other integrators.
+        touchdown: whether gradients count that such a contact begins with a jump, sooner or later as the state changes:
+            docs/physics.md; not read by the other integrators.
     """
 
     integrator: str = "semi_implicit"
     substeps: int = 16
     theta: float = 0.0
     passes: int = PASSES
+    touchdown: bool = True
 
     def replaced(
-        self, integrator: str | None, substeps: int | None, theta: float | None, passes: int | None = None
+        self,
+        integrator: str | None,
+        substeps: int | None,
+        theta: float | None,
+        passes: int | None = None,
+        touchdown: bool | None = None,
     ) -> Integration:
         """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
         new = self
@@ -39,6 +47,8 @@ class Integration(NamedTuple):
             new = new._replace(substeps=substeps)
         if passes is not None:
             new = new._replace(passes=passes)
+        if touchdown is not None:
+            new = new._replace(touchdown=touchdown)
         return new if theta is None else new._replace(theta=theta)
 
     def check(self) -> Integration:
@@ -52,6 +62,8 @@ class Integration(NamedTuple):
             raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
         if self.theta and self.integrator != "implicit":
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
+        if not isinstance(self.touchdown, bool):
+            raise ValueError(f"touchdown is {self.touchdown!r}, must be True or False")
         return self._replace(substeps=substeps, passes=check_count("passes", self.passes, MOST_PASSES))
 
 

@@ -58,8 +58,11 @@ class Launcher:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         implicit = options.integration.integrator == "implicit"
         block = options.block or default_block(num_envs, options)
-        passes = options.integration.passes if options.integration.integrator == "mujoco" else 0
-        self.spec = kernel_spec(scene, division, real, implicit, cuda, options.factors, options.forces, block, passes)
+        how = options.integration
+        passes = how.passes if how.integrator == "mujoco" else 0
+        self.spec = kernel_spec(
+            scene, division, real, implicit, cuda, options.factors, options.forces, block, passes, how.touchdown
+        )
         self.num_blocks = -(-num_envs // block)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
         with building:

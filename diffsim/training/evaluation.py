@@ -172,6 +172,7 @@ def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **opti
             integrator=args.integrator,
             theta=args.theta,
             passes=args.passes,
+            touchdown=args.touchdown,
             contact=args.contact,
             penalty=parse_penalty(args.penalty),
             threads=args.threads or None,

@@ -50,6 +50,8 @@ class SimulatorFlags:
     """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
     passes: Count = PASSES
     """of Newton's method on the constraints in each substep, with --integrator mujoco"""
+    touchdown: bool = True
+    """with --integrator mujoco, gradients count that a contact begins with a jump (docs/physics.md)"""
     contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md)"""
     penalty: tuple[str, ...] = ()
@@ -102,7 +104,7 @@ class Flags(SimulatorFlags, RunFlags):
 
     # What may change when a run goes on or is evaluated; the checkpoint decides everything else.
     MAY_CHANGE: ClassVar[tuple[str, ...]] = (
-        *("accuracy", "integrator", "substeps", "theta", "passes", "contact", "penalty"),
+        *("accuracy", "integrator", "substeps", "theta", "passes", "touchdown", "contact", "penalty"),
         *("early_termination", "threads"),
         *(field.name for field in dataclasses.fields(RunFlags) if field.name != "seed"),
     )
