@@ -232,6 +232,27 @@ def test_robot_without_damping(rng):
     check_gradients(scene, (qpos, qvel, np.zeros((16, 0))), rng, enough=1.0)
 
 
+def test_gradients_know_that_a_lower_ball_lands_earlier():
+    """On average over heights they are the slope of where and how fast a sliding ball ends up, jumps included."""
+    scene, n, errors = parse(BALL), 256, []
+    for touchdown in (True, False):
+        how = Integration("mujoco", 16, touchdown=touchdown)
+        sim = Simulator(scene, n, how, 1 / 60, horizon=8, dtype=torch.float64)
+        height = torch.linspace(0.13, 0.2, n, dtype=torch.float64, requires_grad=True)
+        qpos, qvel = torch.tensor(scene.qpos0).repeat(n, 1), torch.tensor([1.0, 0, -1, 0, 0, 0]).double().repeat(n, 1)
+        qpos = qpos.index_put((torch.arange(n), torch.tensor(2)), height)
+        for _ in range(8):
+            qpos, qvel = sim.step(qpos, qvel, torch.zeros(n, 0, dtype=torch.float64))
+        # The slope of a regression is a mean of the derivative with these weights.
+        x = (height - height.mean()).detach()
+        share = (x[-1].square() - x.square()) / (x[-1].square() - x.square()).sum()
+        ends = [qpos[:, 2], qvel[:, 2], qvel[:, 0]]
+        true = np.array([float((end.detach() * x).sum() / x.square().sum()) for end in ends])
+        slopes = [torch.autograd.grad(end.sum(), height, retain_graph=True)[0] for end in ends]
+        errors.append(abs(np.array([float((slope * share).sum()) for slope in slopes]) - true) / abs(true))
+    assert (errors[0] < (0.3, 0.3, 4.0)).all() and (errors[1] > (2.0, 2.0, 9.0)).all(), errors
+
+
 # Single precision, metrics, bad input
 
 
