@@ -84,8 +84,9 @@ class Runner:
         """Evaluate the checkpoint in all ways in which that is not done; whether it is now."""
         state = checkpoint.load(path := case.folder / "checkpoint.pt")
         settings: dict[Path, list[object]] = {case.folder: ["--no-finer"]}
-        for substeps in (state["args"]["substeps"], diffsim.TASKS[case.env].substeps):
-            explicit = ["--integrator", "semi_implicit", "--theta", 0, "--substeps", FINER * substeps]
+        for substeps in checked(case.env, how := state["args"]):
+            law = "mujoco" if how["integrator"] == "mujoco" else "semi_implicit"
+            explicit = ["--integrator", law, "--theta", 0, "--substeps", FINER * substeps]
             settings[finer(case.folder, substeps)] = ["--no-finer", *explicit]
         return all(
             evaluation(folder, state["iteration"]) or self._call(case, "--evaluate", path, "--run-dir", folder, *flags)
@@ -110,6 +111,11 @@ class Runner:
         if process.returncode:
             print(f"{case.folder}: stopped or failed, see output.txt there", flush=True)
         return process.returncode == 0
+
+
+def checked(env: str, how: Mapping[str, Any]) -> tuple[int, int]:
+    """Substeps of which the finer evaluations take multiples: a run's own, and the task's on that contact."""
+    return how["substeps"], diffsim.TASKS[env].integration("default", how["contact"]).substeps
 
 
 def finer(folder: Path, substeps: int) -> Path:
@@ -154,7 +160,7 @@ def summary(directory: Path, env: str, targets: Sequence[float]) -> dict[str, ob
     for folder in folders(directory, env):
         if own := evaluation(folder):
             how = own["settings"]
-            checks = [evaluation(finer(folder, n), how["iteration"]) for n in (how["substeps"], task.substeps)]
+            checks = [evaluation(finer(folder, n), how["iteration"]) for n in checked(env, how)]
             if all(checks):
                 progress = read_csv(folder / "progress.csv")
                 rows.append(next(row for row in progress if int(row["iteration"]) == how["iteration"]))
