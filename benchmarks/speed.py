@@ -64,11 +64,7 @@ class Args(ScriptFlags):
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
     scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
     horizons: tuple[Count, ...] = (1, 4, 8, 16, 32, 64, 128)  # horizons of the scaling table, at 64 environments
-    kernels: tuple[KernelName, ...] = (
-        "blocks",
-        "scalar",
-        "float64",
-    )  # those of the physics table, scalar on a CPU only
+    kernels: tuple[KernelName, ...] = ("blocks", "scalar", "float64")  # of the physics table; scalar on a CPU
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
     script: str = "shac"  # script of the training table, in the repository's root, without .py

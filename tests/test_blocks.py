@@ -163,6 +163,7 @@ def test_sines_of_large_angles():
     "options, message",
     [
         ({"block": 4}, "block is 4, must be 1, 8 or 16"),
+        ({"block": 8.0}, "block is 8.0, must be an integer of at least 1"),
         ({"block": 16, "dtype": torch.float64}, "block is 16, must be 1 on a GPU and in float64"),
     ],
 )

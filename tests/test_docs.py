@@ -149,8 +149,8 @@ ORIGIN = re.compile(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python 
 WITHOUT_ORIGIN = {
     "cpu": """
         bptt_ant bptt_cartpole bptt_hopper landscape_ant_gradients landscape_ant_surface landscape_ant_weight learning
-        ppo_baseline_ant ppo_baseline_cartpole ppo_baseline_hopper shac_ant shac_cartpole shac_half_cheetah shac_hopper
-        shac_humanoid shac_no_critic_ant shac_no_critic_hopper stability_horizon
+        ppo_baseline_ant ppo_baseline_cartpole ppo_baseline_hopper
+        shac_no_critic_ant shac_no_critic_hopper stability_horizon
         stability_long stability_step stability_sweeps time tradeoff
     """,
     "h100": """

@@ -24,6 +24,7 @@ from scenes import (
     check_that_ground_and_limits_act,
     free_states,
     in_free_flight,
+    leg,
     leg_scene,
     parse,
     pass_limits,
@@ -101,6 +102,12 @@ def test_ball_joint_on_the_world_has_mujocos_accelerations(rng):
 def test_muscles_pull_as_mujocos(model, rng):
     """Moment arms, and for the Hill-type force also lengths and their rates, in every part of its curves."""
     check_against_mujoco(leg_scene(model, grounded=model == "linear"), torch.float64, rng)
+
+
+def test_a_muscle_that_is_no_stronger_while_it_lengthens(rng):
+    """fvmax 1: half of a curve has no width."""
+    scene = parse(leg("hill").replace('fvmax="1.3"', 'fvmax="1"'))
+    check_against_mujoco(scene, torch.float64, rng)
 
 
 def mujoco_tendons(scene, qpos):

@@ -40,14 +40,16 @@ class Options(NamedTuple):
     def check(self) -> Options:
         """Itself, with plain types; raises ValueError, with what is allowed, if it cannot be simulated so."""
         device, dtype = check_device(self.device), check_dtype(self.dtype)
-        if self.block is not None and self.block not in BLOCKS:
-            raise ValueError(f"block is {self.block!r}, must be 1, 8 or 16")
-        if (self.block or 1) > 1 and (device.type == "cuda" or dtype == torch.float64):
-            raise ValueError(f"block is {self.block}, must be 1 on a GPU and in float64")
+        block = None if self.block is None else check_count("block", self.block)
+        if block not in (None, *BLOCKS):
+            raise ValueError(f"block is {block}, must be 1, 8 or 16")
+        if (block or 1) > 1 and (device.type == "cuda" or dtype == torch.float64):
+            raise ValueError(f"block is {block}, must be 1 on a GPU and in float64")
         return self._replace(
             integration=self.integration.check(),
             device=device,
             dtype=dtype,
+            block=block,
             threads=None if self.threads is None else check_count("threads", self.threads),
         )
 
