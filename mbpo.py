@@ -132,8 +132,8 @@ class Args(ParallelFlags):
             fail(f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a control step")
         if self.sample_enhance and TASKS[self.env].timed:
             fail(f"--sample-enhance takes Jacobians of states that do not hold the time, on which {self.env} depends")
-        if self.sample_enhance and (any(self.anneal) or self.randomise):
-            fail("--sample-enhance takes Jacobians of one robot: neither --anneal nor --randomise goes with it")
+        if self.sample_enhance and self.randomise:
+            fail("--sample-enhance takes Jacobians of one robot: leave out --randomise")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

@@ -102,9 +102,14 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """What the page has of the rows."""
-    own = (row for row in rows if row["horizon"] in ("8", "16"))
-    return [{name: row[name] for name in ("task", "horizon", "ground", *COLUMNS)} for row in own]
+    """A line for each task and ground."""
+    lines = dict[tuple[str, str], Row]()
+    for row in rows:
+        line = lines.setdefault((row["task"], row["ground"]), {"task": row["task"], "ground": row["ground"]})
+        line[f"cosine, {row['horizon']} steps"] = row["cosine"]
+        line[f"norm 95 %, {row['horizon']} steps"] = row["norm 95 %"]
+    names = "task", "ground", "cosine, 4 steps", "cosine, 8 steps", "cosine, 16 steps", "norm 95 %, 16 steps"
+    return [{name: line.get(name, "") for name in names} for line in lines.values()]
 
 
 def main(args: Args) -> None:

@@ -128,14 +128,12 @@ class Flags(SimulatorFlags, RunFlags):
 class ParallelFlags(Flags):
     """Many environments at once."""
 
-    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*Flags.MAY_CHANGE, "cuda_graph", "anneal", "randomise", "redraw")
+    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*Flags.MAY_CHANGE, "cuda_graph", "randomise", "redraw")
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
-    anneal: tuple[Fraction, Fraction] = (0.0, 0.0)
-    """with --contact mujoco, shares of the iterations between which contact hardens to the robot file's"""
     randomise: tuple[str, ...] = ()
     """ranges of factors drawn for each environment: friction=0.7:1.3 stiffness mass motor (per --contact)"""
     redraw: Count = 10
@@ -143,10 +141,6 @@ class ParallelFlags(Flags):
 
     def check(self) -> None:
         super().check()
-        if self.anneal[0] > self.anneal[1]:
-            fail(f"--anneal {self.anneal[0]} {self.anneal[1]} are the wrong way round")
-        if any(self.anneal) and self.contact != "mujoco":
-            fail(f"--anneal hardens the contact of --contact mujoco; with {self.contact} leave it at 0 0")
         try:
             parse_ranges(self.randomise)
         except ValueError as error:

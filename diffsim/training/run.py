@@ -26,7 +26,7 @@ from diffsim.training.directory import EpisodeStatistics, Lock, ProgressLog, che
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, make_env, write_evaluation
 from diffsim.training.flags import Flags, ParallelFlags
-from diffsim.training.variation import SOFT, Variation, parse_ranges
+from diffsim.training.variation import Variation, parse_ranges
 
 L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
@@ -137,13 +137,11 @@ class Run:
         args, size = self.args, num_envs // distributed.size()
         if args.eval_episodes > size:
             self.eval_env.detach()  # makes them now: an error of what does not fit should not wait
-        if not isinstance(args, ParallelFlags) or not (any(args.anneal) or args.randomise):
+        if not isinstance(args, ParallelFlags) or not args.randomise:
             self._env = make_env(args, size, horizon, seed)
             return self._env
         self._env = make_env(args, size, horizon, seed, factors=True)
-        begin, end = (share * args.iterations for share in args.anneal)
-        start = SOFT if any(args.anneal) else {}
-        self._variation = Variation(self._env, start, parse_ranges(args.randomise), (begin, end), args.redraw, seed)
+        self._variation = Variation(self._env, parse_ranges(args.randomise), args.redraw, seed)
         return self._env
 
     @cached_property

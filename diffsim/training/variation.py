@@ -1,8 +1,4 @@
-"""Constants that differ between environments and change over a training: hardening contact, robots of many kinds.
-
-On ground as hard as MuJoCo's gradients are steep before there is a gait. So contact may begin soft and harden while the
-policy learns. Constants drawn at random keep the policy from living on one ground's own errors.
-"""
+"""Constants that differ between environments, drawn at random, so that no policy lives on one robot's or ground's."""
 
 from __future__ import annotations
 
@@ -23,7 +19,6 @@ VARIED = {
     "mass": ("mass",),
     "motor": ("motor",),
 }
-SOFT = {"k_d": 0.01}  # where --anneal begins: a contact's force at a given motion, as a factor
 SEEDS = 15_485_863  # between the random numbers of one drawing and the next; ranks are 1_000_003 apart
 
 
@@ -58,45 +53,25 @@ def parse_ranges(items: Sequence[str]) -> dict[str, Range]:
 class Variation:
     """Sets the factors of an environment's constants, before each iteration, as the iteration alone decides.
 
-    With progress t from 0 to 1 a constant is start^(1 - t) of its own, times a random factor whose range opens as t
-    does.
-
     Args:
         env: made with factors.
-        start: factors at t = 0, by their names in FACTORS; what is not named has 1.
         ranges: of random factors, by their names in VARIED.
-        span: iterations between which t rises from 0 to 1.
         redraw: iterations between drawings.
         seed: of the drawings.
     """
 
-    def __init__(
-        self,
-        env: DiffEnv,
-        start: Mapping[str, float],
-        ranges: Mapping[str, Range],
-        span: tuple[float, float],
-        redraw: int,
-        seed: int,
-    ) -> None:
-        self.factors, self.span, self.redraw, self.seed = env.sim.factors, span, redraw, seed
+    def __init__(self, env: DiffEnv, ranges: Mapping[str, Range], redraw: int, seed: int) -> None:
+        self.factors, self.redraw, self.seed = env.sim.factors, redraw, seed
         drawn = {factor: ranges[name] for name, factors in VARIED.items() if name in ranges for factor in factors}
         least = [math.log(drawn[name].least) if name in drawn else 0.0 for name in FACTORS]
         most = [math.log(drawn[name].most) if name in drawn else 0.0 for name in FACTORS]
         self.least, self.width = torch.tensor(least), torch.tensor(most) - torch.tensor(least)
-        self.start = torch.tensor([start.get(name, 1.0) for name in FACTORS])
-        self._present: tuple[float, int] | None = None
-
-    def progress(self, iteration: int) -> float:
-        begin, end = self.span
-        return min(1.0, max(0.0, (iteration - begin) / (end - begin))) if end > begin else float(iteration > begin)
+        self._drawing = -1
 
     def set(self, iteration: int) -> None:
-        """The factors (N, len(FACTORS)) of an iteration; between drawings they change by the progress alone."""
-        t, drawing = self.progress(iteration), (iteration - 1) // self.redraw
-        if self._present == (t, drawing):
-            return
-        self._present = t, drawing
-        generator = torch.Generator().manual_seed(self.seed + SEEDS * drawing)
-        uniform = torch.rand(self.factors.shape, generator=generator)
-        self.factors.copy_(self.start ** (1 - t) * (t * (self.least + self.width * uniform)).exp())
+        """The factors (N, len(FACTORS)) of an iteration."""
+        drawing = (iteration - 1) // self.redraw
+        if drawing != self._drawing:
+            self._drawing = drawing
+            generator = torch.Generator().manual_seed(self.seed + SEEDS * drawing)
+            self.factors.copy_((self.least + self.width * torch.rand(self.factors.shape, generator=generator)).exp())
