@@ -346,7 +346,7 @@ def step(
     profile: int = 0,
 ) -> tuple[Array, Array]:
     """One control step of one environment."""
-    integrator, substeps, theta, _ = integration
+    integrator, substeps, theta = integration[:3]
     h = control_dt / substeps
     for _ in range(substeps):
         implicit = h if integrator == "implicit" else 0.0
