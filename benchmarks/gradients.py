@@ -103,7 +103,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task and ground."""
-    lines = dict[tuple[str, str], Row]()
+    lines = dict[tuple[str, str], dict[str, object]]()
     for row in rows:
         line = lines.setdefault((row["task"], row["ground"]), {"task": row["task"], "ground": row["ground"]})
         line[f"cosine, {row['horizon']} steps"] = row["cosine"]

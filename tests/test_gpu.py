@@ -59,7 +59,9 @@ def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
 
 def test_kernels_with_constraints_compile_for_a_gpu_without_one() -> None:
     scene = constrained(task_scene("ant"), 1 / 240)
-    spec = kernel_spec(scene, divide(scene, 4), wp.float32, implicit=False, env_last=True, varied=True, passes=4)
+    spec = kernel_spec(
+        scene, divide(scene, 4), wp.float32, implicit=False, env_last=True, varied=True, constrained=True
+    )
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
         compiled(kernel.module, arch=90)
 

@@ -40,7 +40,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     )
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     # With MuJoCo's constraints a substep takes several solves.
-    CONSTRAINED, SOLVES, PASSES = spec.constrained, spec.solves, spec.passes
+    CONSTRAINED, SOLVES = spec.constrained, spec.solves
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LIMIT = spec.nball, MAX_SPEED
@@ -64,6 +64,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         seconds: t.U,  # of a substep
         implicitness: t.U,
         substeps: int,
+        passes: int,  # of Newton's method, read with constraints
         # state in
         qpos: t.array2,
         qvel: t.array2,
@@ -212,7 +213,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             end = 1
             factor_row = row
             if wp.static(CONSTRAINED):
-                end = int(PASSES) + int(SOLVES) - 1
+                end = passes + int(SOLVES) - 1
                 last_change = T(wp.inf)
                 wdot = vec3()
                 vdot = vec3()
@@ -231,7 +232,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         B[i] = vec6()
             for solve in range(begin, end):
                 if wp.static(CONSTRAINED):
-                    newton = wp.where(solve < PASSES, 1, 0)
+                    newton = wp.where(solve < passes, 1, 0)
                     stuck = T(wp.where(solve == 0, 1, 0))
                     factor_row = SOLVES * row + (SOLVES - 1) * newton
                     for i in range(n):
@@ -337,7 +338,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         # Newton's method may go to and fro between zones: where a step is no shorter, half of it.
                         part = pick(last_change, change, T(0.5), T(1.0))
                         last_change = change
-                        if solve == PASSES - 1:
+                        if solve == passes - 1:
                             residual = wp.max(residual, wp.sqrt(change / size))
                         if wp.static(FLOATING):
                             wdot = wdot + part * (turning_up - wdot)

@@ -29,7 +29,7 @@ class KernelSpec:
     trunk: int
     slots: int
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
-    passes: int  # of Newton's method on MuJoCo's constraints (constraint.py), 0 with the laws of springs and dampers
+    constrained: bool  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
     touchdown: bool  # see Integration
 
     @property
@@ -48,10 +48,6 @@ class KernelSpec:
     @property
     def nq(self) -> int:
         return self.nv + int(self.floating) + self.nball
-
-    @property
-    def constrained(self) -> bool:
-        return self.passes > 0
 
     @property
     def solves(self) -> int:
@@ -78,7 +74,7 @@ def kernel_spec(
     varied: bool = False,
     forced: bool = False,
     block: int = 1,
-    passes: int = 0,
+    constrained: bool = False,
     touchdown: bool = True,
 ) -> KernelSpec:
     limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
@@ -99,6 +95,6 @@ def kernel_spec(
         trunk=division.trunk,
         slots=division.slots,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
-        passes=passes,
-        touchdown=touchdown and passes > 0,
+        constrained=constrained,
+        touchdown=touchdown and constrained,
     )

@@ -59,9 +59,9 @@ class Launcher:
         implicit = options.integration.integrator == "implicit"
         block = options.block or default_block(num_envs, options)
         how = options.integration
-        passes = how.passes if how.integrator == "mujoco" else 0
+        constrained = how.integrator == "mujoco"
         self.spec = kernel_spec(
-            scene, division, real, implicit, cuda, options.factors, options.forces, block, passes, how.touchdown
+            scene, division, real, implicit, cuda, options.factors, options.forces, block, constrained, how.touchdown
         )
         self.num_blocks = -(-num_envs // block)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)

@@ -57,6 +57,7 @@ class Stepper:
 
         self._launcher, self._horizon, self._substeps = launcher, horizon, integration.substeps
         self._scalars = [h, spec.dtype(integration.theta), integration.substeps]
+        self._passes = integration.passes
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step.
         self._widths = (spec.nq, spec.nv, spec.nu, spec.nfactors, 6 * spec.forced)
@@ -139,7 +140,7 @@ class Stepper:
         )
         nonfinite = wp.from_torch(self._nonfinite[slot])
         if kernel == "forward":
-            return [*self._scalars, *start, int(record), row0, *rows, *end, nonfinite]
+            return [*self._scalars, self._passes, *start, int(record), row0, *rows, *end, nonfinite]
         qpos, _, *inputs = start  # ctrl, factors and forces
         blown_up = wp.from_torch(self._launcher.nonfinite_gradients)
         return [*self._scalars, row0, *rows, qpos, *inputs, nonfinite, *g_end, *g_start, blown_up]
