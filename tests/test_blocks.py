@@ -62,11 +62,11 @@ def step(scene, states, dtype, integration, weights=None, **options):
     [
         ("ant", SEMI, {}),
         ("hopper", EXTRAPOLATED, {"forces": True}),
-        ("fish", SEMI, {}),
+        pytest.param("fish", SEMI, {}, marks=pytest.mark.slow),
         ("half_cheetah", IMPLICIT, {}),
-        ("hill", SEMI, {"factors": True}),
+        pytest.param("hill", SEMI, {"factors": True}, marks=pytest.mark.slow),
         ("hopper on hills", SEMI, {}),
-        ("ball on hills", IMPLICIT, {}),
+        pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),
     ],
 )
 def test_laws_are_those_of_float64(name, integration, options, rng):

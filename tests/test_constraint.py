@@ -34,7 +34,9 @@ from diffsim.terrain import rough
 from diffsim.training.checkpoint import load_policy
 
 ROBOTS = ("hopper", "half_cheetah", "ant", "humanoid")
-TREES = [(base, seed) for base in ("floating", "fixed", "planar", "ball") for seed in range(3)]
+BASES = "floating", "fixed", "planar", "ball"
+SLOW = pytest.mark.slow  # for its kernels, which no other test needs
+TREES = [pytest.param(base, seed, marks=[SLOW] * (seed > 0)) for base in BASES for seed in range(3)]
 H = 1 / 240  # s, of a substep
 PASSES = 40  # Newton's method has converged by then, but in a few states where it goes to and fro between zones
 STATES = {"satisfied": 0, "quadratic": 1, "linear_neg": 2, "linear_pos": 3, "cone": 4}  # MuJoCo's mjtConstraintState
@@ -142,6 +144,7 @@ def test_tree_steps_are_mujocos(base, seed, rng):
     assert check_step(scene, states, 0.75) == set(STATES.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ant", "humanoid"])
 def test_four_passes_suffice_in_gaits(name):
     """And in random motion, the second half of the robots."""
@@ -207,7 +210,7 @@ def test_task_gradient_is_that_of_differences(name, rng):
     check_gradients(scene, acting_states(scene, 8, rng), rng, enough=0.9)
 
 
-@pytest.mark.parametrize("base", ["floating", "fixed", "planar", "ball"])
+@pytest.mark.parametrize("base", ["floating", *(pytest.param(base, marks=SLOW) for base in BASES[1:])])
 def test_tree_gradient_is_that_of_differences(base, rng):
     """In every zone of every law, and with factors of friction, time constants, mass and motors."""
     scene, states = tree_states(base, 0, 16, rng)
@@ -217,6 +220,7 @@ def test_tree_gradient_is_that_of_differences(base, rng):
         check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (16, len(FACTORS)))})
 
 
+@pytest.mark.slow
 def test_muscle_gradient_is_that_of_differences(rng):
     scene = leg_scene("linear", grounded=True)
     qpos, qvel, ctrl = free_states(scene, 8, rng)
