@@ -172,6 +172,7 @@ def test_blocks_of_other_sizes_are_refused(options, message):
         Simulator(task_scene("hopper"), 2, **options)
 
 
+@pytest.mark.slow
 def test_processors_without_wide_registers(tmp_path, hoppers):
     """Compiled for the oldest processor of its kind, which has neither AVX nor a fused product and sum."""
     states, expected = hoppers

@@ -260,6 +260,7 @@ def test_gradients_know_that_a_lower_ball_lands_earlier():
 # Single precision, metrics, bad input
 
 
+@pytest.mark.slow
 def test_blocks_in_single_precision_are_close(rng):
     """Of an environment's gradient, too; an impedance with another power calls pow for each of a block."""
     scene = task_scene("ant")
