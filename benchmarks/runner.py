@@ -115,7 +115,7 @@ class Runner:
 
 def checked(env: str, how: Mapping[str, Any]) -> tuple[int, int]:
     """Substeps of which the finer evaluations take multiples: a run's own, and the task's on that contact."""
-    return how["substeps"], diffsim.TASKS[env].integration("default", how["contact"]).substeps
+    return how["substeps"], diffsim.TASKS[env].integration("default", how.get("contact", "soft")).substeps
 
 
 def finer(folder: Path, substeps: int) -> Path:
