@@ -85,7 +85,7 @@ class Args(ParallelFlags):
     """initial log standard deviation of the policy's noise, before tanh"""
 
     def task_defaults(self) -> dict[str, Any]:
-        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
         if self.general_hyperparameters:
             values = {name: value for name, value in values.items() if name == "iterations"}
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from numbers import Integral, Real
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 INTEGRATORS = ("semi_implicit", "implicit", "extrapolated", "mujoco")
 MOST_PASSES = 1000
@@ -43,13 +43,8 @@ class Integration(NamedTuple):
         new = self
         if integrator is not None and integrator != self.integrator:
             new = Integration(integrator, self.substeps)
-        if substeps is not None:
-            new = new._replace(substeps=substeps)
-        if passes is not None:
-            new = new._replace(passes=passes)
-        if touchdown is not None:
-            new = new._replace(touchdown=touchdown)
-        return new if theta is None else new._replace(theta=theta)
+        given: dict[str, Any] = {"substeps": substeps, "theta": theta, "passes": passes, "touchdown": touchdown}
+        return new._replace(**{name: value for name, value in given.items() if value is not None})
 
     def check(self) -> Integration:
         """Itself, with substeps a plain int; raises ValueError, with what is allowed, if it cannot be integrated so."""

@@ -98,7 +98,7 @@ class Simulator:
     @factors.setter
     def factors(self, value: torch.Tensor) -> None:
         self.check_tensor("factors", value, self._factors.shape[1])
-        check_factors(value)
+        self.check_factors(value)
         self._factors = value
 
     @property
@@ -131,7 +131,7 @@ class Simulator:
             self.check_tensor(name, value, width)
         if self.device.type == "cpu":  # a GPU's would have to be waited for
             if self._factors.shape[1]:
-                check_factors(self._factors)
+                self.check_factors(self._factors)
             if self._forces.shape[1]:
                 self.check_forces(self._forces)
         return self._stepper.step(qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
@@ -160,6 +160,19 @@ class Simulator:
         if value.device != self.device:
             raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
 
+    def check_factors(self, factors: torch.Tensor) -> None:
+        """Raise ValueError unless all (N, len(FACTORS) or 0) are finite and not negative, and what divides positive."""
+        bad = ~((factors >= 0) & (factors < math.inf))
+        if factors.shape[1] and self.integration.integrator == "mujoco":
+            divisors = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]
+            bad[:, divisors] |= factors[:, divisors] == 0
+        if bool(bad.any()):
+            env, column = bad.nonzero()[0].tolist()
+            raise ValueError(
+                f"the factor of {FACTORS[column]} is {factors[env, column].item()} in environment {env}; factors must "
+                "be finite and not negative, with the integrator mujoco those of k_n, k_d and k_limit positive"
+            )
+
     def check_forces(self, forces: torch.Tensor) -> None:
         """Raise ValueError unless all (N, nbody or 0, 6) are finite."""
         if not bool(torch.isfinite(forces).all()):
@@ -169,14 +182,3 @@ class Simulator:
                 f"{'force' if column < 3 else 'torque'} {'xyz'[column % 3]} on body {name} is "
                 f"{forces[env, body, column].item()} in environment {env}; forces must be finite"
             )
-
-
-def check_factors(factors: torch.Tensor) -> None:
-    """Raise ValueError unless all (N, len(FACTORS) or 0) are finite and not negative."""
-    bad = ~((factors >= 0) & (factors < math.inf))
-    if bool(bad.any()):
-        env, column = bad.nonzero()[0].tolist()
-        raise ValueError(
-            f"the factor of {FACTORS[column]} is {factors[env, column].item()} in environment {env}; factors must be "
-            "finite and not negative"
-        )

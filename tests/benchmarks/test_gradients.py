@@ -32,11 +32,11 @@ def test_the_gradient_of_a_window_agrees_with_differences() -> None:
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = f"--num-envs 16 --horizons 2 --warmup 40 --output {tmp_path}".split()
+    flags = f"--num-envs 16 --horizons 8 --warmup 40 --output {tmp_path}".split()
     gradients.main(parse(gradients.Args, None, [str(POLICIES / "hopper.pt"), *flags]))
     rows = read_csv(tmp_path / "gradients.csv")
     assert [row["ground"] for row in rows] == [*gradients.GROUNDS]
-    assert rows[0]["norm"] != rows[1]["norm"]  # no foot touches down in these two steps
+    assert len({row["norm"] for row in rows}) == len(rows)
     assert all(float(row["norm"]) > 0 and abs(float(row["cosine"])) <= 1 for row in rows)
     for arguments, message in (
         ([], "of what? give a checkpoint"),

@@ -51,6 +51,17 @@ def test_factors_are_drawn_for_each_environment_and_constant(env: diffsim.DiffEn
     assert not torch.equal(first, env.sim.factors)
 
 
+def test_what_divides_the_gradient_is_positive(env: diffsim.DiffEnv) -> None:
+    factors = torch.ones_like(env.sim.factors)
+    factors[3, FACTORS.index("mu")] = 0.0
+    env.sim.factors = factors
+    for name in ("k_n", "k_d", "k_limit"):
+        bad = factors.clone()
+        bad[5, FACTORS.index(name)] = 0.0
+        with pytest.raises(ValueError, match=f"the factor of {name} is 0.0 in environment 5; .* positive"):
+            env.sim.factors = bad
+
+
 @pytest.mark.parametrize(
     "items, message",
     [
