@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Integral
 from typing import Any
 
@@ -62,12 +62,14 @@ class DiffEnv(VectorEnv):
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.
         episode_step: (N,) int64 control steps since each environment's start.
         first_step: (N,) int64 at which step of a timed task each episode started; 0 of others.
+        memory: (N, num_memory) what the task keeps from step to step.
         generator: the torch.Generator of the start states.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": RENDER_MODES}
     qpos: Tensor
     qvel: Tensor
+    memory: Tensor
     _obs: Tensor
 
     def __init__(
@@ -88,9 +90,10 @@ class DiffEnv(VectorEnv):
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         asked = Options(integration or task.integration("default"), **options).check()
         self.device, self.dtype = torch.device(asked.device), asked.dtype
-        numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim)
+        numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory)
         check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
+        self._parts = ("qpos", "qvel", "_obs", *(("memory",) if task.num_memory else ()))  # of the state
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         if max_episode_steps is not None:
             self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
@@ -115,6 +118,7 @@ class DiffEnv(VectorEnv):
         self.first_step = torch.zeros_like(self.episode_step)
         self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
+        self.memory = torch.zeros(num_envs, task.num_memory, dtype=self.dtype, device=self.device)
         self._restart()
         self.render_mode = render_mode
 
@@ -137,7 +141,7 @@ class DiffEnv(VectorEnv):
         if seed is not None:
             self.generator.manual_seed(check_seed(seed))
         if options and "reset_mask" in options:
-            self.begin(rows, self._uniform(len(rows)))
+            self.begin(rows, self._uniform(len(rows), self.task.num_random))
             self._draw_starts()
         else:
             self._restart()
@@ -163,9 +167,7 @@ class DiffEnv(VectorEnv):
         if self._time == self.horizon:
             self._draw_starts()
         row, (first, *starts) = info["_final_obs"].unsqueeze(1), (start[self._time] for start in self._starts)
-        self.qpos, self.qvel, self._obs = (
-            torch.where(row, start, end) for start, end in zip(starts, (self.qpos, self.qvel, self._obs), strict=True)
-        )
+        self._put(torch.where(row, start, end) for start, end in zip(starts, self._state(), strict=True))
         if self.task.timed:
             self.first_step.copy_(torch.where(info["_final_obs"], first, self.first_step))
         self._time += 1
@@ -190,6 +192,9 @@ class DiffEnv(VectorEnv):
         self._recorded += recorded
         self.qpos, self.qvel = self.sim.step(self.qpos, self.qvel, action)
         nonfinite = self.sim.nonfinite.clone()
+        if self.task.num_memory:
+            noise = self._uniform(self.num_envs, self.task.num_noise)
+            self.memory = self.task.remember(self.memory, action, noise)
         self._obs = obs = self.observe(self.qpos, self.qvel, action, elapsed=1)
         reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)
         with torch.no_grad():
@@ -219,10 +224,7 @@ class DiffEnv(VectorEnv):
         """
         first, *starts = self._start_states(rand, rows)
         self.first_step.index_copy_(0, rows, first)
-        self.qpos, self.qvel, self._obs = (
-            whole.index_copy(0, rows, part)
-            for whole, part in zip((self.qpos, self.qvel, self._obs), starts, strict=True)
-        )
+        self._put(whole.index_copy(0, rows, part) for whole, part in zip(self._state(), starts, strict=True))
         self.episode_step.index_fill_(0, rows, 0)
         self._episode_return.index_fill_(0, rows, 0.0)
         self._show()
@@ -262,23 +264,30 @@ class DiffEnv(VectorEnv):
 
     def detach(self) -> Tensor:
         """Cut the graph at the current state, start a new window there, and return its observation (N, obs_dim)."""
-        self.qpos, self.qvel, self._obs = self.qpos.detach(), self.qvel.detach(), self._obs.detach()
+        self._put(part.detach() for part in self._state())
         self._recorded = 0
         self.sim.rewind()
         self._draw_starts()
         return self._obs
 
-    def pin(self) -> tuple[Tensor, Tensor, Tensor]:
+    def pin(self) -> tuple[Tensor, ...]:
         """Move the state into memory of its own, where a captured window can start again and again; see graph.py."""
-        self.qpos, self.qvel, self._obs = (x.detach().clone() for x in (self.qpos, self.qvel, self._obs))
-        return self.qpos, self.qvel, self._obs
+        self._put(part.detach().clone() for part in self._state())
+        return self._state()
 
-    def carry_over(self, start: tuple[Tensor, Tensor, Tensor]) -> None:
+    def carry_over(self, start: tuple[Tensor, ...]) -> None:
         """End a captured window: write the state back to where it started, as returned by `pin`."""
         with torch.no_grad():
-            for to, value in zip(start, (self.qpos, self.qvel, self._obs), strict=True):
+            for to, value in zip(start, self._state(), strict=True):
                 to.copy_(value)
-        self.qpos, self.qvel, self._obs = start
+        self._put(start)
+
+    def _state(self) -> tuple[Tensor, ...]:
+        return tuple(getattr(self, name) for name in self._parts)
+
+    def _put(self, state: Iterable[Tensor]) -> None:
+        for name, value in zip(self._parts, state, strict=True):
+            setattr(self, name, value)
 
     def take_statistics(self) -> dict[str, Tensor]:
         """What happened since the last call, as () tensors; the device is not waited for.
@@ -316,6 +325,8 @@ class DiffEnv(VectorEnv):
         """What the task observes (N, obs_dim) of states on the episodes' clocks, `elapsed` control steps from now."""
         if self._elevation is not None:
             qpos = self._elevation.lower(qpos)
+        if self.task.num_memory:
+            return self.task.observe_with(qpos, qvel, action, self.memory)
         if not self.task.timed:
             return self.task.observe(qpos, qvel, action)
         return self.task.observe_at(qpos, qvel, action, self.first_step + self.episode_step + elapsed)
@@ -331,6 +342,7 @@ class DiffEnv(VectorEnv):
             "episode_return": self._episode_return.clone(),
             "generator": self.generator.get_state(),
             **({"first_step": self.first_step.clone()} if self.task.timed else {}),
+            **({"memory": self.memory.detach().clone()} if self.task.num_memory else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -353,6 +365,7 @@ class DiffEnv(VectorEnv):
         self._obs = state["obs"].to(self.device)
         self.episode_step.copy_(state["episode_step"])
         self.first_step.copy_(state.get("first_step", self.first_step))
+        self.memory = state.get("memory", self.memory).to(self.device)
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
         self._time = self.horizon
@@ -362,7 +375,8 @@ class DiffEnv(VectorEnv):
         self._episode_return.zero_()
         self._recorded = 0  # differentiable steps since the window began
         self.sim.rewind()
-        first, self.qpos, self.qvel, self._obs = (start[0] for start in self._draw(1))
+        first, *state = (start[0] for start in self._draw(1))
+        self._put(state)
         self.first_step.copy_(first)
         self._draw_starts()
         self._show()
@@ -371,22 +385,25 @@ class DiffEnv(VectorEnv):
         # Start states of a whole window at once: one batch of small operations instead of one per step.
         self._starts, self._time = self._draw(self.horizon), 0
 
-    def _draw(self, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self._start_states(self._uniform(steps, self.num_envs))
+    def _draw(self, steps: int) -> tuple[Tensor, ...]:
+        return self._start_states(self._uniform(steps, self.num_envs, self.task.num_random))
 
     def _uniform(self, *size: int) -> Tensor:
-        size = *size, self.task.num_random
         return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
 
     @torch.no_grad()
-    def _start_states(self, rand: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The first step (...), qpos, qvel and obs (..., each) of rand (..., num_random), of all or of rows."""
+    def _start_states(self, rand: Tensor, rows: Tensor | None = None) -> tuple[Tensor, ...]:
+        """The first step (...), qpos, qvel, obs and memory, if any (..., each) of rand (..., num_random)."""
         if not self.stochastic_init:
             rand = torch.full_like(rand, 0.5)
-        first, (qpos, qvel) = self.task.first_step(rand), self.task.reset(rand)
+        first, (qpos, qvel), memory = self.task.first_step(rand), self.task.reset(rand), ()
         action = self._no_action[0].expand(*rand.shape[:-1], -1)
-        obs = self.task.observe_at(qpos, qvel, action, first)
-        return first, qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs
+        if self.task.num_memory:
+            memory = (self.task.begin(rand),)
+            obs = self.task.observe_with(qpos, qvel, action, *memory)
+        else:
+            obs = self.task.observe_at(qpos, qvel, action, first)
+        return first, qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs, *memory
 
     def _show(self) -> None:
         if self.render_mode == "human":

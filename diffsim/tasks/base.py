@@ -33,6 +33,9 @@ class Task:
     accurate: ClassVar[Integration]
     obs_dim: ClassVar[int]
     num_random: ClassVar[int]  # random numbers per reset
+    actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
+    num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
+    num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
     timed: ClassVar[bool] = False  # whether observations depend on the time: see first_step and observe_at
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: ClassVar[float] = 1 / 60  # s
@@ -99,6 +102,24 @@ class Task:
 
     def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
         """`observe` at a control step (...) int64, which is `first_step` at the start of an episode."""
+        return self.observe(qpos, qvel, action)
+
+    def begin(self, rand: Tensor) -> Tensor:
+        """The memory (..., num_memory) at the start of an episode from rand (..., num_random)."""
+        return rand[..., : self.num_memory] * 0.0
+
+    def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
+        """The memory (..., num_memory) after a control step.
+
+        Args:
+            memory: (..., num_memory) before it; gradients flow through it within a window.
+            action: (..., nu) of the step, clipped to [-1, 1].
+            noise: (..., num_noise) uniform in [0, 1).
+        """
+        return memory
+
+    def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
+        """`observe` of a task with a memory (..., num_memory)."""
         return self.observe(qpos, qvel, action)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:

@@ -1,0 +1,225 @@
+"""Joystick: a legged robot follows a commanded velocity, as MuJoCo Playground and mjlab train it, with smooth terms.
+
+The command is the velocity of the root along its own x and y axes [m/s] and its yaw rate [rad/s]; it changes within an
+episode. A clock moves the legs' reference: in the air they fold, on the ground their feet go backward as fast as the
+command asks. Robots are data: GO1, GO2, G1. Their figures are those of MuJoCo Menagerie's files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffsim.tasks.base import Contact, Task
+from diffsim.tasks.locomotion import rotate
+
+FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
+STANDING = 0.1  # share of commands that are zero; each of the three numbers of others is with the same probability
+# Noise of the sensors, uniform to both sides: joints [rad], rates [rad/s], angular and linear velocity, gravity
+JOINT_NOISE, RATE_NOISE, GYRO_NOISE, VELOCITY_NOISE, GRAVITY_NOISE = 0.03, 0.5, 0.2, 0.1, 0.05
+
+
+class Leg(NamedTuple):
+    """A leg, and where it is in the gait.
+
+    Attributes:
+        joints: (pitch, roll) names of the joints that move the foot along x and y.
+        folds: of joints in the middle of the swing [rad].
+        place: x and y of the hip from the root [m].
+        phase: share of the cycle by which it is ahead.
+    """
+
+    joints: tuple[str, str]
+    folds: dict[str, float]
+    place: tuple[float, float]
+    phase: float
+
+
+class Robot(NamedTuple):
+    """What the task knows of a robot.
+
+    Attributes:
+        legs: of it; joints of no leg stay near the keyframe's.
+        joints: names in order of qpos.
+        home: (joints,) [rad] of the keyframe.
+        height: m, of the root there.
+        length: m, of a leg, from hip to foot there.
+        cycle: Hz, of the gait.
+        command: largest vx, vy [m/s] and yaw rate [rad/s].
+    """
+
+    joints: tuple[str, ...]
+    home: tuple[float, ...]
+    height: float
+    legs: tuple[Leg, ...]
+    length: float
+    cycle: float
+    command: tuple[float, float, float] = (1.0, 0.6, 1.0)
+
+
+def quadruped(order: Sequence[str]) -> Robot:
+    """Unitree's, with the legs in this order; a trot."""
+    legs = tuple(
+        Leg(
+            (f"{name}_thigh", f"{name}_hip"),
+            {f"{name}_thigh": 0.25, f"{name}_calf": -0.5},
+            (0.19 if name[0] == "F" else -0.19, 0.14 if name[1] == "L" else -0.14),
+            0.0 if name in ("FL", "RR") else 0.5,
+        )
+        for name in order
+    )
+    joints = tuple(f"{name}_{part}" for name in order for part in ("hip", "thigh", "calf"))
+    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 2.0)
+
+
+def humanoid() -> Robot:
+    """Unitree's G1 with 29 joints; a walk."""
+    leg = "hip_pitch hip_roll hip_yaw knee ankle_pitch ankle_roll".split()
+    arm = "shoulder_pitch shoulder_roll shoulder_yaw elbow wrist_roll wrist_pitch wrist_yaw".split()
+    parts = [("left_", leg), ("right_", leg), ("waist_", ["yaw", "roll", "pitch"]), ("left_", arm), ("right_", arm)]
+    stance, hang = (-0.312, 0.0, 0.0, 0.669, -0.363, 0.0), (0.2, 0.0, 0.6, 0.0, 0.0, 0.0)
+    legs = tuple(
+        Leg(
+            (f"{side}_hip_pitch", f"{side}_hip_roll"),
+            {f"{side}_hip_pitch": -0.4, f"{side}_knee": 0.8, f"{side}_ankle_pitch": -0.4},
+            (0.0, 0.12 if side == "left" else -0.12),
+            0.0 if side == "left" else 0.5,
+        )
+        for side in ("left", "right")
+    )
+    home = (*stance, *stance, 0.0, 0.0, 0.073, 0.2, *hang, 0.2, -0.2, *hang[1:])
+    return Robot(tuple(side + name for side, names in parts for name in names), home, 0.755, legs, 0.65, 1.4)
+
+
+class Joystick(Task):
+    """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates).
+
+    Memory: command, clock in cycles, the last two actions, then the noise of the sensors.
+    """
+
+    robot: ClassVar[Robot]
+    contact: ClassVar[Contact] = "mujoco"
+    substeps = 4
+    control_dt = 0.02
+    episode_length = 1000
+
+    def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
+        robot, n = self.robot, len(self.robot.joints)
+        self.start = (0.0, 0.0, robot.height, 1.0, 0.0, 0.0, 0.0, *robot.home, *(0.0,) * (6 + n))
+        self.spread = (0.0,) * 7 + (0.2,) * n + (1.0,) * 6 + (0.5,) * n
+        super().__init__(device, dtype)
+
+        def tensor(values: object) -> Tensor:
+            return torch.tensor(values, device=device, dtype=dtype)
+
+        fold, stride, phase = torch.zeros(n), torch.zeros(n, 3), torch.zeros(n)
+        reach = 1.0 / (4.0 * robot.cycle * robot.length)  # rad per m/s: a stance is half a cycle
+        for leg in robot.legs:
+            x, y = leg.place
+            pitch, roll = map(robot.joints.index, leg.joints)
+            stride[pitch] = reach * torch.tensor((1.0, 0.0, -y))
+            stride[roll] = -reach * torch.tensor((0.0, 1.0, x))
+            for name, angle in leg.folds.items():
+                fold[robot.joints.index(name)] = angle
+            for joint in {pitch, roll, *map(robot.joints.index, leg.folds)}:
+                phase[joint] = leg.phase
+        self._fold, self._phase = fold.to(device, dtype), phase.to(device, dtype)
+        self._stride = stride.mT.contiguous().to(device, dtype)
+        self._home, self._most = tensor(robot.home), tensor(robot.command)
+        scales = (VELOCITY_NOISE,) * 3 + (GYRO_NOISE,) * 3 + (GRAVITY_NOISE,) * 3
+        self._noise = tensor(scales + (JOINT_NOISE,) * n + (0.1 * RATE_NOISE,) * n)
+        self._down = tensor((0.0, 0.0, -1.0))
+        self._n = n
+
+    def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
+        """The keyframe, with joints and rates drawn around it."""
+        start = torch.addcmul(self._start, rand[..., : len(self.start)] - 0.5, self._spread)
+        qpos, qvel = start.split((7 + self._n, 6 + self._n), dim=-1)
+        return qpos, qvel
+
+    def begin(self, rand: Tensor) -> Tensor:
+        """A command and a phase; no action yet."""
+        command, phase = self._draw(rand[..., len(self.start) :]), rand[..., -1:]
+        return torch.cat((command, phase, torch.zeros_like(rand[..., :1]).expand(*rand.shape[:-1], 4 * self._n + 9)), -1)
+
+    def _draw(self, rand: Tensor) -> Tensor:
+        """A command (..., 3) from rand (..., 7)."""
+        size, kept, some = rand[..., :3], rand[..., 3:6] >= STANDING, rand[..., 6:7] >= STANDING
+        return (2.0 * size - 1.0) * self._most * kept * some
+
+    def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
+        command, clock, last, _, _ = memory.split((3, 1, self._n, self._n, 9 + 2 * self._n), dim=-1)
+        drawn, when, sensors = noise.split((7, 1, 9 + 2 * self._n), dim=-1)
+        command = torch.where(when < self.control_dt * FREQUENCY_OF_COMMANDS, self._draw(drawn), command)
+        clock = (clock + self.control_dt * self.robot.cycle).remainder(1.0)
+        return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise), dim=-1)
+
+    def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
+        """For the actor, with noise: linear and angular velocity, gravity's direction, in the body's frame; joints from
+        the keyframe's, 0.1 joint rates; the last action, the command, sine and cosine of the clock. For the critic also
+        these without noise; height, the change of the action, and how far the joints are from the reference."""
+        position, quat, joints = qpos.split((3, 4, self._n), dim=-1)
+        velocity, angular, rates = qvel.split((3, 3, self._n), dim=-1)
+        command, clock, last, before, noise = memory.split((3, 1, self._n, self._n, 9 + 2 * self._n), dim=-1)
+        world = torch.stack((velocity, self._down.expand_as(velocity)), dim=-2)
+        inverse = torch.cat((quat[..., :1], -quat[..., 1:]), dim=-1).unsqueeze(-2)
+        velocity, gravity = rotate(inverse, world).unbind(dim=-2)
+        sensed = torch.cat((velocity, angular, gravity, joints - self._home, 0.1 * rates), dim=-1)
+        turn = 2.0 * math.pi * clock
+        private = sensed, position[..., 2:], last - before, joints - self.reference(command, clock)
+        return torch.cat((sensed + noise, last, command, turn.sin(), turn.cos(), *private), dim=-1)
+
+    def reference(self, command: Tensor, clock: Tensor) -> Tensor:
+        """Joints (..., n) of a gait at the command's speed; at rest the keyframe's."""
+        turn = 2.0 * math.pi * (clock + self._phase)
+        moving = command.square().sum(-1, keepdim=True)
+        moving = moving / (moving + 0.01)
+        return self._home + moving * self._fold * turn.sin().clamp(min=0.0).square() + command @ self._stride * turn.cos()
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Both velocities, then an upright, level, calm root at its height, the reference's joints, smooth actions."""
+        n = self._n
+        command, private = obs[..., 9 + 3 * n : 12 + 3 * n], obs[..., 14 + 3 * n :]
+        velocity, angular, gravity, _, _, height, change, error = private.split((3, 3, 3, n, n, 1, n, n), dim=-1)
+        speed = (velocity[..., :2] - command[..., :2]).square().sum(-1)
+        yaw = (angular[..., 2] - command[..., 2]).square()
+        tracking = 0.1 / (0.1 + speed) + 0.5 * 0.1 / (0.1 + yaw) - 0.5 * speed - 0.2 * yaw
+        calm = 0.5 * velocity[..., 2].square() + 0.05 * angular[..., :2].square().sum(-1)
+        level = 2.0 * gravity[..., :2].square().sum(-1) + 20.0 * (height[..., 0] - self.robot.height).square()
+        gait = 0.5 * error.square().sum(-1) + 0.02 * change.square().sum(-1)
+        return 1.0 + tracking - calm - level - gait
+
+    def terminated(self, obs: Tensor) -> Tensor:
+        """Tilted by more than 60 degrees, or the root below 60 % of its height."""
+        private = obs[..., 14 + 3 * self._n :]
+        return (private[..., 8] > -0.5) | (private[..., 9 + 2 * self._n] < 0.6 * self.robot.height)
+
+
+def sizes(robot: Robot) -> dict[str, int]:
+    n = len(robot.joints)
+    return dict(actor_dim=14 + 3 * n, obs_dim=24 + 7 * n, num_memory=13 + 4 * n, num_noise=17 + 2 * n, num_random=21 + 2 * n)
+
+
+class Go1(Joystick):
+    """12 joints; action: targets of the servos."""
+
+    name, asset, robot = "go1", "go1.xml", quadruped(("FR", "FL", "RR", "RL"))
+    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot).values()
+
+
+class Go2(Joystick):
+    """12 joints; action: targets of servos on the motors."""
+
+    name, asset, robot = "go2", "go2.xml", quadruped(("FL", "FR", "RL", "RR"))
+    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot).values()
+
+
+class G1(Joystick):
+    """29 joints; action: targets of the servos."""
+
+    name, asset, robot = "g1", "g1.xml", humanoid()
+    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot).values()
