@@ -16,6 +16,7 @@ from scenes import (
     BLOCK,
     CRANE,
     DISTINCT,
+    FREE_SERVOS,
     PENDULUM,
     ROBOTS,
     SHOULDER,
@@ -96,6 +97,13 @@ def test_tree_accelerations_are_mujocos(base, seed, rng):
 
 def test_ball_joint_on_the_world_has_mujocos_accelerations(rng):
     check_against_mujoco(parse(SHOULDER), torch.float64, rng)
+
+
+def test_servos_push_as_mujocos(rng):
+    """Springs and dampers of position, velocity and general actuators add up with each other and with the joints'."""
+    scene = parse(FREE_SERVOS)
+    assert scene.features == {"hinge", "slide", "stiffness", "damping", "motor"}
+    check_against_mujoco(scene, torch.float64, rng)
 
 
 @pytest.mark.parametrize("model", ["linear", "hill"])

@@ -25,6 +25,7 @@ from diffsim.robot.constants import (
     motors,
     numeric,
     pair_law,
+    servos,
     text,
 )
 from diffsim.robot.refuse import obstacles, overflows
@@ -137,7 +138,7 @@ class _Reader:
             position=self.position,
             **joints,
             **inertias,
-            **self._actuators(),
+            **self._actuators(joints["stiffness"]),
             **self._contacts(float(inertias["mass"].sum()), joints["slide"]),
             body_link=np.array([link for link, _, _ in self.body], np.int32),
             body_com=np.array([p + r @ com for (_, r, p), com in zip(self.body, m.body_ipos, strict=True)]),
@@ -177,6 +178,11 @@ class _Reader:
         ball, limited = m.jnt_type[joint] == kind.mjJNT_BALL, m.jnt_limited[joint] != 0
         nth, at = dof - m.jnt_dofadr[joint], m.jnt_qposadr[joint]
         k_limit, d_limit = self._limits()
+        # Springs and dampers of servos join those of the joints.
+        push, stiffness, damping = self._servos()
+        spring_ref = np.where(ball, 0.0, m.qpos_spring[at])  # a ball's is the identity in every MJCF
+        total = m.jnt_stiffness[joint] + stiffness
+        moved = np.divide(m.jnt_stiffness[joint] * spring_ref + push, total, out=spring_ref.copy(), where=total > 0)
 
         def column(values: Array, base: float = 0.0) -> Array:
             return np.concatenate((np.full((1, *values.shape[1:]), base), values))
@@ -187,14 +193,26 @@ class _Reader:
             "axis": column(np.where(ball[:, None], np.eye(3)[nth], m.jnt_axis[joint])),
             "joint_ref": column(np.where(ball, 0.0, m.qpos0[at])),
             "armature": column(m.dof_armature[dof]),
-            "damping": column(m.dof_damping[dof]),
-            "stiffness": column(m.jnt_stiffness[joint]),
-            "spring_ref": column(np.where(ball, 0.0, m.qpos_spring[at])),  # a ball's is the identity in every MJCF
+            "damping": column(m.dof_damping[dof] + damping),
+            "stiffness": column(total),
+            "spring_ref": column(np.where((stiffness > 0) | (push != 0), moved, spring_ref)),
             "lower": column(np.where(limited, m.jnt_range[joint, 0], -np.inf), -np.inf),
             "upper": column(np.where(limited, m.jnt_range[joint, 1], np.inf), np.inf),
             "k_limit": column(np.where(limited, k_limit[dof], 0.0)),
             "d_limit": column(np.where(limited, d_limit[dof], 0.0)),
         }
+
+    def _servos(self) -> Array:
+        """(3, joints) of the affine biases of their actuators: force at zero, stiffness and damping."""
+        m, sums = self.m, np.zeros((3, self.nlink - 1))
+        for a in np.flatnonzero(servos(m)).tolist():
+            gear = m.actuator_gear[a, 0]
+            sums[:, self._link(m.actuator_trnid[a, 0]) - 1] += m.actuator_biasprm[a, :3] * (
+                gear,
+                -(gear**2),
+                -(gear**2),
+            )
+        return sums
 
     def _inertias(self) -> dict[str, Any]:
         """mass, com and inertia (nlink, ...) of the bodies that are welded together."""
@@ -213,7 +231,8 @@ class _Reader:
         about_com = inertia + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
         return {"mass": mass, "com": com, "inertia": about_com}
 
-    def _actuators(self) -> dict[str, Any]:
+    def _actuators(self, stiffness: Array) -> dict[str, Any]:
+        """Columns (nu, ...); without a spring on their link, the constant forces of servos are the motors'."""
         m = self.m
         tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
         low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
@@ -227,11 +246,14 @@ class _Reader:
                 scale[a], hill[a] = self._muscle(a, constant)
             else:
                 link[a], scale[a] = self._motor(a)
+        constant_force = np.where(
+            servos(m) & (stiffness[link] == 0), m.actuator_gear[:, 0] * m.actuator_biasprm[:, 0], 0
+        )
         segments.sort(key=lambda segment: (segment.links, segment.actuator))
         return {
             "motor_link": link,
             "gear": scale * (high - low) / 2,
-            "motor_bias": scale * (high + low) / 2,
+            "motor_bias": scale * (high + low) / 2 + constant_force,
             "segment_link": np.array([s.links for s in segments], np.int32).reshape(-1, 2),
             "segment_position": np.array([s.ends for s in segments]).reshape(-1, 2, 3),
             "segment_muscle": np.array([s.actuator for s in segments], np.int32),

@@ -26,6 +26,7 @@ from diffsim.robot.constants import (
     motors,
     numeric,
     pair_law,
+    servos,
     text,
 )
 from diffsim.robot.scene import MUSCLE_MODELS, PENALTY_CONSTANTS, Array, Scene
@@ -85,7 +86,8 @@ def overflows(scene: Scene) -> list[str]:
     """Likewise of actuators whose forces, products of the file's numbers, single precision does not hold."""
     muscle = np.zeros(scene.nu, bool)
     muscle[scene.segment_muscle] = "hill" in scene.features
-    numbers = np.column_stack((scene.gear, scene.motor_bias, np.where(muscle[:, None], scene.hill, 0.0)))
+    springs = np.array((scene.stiffness, scene.damping, scene.spring_ref))[:, scene.motor_link]
+    numbers = np.column_stack((scene.gear, scene.motor_bias, *springs, np.where(muscle[:, None], scene.hill, 0.0)))
     why = f"its force is beyond single precision, {GREATEST:.2g} N at most"
     return _lines(_where(scene.mj_model, Kind.mjOBJ_ACTUATOR, {why: ~_finite(numbers).all(1)}))
 
@@ -288,7 +290,7 @@ def _tendons(m: mujoco.MjModel) -> Iterator[Obstacle]:
     yield from _where(m, Kind.mjOBJ_SITE, {"a muscle of a floating robot cannot hold on to the world": held & world})
 
 
-ON_JOINT = "motors with a gear and a ctrlrange on a hinge, a slide or one axis of a ball joint"
+ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
 
 
@@ -297,24 +299,27 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
     tendon, motor = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, motors(m)
     pulls, turns = _pulls(m, count), _turns(m)
     low, high = m.actuator_ctrlrange[:count].T
+    stiffness, damping = np.where(servos(m), -m.actuator_biasprm[:count, 1:3].T, 0.0)
     hill = text(m, "muscle_model", "linear") == "hill"
     idle = tendon & ~motor & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
     rules = {
         f"only {ON_TENDON}": tendon & ~pulls,
-        f"only {ON_JOINT}, or muscles on tendons": ~tendon & ~turns,
+        f"only {ON_JOINT}, without activation dynamics, or muscles on tendons": ~tendon & ~turns,
+        "its stiffness (minus biasprm's second number) is {stiffness:g}, must not be negative": turns & (stiffness < 0),
+        "its damping (minus biasprm's third number) is {damping:g}, must not be negative": turns & (damping < 0),
         "muscle_model 'hill' needs a <muscle>": tendon & motor & hill,
         "its force follows from what it moves, and it moves nothing; give force": pulls & idle,
         "ctrlrange {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
     }
-    yield from _where(m, Kind.mjOBJ_ACTUATOR, rules, low=low, high=high)
+    yield from _where(m, Kind.mjOBJ_ACTUATOR, rules, low=low, high=high, stiffness=stiffness, damping=damping)
 
 
 def _turns(m: mujoco.MjModel) -> Mask:
-    """Motors of a hinge, of a slide or of one axis of a ball joint."""
-    turns = motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    """Motors and servos of a hinge or of a slide, and motors of one axis of a ball joint."""
+    turns = (motors(m) | servos(m)) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
     found = np.flatnonzero(turns)
     kind, axes = m.jnt_type[m.actuator_trnid[found, 0]], np.count_nonzero(m.actuator_gear[found, :3], axis=1)
-    turns[found] = np.where(kind == Joint.mjJNT_BALL, axes <= 1, kind != Joint.mjJNT_FREE)
+    turns[found] = np.where(kind == Joint.mjJNT_BALL, motors(m)[found] & (axes <= 1), kind != Joint.mjJNT_FREE)
     return turns
 
 

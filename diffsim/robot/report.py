@@ -173,7 +173,7 @@ def _actuators(scene: Scene) -> list[str]:
     free = [label(m, Kind.mjOBJ_ACTUATOR, a) for a in np.flatnonzero(m.actuator_ctrllimited == 0).tolist()]
     if free:
         sentences.append(f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {', '.join(free)}.")
-    if not motors(m).all():
+    if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         sentences.append("A control sets the activation of a <muscle> at once.")
         if scene.muscle_model != "hill":
             sentences.append("A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves.")

@@ -92,8 +92,10 @@ REFUSED = [
     *cases(
         actuated,
         {
-            '<position name="servo" kp="5"/>': "servo",
-            '<velocity name="drive"/>': "drive",
+            '<position name="servo" kp="-5"/>': "actuator 'servo': its stiffness .* is -5, must not be negative",
+            '<velocity name="drive" kv="-2"/>': "actuator 'drive': its damping .* is -2, must not be negative",
+            '<position name="soft" kp="5" timeconst="0.1"/>': "actuator 'soft': only motors .* servos .* activation",
+            '<damper name="brake" kv="1" ctrlrange="0 1"/>': "actuator 'brake': only motors",
             '<general name="slow" dyntype="filter" dynprm="1"/>': "slow",
             '<motor name="weak" forcerange="-1 1"/>': "weak",
             '<motor name="stiff" damping="1"/>': "stiff|damping",
@@ -227,12 +229,15 @@ REFUSED = [
         ),
         "rocket",
     ),
-    (
-        robot(
-            '<body><joint name="hip" type="ball"/><geom size="0.1"/></body>',
-            '<actuator><motor name="twist" joint="hip" gear="1 1 0"/></actuator>',
-        ),
-        "twist.*one axis of a ball joint",
+    *(
+        (
+            robot(
+                '<body><joint name="hip" type="ball"/><geom size="0.1"/></body>',
+                f'<actuator><{actuator} name="twist" joint="hip" gear="1 {second} 0"/></actuator>',
+            ),
+            "twist.*one axis of a ball joint",
+        )
+        for actuator, second in (("motor", 1), ("position", 0))
     ),
     (pendulum(inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'), "hull"),
     (pendulum(inside='<body name="fin"><geom size="0.1"/></body>', rest='<option density="1"/>'), "fin"),
@@ -300,7 +305,7 @@ def test_all_obstacles_in_one_message():
                 'actuatorfrcrange="-1 1" damping="-2"',
                 inside='<geom name="egg" type="ellipsoid" size="1 2 3"/><geom name="can" type="cylinder" size="1 2"/>'
                 '<geom type="cylinder" size="1 2"/>',
-                rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="5"/></actuator>'
+                rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="-5"/></actuator>'
                 '<custom><numeric name="k_nn" data="1"/></custom>',
             )
         )
