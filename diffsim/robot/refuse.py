@@ -44,13 +44,11 @@ EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", 
 
 # Attributes of elements that are not simulated, and the arrays that are not 0 where one is set.
 UNSIMULATED = {
-    Kind.mjOBJ_JOINT: {"actuatorfrcrange": "jnt_actfrclimited"},
     Kind.mjOBJ_TENDON: {
         f"{field} of a tendon": f"tendon_{field}"
         for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited", "springyield")
     },
     Kind.mjOBJ_ACTUATOR: {
-        "forcerange": "actuator_forcelimited",
         "damping": "actuator_damping actuator_dampingpoly",
         "armature": "actuator_armature",
         "delay": "actuator_delay actuator_history",
@@ -86,7 +84,8 @@ def overflows(scene: Scene) -> list[str]:
     """Likewise of actuators whose forces, products of the file's numbers, single precision does not hold."""
     muscle = np.zeros(scene.nu, bool)
     muscle[scene.segment_muscle] = "hill" in scene.features
-    springs = np.array((scene.stiffness, scene.damping, scene.spring_ref))[:, scene.motor_link]
+    names = "stiffness", "damping", "spring_ref", "servo_stiffness", "servo_damping", "servo_ref"
+    springs = np.array([getattr(scene, name) for name in names])[:, scene.motor_link]
     numbers = np.column_stack((scene.gear, scene.motor_bias, *springs, np.where(muscle[:, None], scene.hill, 0.0)))
     why = f"its force is beyond single precision, {GREATEST:.2g} N at most"
     return _lines(_where(scene.mj_model, Kind.mjOBJ_ACTUATOR, {why: ~_finite(numbers).all(1)}))
@@ -135,8 +134,8 @@ def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
         Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat"),
         Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solimp solmix margin gap"),
         Kind.mjOBJ_SITE: ("site", "pos"),
-        Kind.mjOBJ_JOINT: ("jnt", "pos axis range stiffness solref solimp margin"),
-        Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange gainprm biasprm lengthrange"),
+        Kind.mjOBJ_JOINT: ("jnt", "pos axis range actfrcrange stiffness solref solimp margin"),
+        Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange forcerange gainprm biasprm lengthrange"),
     }
     table = {k: {f: getattr(m, f"{prefix}_{f}") for f in names.split()} for k, (prefix, names) in fields.items()}
     table[Kind.mjOBJ_JOINT] |= {"ref": m.qpos0[m.jnt_qposadr], "springref": m.qpos_spring[m.jnt_qposadr]}
@@ -261,12 +260,14 @@ def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
     passive = (m.dof_armature[dof] != 0) | (m.dof_damping[dof] != 0) | (m.jnt_stiffness != 0) | (loss != 0)
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
+    tendons = (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON).any()
     curved = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(_any(m, "dof_dampingpoly"))])
     rules = {
         "damping and stiffness are linear here, one number each": curved | _any(m, "jnt_stiffnesspoly"),
         "springs that yield are not simulated": _any(m, "jnt_springyield") | plastic,
         "frictionloss {loss:g} is negative": loss < 0,
         "the limit of a ball joint is not simulated": ball & limited,
+        "actuatorfrcrange beside muscles is not simulated": (m.jnt_actfrclimited != 0) & tendons,
         "a free joint has no armature, damping, stiffness or frictionloss here": free & passive,
         "one free joint, of the first moving body, is simulated": free & ~first,
         "range {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
@@ -300,6 +301,8 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
     pulls, turns = _pulls(m, count), _turns(m)
     low, high = m.actuator_ctrlrange[:count].T
     stiffness, damping = np.where(servos(m), -m.actuator_biasprm[:count, 1:3].T, 0.0)
+    bounded, joint = m.actuator_forcelimited[:count] != 0, np.where(tendon, -1, m.actuator_trnid[:count, 0])
+    shared = (joint[:, None] == joint).sum(1) > 1
     hill = text(m, "muscle_model", "linear") == "hill"
     idle = tendon & ~motor & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
     rules = {
@@ -307,6 +310,8 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
         f"only {ON_JOINT}, without activation dynamics, or muscles on tendons": ~tendon & ~turns,
         "its stiffness (minus biasprm's second number) is {stiffness:g}, must not be negative": turns & (stiffness < 0),
         "its damping (minus biasprm's third number) is {damping:g}, must not be negative": turns & (damping < 0),
+        "forcerange of a muscle is not simulated": tendon & bounded,
+        "forcerange is simulated of a joint's only actuator": turns & bounded & shared,
         "muscle_model 'hill' needs a <muscle>": tendon & motor & hill,
         "its force follows from what it moves, and it moves nothing; give force": pulls & idle,
         "ctrlrange {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),

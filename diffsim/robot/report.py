@@ -187,7 +187,7 @@ def _stability(scene: Scene) -> list[str]:
         sentences.append("Nothing damps the joints: semi_implicit drifts in energy; the extrapolated one hardly does.")
     first = 6 if scene.floating else 0
     inverse = np.linalg.inv(mass_matrix(scene.mj_model))[first:, first:]
-    laws = (scene.stiffness[1:], scene.damping[1:])
+    laws = ((scene.stiffness + scene.servo_stiffness)[1:], (scene.damping + scene.servo_damping)[1:])
     k, b = (abs(np.linalg.eigvals(inverse * law)).max(initial=0) for law in laws)
     if k * STEP**2 + 2 * b * STEP < 4:  # semi-implicit Euler of v' = -b v - k x
         return sentences

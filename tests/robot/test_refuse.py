@@ -49,7 +49,6 @@ REFUSED = [
     *cases(
         pendulum,
         {
-            'actuatorfrcrange="-1 1"': "hinge",
             'frictionloss="-1"': "joint 'hinge': frictionloss -1 is negative",
             'damping="1 2"': "hinge|damping",
             'stiffness="1 2"': "hinge|stiffness",
@@ -97,7 +96,7 @@ REFUSED = [
             '<position name="soft" kp="5" timeconst="0.1"/>': "actuator 'soft': only motors .* servos .* activation",
             '<damper name="brake" kv="1" ctrlrange="0 1"/>': "actuator 'brake': only motors",
             '<general name="slow" dyntype="filter" dynprm="1"/>': "slow",
-            '<motor name="weak" forcerange="-1 1"/>': "weak",
+            '<motor name="weak" forcerange="-1 1"/><motor joint="hinge"/>': "'weak': forcerange .* only actuator",
             '<motor name="stiff" damping="1"/>': "stiff|damping",
             '<motor name="heavy" armature="1"/>': "heavy|armature",
             '<motor name="m" ctrlrange="1 -1"/>': "actuator 'm': ctrlrange 1 -1 is empty",
@@ -188,10 +187,15 @@ REFUSED = [
             '<motor name="pusher" tendon="string"/>': "pusher.*never push",
             '<position name="servo" tendon="string" kp="1"/>': "servo",
             f'<muscle gear="2" {MUSCLE}/>': "biceps.*gear",
+            f'<muscle forcerange="-1 0" {MUSCLE}/>': "actuator 'biceps': forcerange of a muscle",
             '<muscle name="biceps" tendon="string" force="-5" lengthrange="1 2"/>': (
                 "actuator 'biceps': its force follows from what it moves, and it moves nothing; give force"
             ),
         },
+    ),
+    (
+        tendon(joint='<joint name="weak" actuatorfrcrange="-1 1"/>', actuator=f"<muscle {MUSCLE}/>"),
+        "joint 'weak': actuatorfrcrange beside muscles",
     ),
     (tendon('<geom geom="g"/>', actuator=f"<muscle {MUSCLE}/>"), "string"),
     (tendon('<pulley divisor="2"/><site site="w"/><site site="a"/>', actuator=f"<muscle {MUSCLE}/>"), "string"),
@@ -302,7 +306,7 @@ def test_all_obstacles_in_one_message():
     with pytest.raises(SceneError) as error:
         parse(
             pendulum(
-                'actuatorfrcrange="-1 1" damping="-2"',
+                'frictionloss="-1" damping="-2"',
                 inside='<geom name="egg" type="ellipsoid" size="1 2 3"/><geom name="can" type="cylinder" size="1 2"/>'
                 '<geom type="cylinder" size="1 2"/>',
                 rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="-5"/></actuator>'
