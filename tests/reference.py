@@ -113,13 +113,16 @@ def joint_forces(
     scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float = 0.0, theta: float = 0.0
 ) -> tuple[Array, Array]:
     """Motors, springs, dampers and limits (Eq. 4) at zero acceleration, and their (nv,) resistance to it."""
-    force, resistance = np.zeros(scene.nv), np.zeros(scene.nv)
+    force, resistance, motors = np.zeros(scene.nv), np.zeros(scene.nv), np.zeros(scene.nlink)
     for motor, link in enumerate(scene.motor_link):
         if link > 0:  # else it is a muscle
-            force[joint_dof(scene, link)] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]
+            motors[link] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]
     for i in range(1, scene.nlink):
         dof, qd = joint_dof(scene, i), qvel[joint_dof(scene, i)]
         q = joint_position(scene, i, qpos) + theta * h * qd
+        servo = scene.servo_stiffness[i] * (scene.servo_ref[i] - q) - scene.servo_damping[i] * qd
+        force[dof] += np.clip(motors[i] + servo, scene.force_low[i], scene.force_high[i])
+        free = scene.force_low[i] < motors[i] + servo < scene.force_high[i]
         bound = np.clip(q, scene.lower[i], scene.upper[i])
         beyond = q != bound
         firmness = scene.k_limit[i] - scene.d_limit[i] * qd * np.sign(bound - q)
@@ -128,6 +131,7 @@ def joint_forces(
         force[dof] += scene.stiffness[i] * (scene.spring_ref[i] - q) - scene.damping[i] * qd + push
         resistance[dof] = h * (scene.damping[i] + (pushes * scene.d_limit[i] * abs(bound - q) if beyond else 0.0))
         resistance[dof] += theta * h**2 * (scene.stiffness[i] + pushes * scene.k_limit[i])
+        resistance[dof] += free * (h * scene.servo_damping[i] + theta * h**2 * scene.servo_stiffness[i])
     return force, resistance
 
 

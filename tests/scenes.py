@@ -93,6 +93,50 @@ SHOULDER = """
   </actuator>
 </mujoco>"""
 
+# Hinges and slides with every kind of servo, several on one joint, one beside a spring and one of a constant force.
+SERVOS = """
+<mujoco>
+  <compiler angle="radian"/> <option integrator="implicitfast"/>
+  <worldbody>
+    <body pos="0 0 1">
+      <joint name="a" axis="0 1 0" ref="0.2" damping="0.3" armature="0.1"/>
+      <inertial pos="0 0 -0.3" mass="2" diaginertia=".1 .1 .1"/>
+      <body pos="0 0 -0.5">
+        <joint name="b" type="slide" axis="1 0 1" stiffness="5" springref="0.1" armature="0.1" {joint}/>
+        <inertial pos="0.1 0 -0.1" mass="1" diaginertia=".1 .2 .1"/>
+        <body pos="0.2 0 0">
+          <joint name="c" axis="1 0 0" stiffness="2" springref="-0.4" armature="0.1"/>
+          <inertial pos="0 0.1 -0.2" mass="1" diaginertia=".1 .1 .2"/>
+          <body>
+            <joint name="d" axis="0 1 1" armature="0.1"/> <inertial pos="0 0 0.2" mass="1" diaginertia=".2 .1 .1"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="a" kp="30" kv="2" gear="-1.5" ctrlrange="-2 1" {a}/>
+    <velocity joint="b" kv="4" gear="2" {b}/>
+    <general joint="c" gaintype="fixed" biastype="affine" gainprm="7" biasprm="3 -20 -1" ctrlrange="-1 2" gear="2" {c}/>
+    <general joint="d" biastype="affine" gainprm="2" biasprm="4 0 0" {d}/>
+    {more}
+  </actuator>
+</mujoco>"""
+FREE_SERVOS = SERVOS.format(
+    **dict.fromkeys(["a", "b", "c", "d", "joint"], ""),
+    more='<position joint="a" kp="10" ctrlrange="0 1"/> <general joint="b" biastype="affine" biasprm="3 0 0"/>',
+)
+
+# The same with bounds on the forces of an actuator, of a joint, of both and of a motor without a spring.
+BOUNDED_SERVOS = SERVOS.format(
+    joint='actuatorfrcrange="-9 12"',
+    a='forcerange="-9 14"',
+    b="",
+    c="",
+    d='forcerange="3 5"',
+    more='<position joint="b" kp="9" kv="2"/>',
+)
+
 # A leg on a floating pelvis: a muscle over the hip, one over hip and knee with a piece along the thigh, one that begins
 # with a segment of no length at the hip's centre, one that goes to and fro; and a motor in their midst.
 LEG = """

@@ -13,6 +13,8 @@ import reference
 import torch
 from scenes import (
     BALL,
+    BOUNDED_SERVOS,
+    FREE_SERVOS,
     acting_states,
     free_states,
     leg_scene,
@@ -142,6 +144,15 @@ def test_tree_steps_are_mujocos(base, seed, rng):
     """solref of both forms, solimp, margins, impratio, priorities, frictionless geoms, dry friction on every joint."""
     scene, states = tree_states(base, seed, 32, rng)
     assert check_step(scene, states, 0.75) == set(STATES.values())
+
+
+@pytest.mark.parametrize("mjcf", [FREE_SERVOS, BOUNDED_SERVOS])
+def test_servos_are_damped_as_by_implicitfast(mjcf, rng):
+    """Their dampers are implicit, but where the force is at a bound."""
+    scene = parse(mjcf)
+    states = free_states(scene, 32, rng)
+    check_step(scene, states, 1.0)
+    check_gradients(scene, states, rng, enough=1.0)
 
 
 @pytest.mark.slow

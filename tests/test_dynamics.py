@@ -14,8 +14,10 @@ import torch
 from scenes import (
     BALL,
     BLOCK,
+    BOUNDED_SERVOS,
     CRANE,
     DISTINCT,
+    FREE_SERVOS,
     PENDULUM,
     ROBOTS,
     SHOULDER,
@@ -96,6 +98,39 @@ def test_tree_accelerations_are_mujocos(base, seed, rng):
 
 def test_ball_joint_on_the_world_has_mujocos_accelerations(rng):
     check_against_mujoco(parse(SHOULDER), torch.float64, rng)
+
+
+def test_servos_push_as_mujocos(rng):
+    """Springs and dampers of position, velocity and general actuators add up with each other and with the joints'."""
+    scene = parse(FREE_SERVOS)
+    assert scene.features == {"hinge", "slide", "stiffness", "damping", "motor"}
+    check_against_mujoco(scene, torch.float64, rng)
+
+
+def bounded_servos(count, rng):
+    """Their scene, and states in which each bounded joint is at either bound and between them."""
+    scene = parse(BOUNDED_SERVOS)
+    qpos, qvel, ctrl = free_states(scene, count, rng)
+    links, joints = reference.scalar_joints(scene)
+    for joint, (i, adr) in enumerate(zip(links, joints, strict=True)):
+        motors = scene.motor_link == i
+        force = ctrl[:, motors] @ scene.gear[motors] + scene.motor_bias[motors].sum()
+        force += (
+            scene.servo_stiffness[i] * (scene.servo_ref[i] - qpos[:, adr]) - scene.servo_damping[i] * qvel[:, joint]
+        )
+        zones = (force > scene.force_low[i]).astype(int) + (force > scene.force_high[i])
+        assert set(zones) == ({1} if scene.force_high[i] == np.inf else {0, 1, 2})
+    return scene, (qpos, qvel, ctrl)
+
+
+def test_bounds_of_actuators_are_mujocos(rng):
+    """forcerange of an actuator, actuatorfrcrange of a joint with several, both, and of a motor that has no spring."""
+    scene, states = bounded_servos(64, rng)
+    assert scene.features == {"hinge", "slide", "stiffness", "damping", "motor", "clamp"}
+    qacc = acceleration(scene, *states)
+    assert relative_error(qacc, mujoco_acceleration(scene, *states)) < 1e-10
+    for theta in (0.0, 0.5):
+        check_against_reference(scene, *(x[:8] for x in states), "implicit", 16, theta)
 
 
 @pytest.mark.parametrize("model", ["linear", "hill"])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scenes import (
     BALL,
+    BOUNDED_SERVOS,
     DISTINCT,
     HINGE,
     ROBOTS,
@@ -134,6 +135,19 @@ def test_gradient_in_factors_is_that_of_differences(name, integrator, theta, rng
     scene, states = varied_robot(name, 16, rng)
     factors = rng.uniform(0.5, 2.0, (16, len(FACTORS)))
     check_gradients(scene, states, rng, {"factors": factors}, integration=Integration(integrator, 8, theta))
+
+
+@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
+def test_gradient_of_bounded_servos_is_that_of_differences(integrator, theta, rng):
+    """At a bound the force depends on nothing."""
+    scene = parse(BOUNDED_SERVOS)
+    states, how = free_states(scene, 16, rng), {"integration": Integration(integrator, 8, theta)}
+    check_gradients(scene, states, rng, **how)
+    if integrator == "implicit":
+        w, factors = weights(scene, rng), rng.uniform(0.5, 2.0, (16, len(FACTORS)))
+        value, slope = (f(scene, states, w, optional={"factors": factors}, **how)[-1] for f in (gradients, differences))
+        assert not slope[:, :6].any() and not value[:, :6].any()  # it has no contact and no limits
+        np.testing.assert_allclose(value[:, 6:], slope[:, 6:], rtol=1e-6, atol=1e-6 * abs(slope).max())
 
 
 def test_quaternion_of_any_length(rng):

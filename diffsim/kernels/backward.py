@@ -46,8 +46,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     muscle, constraint = muscle_law(spec, adjoint=True), constraint_law(spec)
     CONSTRAINED, SOLVES, NV = spec.constrained, spec.solves, spec.nv
     DAMPED = SOLVES > 1  # after the constraints are solved
-    CONTACT, TERRAIN, DRIVEN, MUSCLE, HILL, LIMIT = (
-        name in spec.features for name in ("contact", "terrain", "motor", "muscle", "hill", "limit")
+    CONTACT, TERRAIN, DRIVEN, CLAMP, MUSCLE, HILL, LIMIT = (
+        name in spec.features for name in ("contact", "terrain", "motor", "clamp", "muscle", "hill", "limit")
     )
     LIMIT = LIMIT and not spec.constrained  # the penalty law
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
@@ -127,6 +127,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         lam = wp.zeros(shape=SLOTS, dtype=T)
         u = wp.zeros(shape=SLOTS, dtype=T)
         law = law_of(m, factors, e)
+        if wp.static(CLAMP):
+            driven = wp.zeros(shape=SLOTS, dtype=T)
+            joint.drive(m, law, lane, n, ctrl, e, driven)
+            free = wp.zeros(shape=SLOTS, dtype=T)  # see joint.py
         if wp.static(VARIED):
             adj_factors = wp.zeros(shape=NFACTORS, dtype=T)
         else:
@@ -245,6 +249,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     B[i] = B[p] + S[i] * qdd
                 if wp.static(DAMPED):
                     D[i] = D[p] + S[i] * (load(ck_a, row, VADR + link_of(m, k), e) - qdd)
+                if wp.static(CLAMP):
+                    ahead = q[i]
+                    if wp.static(IMPLICIT):
+                        ahead = ahead + theta * h * qd[i]
+                    free[i] = joint.actuation_free(m, k, driven[i], ahead, qd[i])
             # 2. lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
             # first, and g + h b lambda1 reaches the acceleration before it.
             g_base = vec6()
@@ -254,7 +263,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(DAMPED):
                     for i in range(n):
                         W1[i] = W[i]
-                        ga[i] = gqd[i] + T(solve) * T(m.damping[at + i]) * lam[i]
+                        within = T(1.0)
+                        if wp.static(CLAMP):
+                            within = free[i]
+                        ga[i] = gqd[i] + T(solve) * joint.damping(m, at + i, within) * lam[i]
                     solve_with_factor(m, at, n, ck_f, SOLVES * row + solve, e, S, h, g_base, ga, u, W, lam)
                 else:
                     solve_with_factor(m, at, n, ck_f, row, e, S, h, g_base, gqd, u, W, lam)
@@ -330,7 +342,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         qi = qi + theta * h * qd[i]
                         if wp.static(LIMIT):
                             end_rate = end_rate + h * load(ck_a, row, VADR + link_of(m, k), e)
-                    gain = joint.passive_gain(m, law, k, qi, qd[i], end_rate)
+                    within = T(1.0)
+                    if wp.static(CLAMP):
+                        within = free[i]
+                    gain = joint.gain(m, law, k, qi, qd[i], end_rate, within)
                     if wp.static(VARIED and LIMIT):
                         if m.carried[k] == 1:  # of the lanes that have the joint
                             by = joint.limit_constants_gain(m, law, k, qi, qd[i], end_rate, theta * h)
@@ -360,7 +375,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         gq[i] = gq[i] - wp.dot(adj_d[i], wp.spatial_cross(S[i], D[p]))
                         gq[i] = gq[i] - wp.dot(adj_w1[i], wp.spatial_cross(S[i], W1[p]))
                     gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[turned], adj_a[i]), S[i]) - lam[i] * kv
-                    gtau[i] = gtau[i] - lam[i]
+                    gtau[i] = gtau[i] - within * lam[i]
                     if wp.static(NBALL > 0):
                         p = m.parent[k]
                     if wp.static(FLOATING) or p > 0:

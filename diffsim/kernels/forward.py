@@ -35,10 +35,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, base, constraint = muscle_law(spec, adjoint=False), base_inertia(spec), constraint_law(spec)
-    CONTACT, TERRAIN, MOTOR, MUSCLE, HILL = (
-        name in spec.features for name in ("contact", "terrain", "motor", "muscle", "hill")
+    CONTACT, TERRAIN, MOTOR, CLAMP, MUSCLE, HILL = (
+        name in spec.features for name in ("contact", "terrain", "motor", "clamp", "muscle", "hill")
     )
-    NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
+    NU, FLOATING, IMPLICIT, FORCED = spec.nu, spec.floating, spec.implicit, spec.forced > 0
     # With MuJoCo's constraints a substep takes several solves.
     CONSTRAINED, SOLVES = spec.constrained, spec.solves
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
@@ -122,12 +122,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             lengths = wp.zeros(shape=NU, dtype=T)
             rates = wp.zeros(shape=NU, dtype=T)
         if wp.static(MOTOR):
-            for k in range(NU):
-                i = m.motor_slot[lane * NU + k]
-                motor[i] = motor[i] + T(m.gear[k]) * read(ctrl, e, k) + T(m.motor_bias[k])
-            if wp.static(VARIED):
-                for i in range(1, n):
-                    motor[i] = law.motor * motor[i]
+            joint.drive(m, law, lane, n, ctrl, e, motor)
         for i in range(1, n):
             q[i] = read(qpos, e, qpos_adr(m, at + i))
             qd[i] = read(qvel, e, VADR + link_of(m, at + i))
@@ -273,20 +268,26 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         qi = q[i]
                         if wp.static(IMPLICIT):
                             qi = qi + theta * h * qd[i]
-                            resistance = joint.passive_resistance(m, law, k, qi, qd[i])
+                        free = T(1.0)
+                        if wp.static(CLAMP):
+                            free = joint.actuation_free(m, k, motor[i], qi, qd[i])
+                        if wp.static(IMPLICIT):
+                            resistance = joint.resistance(m, law, k, qi, qd[i], free)
                             d = d + theta * h * h * resistance[0] + h * resistance[1]
                         if wp.static(CONSTRAINED):
-                            damper = h * T(m.damping[k])
+                            damper = h * joint.damping(m, k, free)
                             ui = -damper * guess[i]
                             if newton == 1:
                                 held = constraint.joint_constraint(m, law, k, qi, qd[i], guess[i], stuck)
-                                ui = motor[i] + joint.passive_force(m, law, k, qi, qd[i]) + held[0] + held[1] * guess[i]
+                                ui = joint.actuation(m, k, motor[i], qi, qd[i])
+                                ui = ui + joint.passive_force(m, law, k, qi, qd[i]) + held[0] + held[1] * guess[i]
                                 d = d + held[1]
                             else:
                                 d = d + damper
                             ui = ui - wp.dot(S[i], P[i])
                         else:
-                            ui = motor[i] + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
+                            ui = joint.actuation(m, k, motor[i], qi, qd[i])
+                            ui = ui + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
                         di = T(1.0) / d
                         if wp.static(FLOATING) or p > 0:
                             va = Ua * di

@@ -1,4 +1,4 @@
-"""The passive force of a hinge or slide: spring, damper and limit (Eq. 4), with its derivatives beside it.
+"""The force of a hinge or slide: motors, spring, damper and limit (Eq. 4), with its derivatives beside it.
 
 With q beyond a bound by x > 0, and the rate v at which it returns, a limit pushes back with
 
@@ -8,6 +8,9 @@ as contact does: the damper grows with the depth, and a limit never pulls. With 
 
 Implicit step: f(q + theta h q', q') - B a with B = theta h^2 k + h (b + d_limit x), of the whole passive force; x is
 lagged. Where the limit lets go it has no part in B. The explicit law is B = 0, h = theta = 0.
+
+Actuators with bounds push with motor + k (r - q) - b q', kept within them. At a bound the force is constant, and their
+spring and damper have no part in B; `free` is 0 there and 1 elsewhere.
 """
 
 from functools import cache
@@ -24,10 +27,48 @@ from diffsim.kernels.wide import blocks
 def joint_law(spec: KernelSpec) -> SimpleNamespace:
     t = types(spec)
     T, Model, Law = t.T, t.Model, t.Law
-    vec2, pick = t.vec2, blocks(spec).pick
+    vec2, block = t.vec2, blocks(spec)
+    pick = block.pick
     STIFFNESS, DAMPING, LIMIT = (name in spec.features for name in ("stiffness", "damping", "limit"))
     LIMIT = LIMIT and not spec.constrained
-    VARIED = spec.varied
+    VARIED, NU = spec.varied, spec.nu
+    CLAMP = "clamp" in spec.features
+
+    @wp.func
+    def drive(m: Model, law: Law, lane: int, n: int, ctrl: t.array2, e: int, motor: t.array):
+        """Adds the motors' forces to the links' of a lane."""
+        for k in range(NU):
+            i = m.motor_slot[lane * NU + k]
+            motor[i] = motor[i] + T(m.gear[k]) * block.read(ctrl, e, k) + T(m.motor_bias[k])
+        if wp.static(VARIED):
+            for i in range(1, n):
+                motor[i] = law.motor * motor[i]
+
+    @wp.func
+    def unbounded(m: Model, i: int, motor: T, q: T, qd: T):
+        return motor + T(m.servo_stiffness[i]) * (T(m.servo_ref[i]) - q) - T(m.servo_damping[i]) * qd
+
+    @wp.func
+    def actuation(m: Model, i: int, motor: T, q: T, qd: T):
+        """The force of the joint's actuators."""
+        force = motor
+        if wp.static(CLAMP):
+            force = wp.max(wp.min(unbounded(m, i, motor, q, qd), T(m.force_high[i])), T(m.force_low[i]))
+        return force
+
+    @wp.func
+    def actuation_free(m: Model, i: int, motor: T, q: T, qd: T):
+        """1 where that force is within its bounds, 0 where it is at one."""
+        force = unbounded(m, i, motor, q, qd)
+        return pick(T(m.force_low[i]), force, pick(force, T(m.force_high[i]), T(1.0), T(0.0)), T(0.0))
+
+    @wp.func
+    def damping(m: Model, i: int, free: T):
+        """What damps the joint, besides its limit."""
+        result = T(m.damping[i])
+        if wp.static(CLAMP):
+            result = result + free * T(m.servo_damping[i])
+        return result
 
     @wp.func
     def way_back(m: Model, i: int, q: T):
@@ -69,14 +110,16 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         return force
 
     @wp.func
-    def passive_resistance(m: Model, law: Law, i: int, q: T, qd: T):
+    def resistance(m: Model, law: Law, i: int, q: T, qd: T, free: T):
         """The parts of B that theta h^2 and h multiply."""
         kq = T(0.0)
         kv = T(0.0)
         if wp.static(STIFFNESS):
             kq = kq + T(m.stiffness[i])
         if wp.static(DAMPING):
-            kv = kv + T(m.damping[i])
+            kv = kv + damping(m, i, free)
+        if wp.static(CLAMP):
+            kq = kq + free * T(m.servo_stiffness[i])
         if wp.static(LIMIT):
             way = way_back(m, i, q)
             k, d = limit_constants(m, law, i)
@@ -86,14 +129,16 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec2(kq, kv)
 
     @wp.func
-    def passive_gain(m: Model, law: Law, i: int, q: T, qd: T, end_rate: T):
+    def gain(m: Model, law: Law, i: int, q: T, qd: T, end_rate: T, free: T):
         """(d force / d q, d force / d qd), -B a included; end_rate is qd + h a, or qd if explicit."""
         kq = T(0.0)
         kv = T(0.0)
         if wp.static(STIFFNESS):
             kq = kq - T(m.stiffness[i])
         if wp.static(DAMPING):
-            kv = kv - T(m.damping[i])
+            kv = kv - damping(m, i, free)
+        if wp.static(CLAMP):
+            kq = kq - free * T(m.servo_stiffness[i])
         if wp.static(LIMIT):
             way = way_back(m, i, q)
             k, d = limit_constants(m, law, i)
@@ -104,7 +149,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def limit_constants_gain(m: Model, law: Law, i: int, q: T, qd: T, end_rate: T, lead: T):
-        """d force / d factor of (k_limit, d_limit); lead is theta h, other arguments as of passive_gain."""
+        """d force / d factor of (k_limit, d_limit); lead is theta h, other arguments as of gain."""
         way = way_back(m, i, q)
         k, d = limit_constants(m, law, i)
         on = pushes(k, d, way, qd)
@@ -112,8 +157,12 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         return on * vec2(by_k, -T(m.d_limit[i]) * wp.abs(way) * end_rate)
 
     return SimpleNamespace(
+        drive=drive,
+        actuation=actuation,
+        actuation_free=actuation_free,
+        damping=damping,
         passive_force=passive_force,
-        passive_resistance=passive_resistance,
-        passive_gain=passive_gain,
+        resistance=resistance,
+        gain=gain,
         limit_constants_gain=limit_constants_gain,
     )

@@ -47,6 +47,12 @@ def scene_types(dtype: type) -> SimpleNamespace:
         damping: wp.array(dtype=dtype)
         stiffness: wp.array(dtype=dtype)
         spring_ref: wp.array(dtype=dtype)
+        # read where actuators have bounds only
+        servo_stiffness: wp.array(dtype=dtype)
+        servo_damping: wp.array(dtype=dtype)
+        servo_ref: wp.array(dtype=dtype)
+        force_low: wp.array(dtype=dtype)
+        force_high: wp.array(dtype=dtype)
         lower: wp.array(dtype=dtype)
         upper: wp.array(dtype=dtype)
         k_limit: wp.array(dtype=dtype)
@@ -223,7 +229,8 @@ class _Writer:
         )
 
     def put_joints(self) -> None:
-        names = ("armature", "damping", "stiffness", "spring_ref", "lower", "upper", "k_limit", "d_limit")
+        names = ["armature", "damping", "stiffness", "spring_ref", "lower", "upper", "k_limit", "d_limit"]
+        names += ["servo_stiffness", "servo_damping", "servo_ref", "force_low", "force_high"]
         self.put(**{name: (getattr(self.scene, name)[self.link], self.dtype) for name in names})
 
     def put_motors_and_muscles(self) -> None:

@@ -69,6 +69,13 @@ def motors(m: mujoco.MjModel) -> NDArray[np.bool_]:
     return found
 
 
+def servos(m: mujoco.MjModel) -> NDArray[np.bool_]:
+    """(actuators,) whose force besides is a spring and a damper on what they move: <position>, <velocity>."""
+    still, affine = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    found: NDArray[np.bool_] = still & affine & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
+    return found
+
+
 def disabled_flags(m: mujoco.MjModel) -> set[str]:
     """Names of <flag> that the file disables."""
     return _set_bits(mujoco.mjtDisableBit.__members__, "mjDSBL_", m.opt.disableflags)

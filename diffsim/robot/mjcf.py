@@ -25,6 +25,7 @@ from diffsim.robot.constants import (
     motors,
     numeric,
     pair_law,
+    servos,
     text,
 )
 from diffsim.robot.refuse import obstacles, overflows
@@ -125,6 +126,7 @@ class _Reader:
         for body in range(1, m.nbody):
             self._read_body(body)
         joints, inertias = self._joints(), self._inertias()
+        springs = np.where(np.isfinite(joints["force_low"]), joints["servo_stiffness"], joints["stiffness"])
         return Scene(
             name=self.file.stem,
             path=str(self.file),
@@ -137,7 +139,7 @@ class _Reader:
             position=self.position,
             **joints,
             **inertias,
-            **self._actuators(),
+            **self._actuators(springs),
             **self._contacts(float(inertias["mass"].sum()), joints["slide"]),
             body_link=np.array([link for link, _, _ in self.body], np.int32),
             body_com=np.array([p + r @ com for (_, r, p), com in zip(self.body, m.body_ipos, strict=True)]),
@@ -187,14 +189,59 @@ class _Reader:
             "axis": column(np.where(ball[:, None], np.eye(3)[nth], m.jnt_axis[joint])),
             "joint_ref": column(np.where(ball, 0.0, m.qpos0[at])),
             "armature": column(m.dof_armature[dof]),
-            "damping": column(m.dof_damping[dof]),
-            "stiffness": column(m.jnt_stiffness[joint]),
-            "spring_ref": column(np.where(ball, 0.0, m.qpos_spring[at])),  # a ball's is the identity in every MJCF
+            **{name: column(values, base) for name, (values, base) in self._springs(joint, ball).items()},
             "lower": column(np.where(limited, m.jnt_range[joint, 0], -np.inf), -np.inf),
             "upper": column(np.where(limited, m.jnt_range[joint, 1], np.inf), np.inf),
             "k_limit": column(np.where(limited, k_limit[dof], 0.0)),
             "d_limit": column(np.where(limited, d_limit[dof], 0.0)),
         }
+
+    def _springs(self, joint: NDArray[np.int32], ball: NDArray[np.bool_]) -> dict[str, tuple[Array, float]]:
+        """Of each degree of freedom after the base: springs, dampers and servos, and what the base has."""
+        m = self.m
+        servo, (low, high) = self._servos(), self._force_bounds()
+        bounded = np.isfinite(low) | np.isfinite(high)
+        push, stiffness, damping = np.where(bounded, 0.0, servo)  # these join the joint's own
+        ref = np.where(ball, 0.0, m.qpos_spring[m.jnt_qposadr[joint]])  # a ball's is the identity in every MJCF
+        total, joined = m.jnt_stiffness[joint] + stiffness, (stiffness > 0) | (push != 0)
+        moved = np.divide(m.jnt_stiffness[joint] * ref + push, total, out=ref.copy(), where=total > 0)
+        push, stiffness_within, damping_within = np.where(bounded, servo, 0.0)
+        own = np.divide(push, stiffness_within, out=np.zeros_like(push), where=stiffness_within > 0)
+        return {
+            "damping": (m.dof_damping[self.first :] + damping, 0.0),
+            "stiffness": (total, 0.0),
+            "spring_ref": (np.where(joined, moved, ref), 0.0),
+            "servo_stiffness": (stiffness_within, 0.0),
+            "servo_damping": (damping_within, 0.0),
+            "servo_ref": (own, 0.0),
+            "force_low": (low, -np.inf),
+            "force_high": (high, np.inf),
+        }
+
+    def _servos(self) -> Array:
+        """(3, joints) of the affine biases of their actuators: force at zero, stiffness and damping."""
+        m, sums = self.m, np.zeros((3, self.nlink - 1))
+        for a in np.flatnonzero(servos(m)).tolist():
+            gear = m.actuator_gear[a, 0]
+            sums[:, self._link(m.actuator_trnid[a, 0]) - 1] += m.actuator_biasprm[a, :3] * (
+                gear,
+                -(gear**2),
+                -(gear**2),
+            )
+        return sums
+
+    def _force_bounds(self) -> Array:
+        """(2, joints) what the sum of the forces of each one's actuators is kept within."""
+        m, bounds = self.m, np.tile((-np.inf, np.inf), (self.nlink - 1, 1))
+        driven = m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        for a in np.flatnonzero(driven & (m.actuator_forcelimited != 0)).tolist():  # the only one on its joint
+            link, gear = self._gear(a)
+            bounds[link - 1] = np.sort(gear * m.actuator_forcerange[a])
+        for joint in np.unique(m.actuator_trnid[driven, 0]).tolist():
+            if m.jnt_actfrclimited[joint] and m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_BALL:
+                own = bounds[self._link(joint) - 1]
+                own[:] = own.clip(*m.jnt_actfrcrange[joint])
+        return bounds.T
 
     def _inertias(self) -> dict[str, Any]:
         """mass, com and inertia (nlink, ...) of the bodies that are welded together."""
@@ -213,7 +260,8 @@ class _Reader:
         about_com = inertia + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
         return {"mass": mass, "com": com, "inertia": about_com}
 
-    def _actuators(self) -> dict[str, Any]:
+    def _actuators(self, springs: Array) -> dict[str, Any]:
+        """Columns (nu, ...); without a spring on their link, the constant forces of servos are the motors'."""
         m = self.m
         tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
         low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
@@ -226,12 +274,14 @@ class _Reader:
                 segments += pieces
                 scale[a], hill[a] = self._muscle(a, constant)
             else:
-                link[a], scale[a] = self._motor(a)
+                link[a], gear = self._gear(a)
+                scale[a] = gear * m.actuator_gainprm[a, 0]
+        constant_force = np.where(servos(m) & (springs[link] == 0), m.actuator_gear[:, 0] * m.actuator_biasprm[:, 0], 0)
         segments.sort(key=lambda segment: (segment.links, segment.actuator))
         return {
             "motor_link": link,
             "gear": scale * (high - low) / 2,
-            "motor_bias": scale * (high + low) / 2,
+            "motor_bias": scale * (high + low) / 2 + constant_force,
             "segment_link": np.array([s.links for s in segments], np.int32).reshape(-1, 2),
             "segment_position": np.array([s.ends for s in segments]).reshape(-1, 2, 3),
             "segment_muscle": np.array([s.actuator for s in segments], np.int32),
@@ -239,13 +289,13 @@ class _Reader:
             "muscle_model": text(m, "muscle_model", "linear"),
         }
 
-    def _motor(self, a: int) -> tuple[int, float]:
-        """Link, and force per control."""
+    def _gear(self, a: int) -> tuple[int, float]:
+        """Link of a joint's actuator, and the joint's force per force of the actuator."""
         m = self.m
         joint, axis = m.actuator_trnid[a, 0], 0
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:  # a torque about one axis of the turned body's frame
             axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
-        return self._link(joint) + axis, m.actuator_gear[a, axis] * m.actuator_gainprm[a, 0]
+        return self._link(joint) + axis, m.actuator_gear[a, axis]
 
     def _muscle(self, a: int, constant: float) -> tuple[float, list[float]]:
         """Force per activation, and the numbers of the Hill-type model; constant: length of the path within links."""

@@ -26,6 +26,7 @@ from diffsim.robot.constants import (
     motors,
     numeric,
     pair_law,
+    servos,
     text,
 )
 from diffsim.robot.scene import MUSCLE_MODELS, PENALTY_CONSTANTS, Array, Scene
@@ -43,13 +44,11 @@ EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", 
 
 # Attributes of elements that are not simulated, and the arrays that are not 0 where one is set.
 UNSIMULATED = {
-    Kind.mjOBJ_JOINT: {"actuatorfrcrange": "jnt_actfrclimited"},
     Kind.mjOBJ_TENDON: {
         f"{field} of a tendon": f"tendon_{field}"
         for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited", "springyield")
     },
     Kind.mjOBJ_ACTUATOR: {
-        "forcerange": "actuator_forcelimited",
         "damping": "actuator_damping actuator_dampingpoly",
         "armature": "actuator_armature",
         "delay": "actuator_delay actuator_history",
@@ -85,7 +84,9 @@ def overflows(scene: Scene) -> list[str]:
     """Likewise of actuators whose forces, products of the file's numbers, single precision does not hold."""
     muscle = np.zeros(scene.nu, bool)
     muscle[scene.segment_muscle] = "hill" in scene.features
-    numbers = np.column_stack((scene.gear, scene.motor_bias, np.where(muscle[:, None], scene.hill, 0.0)))
+    names = "stiffness", "damping", "spring_ref", "servo_stiffness", "servo_damping", "servo_ref"
+    springs = np.array([getattr(scene, name) for name in names])[:, scene.motor_link]
+    numbers = np.column_stack((scene.gear, scene.motor_bias, *springs, np.where(muscle[:, None], scene.hill, 0.0)))
     why = f"its force is beyond single precision, {GREATEST:.2g} N at most"
     return _lines(_where(scene.mj_model, Kind.mjOBJ_ACTUATOR, {why: ~_finite(numbers).all(1)}))
 
@@ -133,8 +134,8 @@ def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
         Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat"),
         Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solimp solmix margin gap"),
         Kind.mjOBJ_SITE: ("site", "pos"),
-        Kind.mjOBJ_JOINT: ("jnt", "pos axis range stiffness solref solimp margin"),
-        Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange gainprm biasprm lengthrange"),
+        Kind.mjOBJ_JOINT: ("jnt", "pos axis range actfrcrange stiffness solref solimp margin"),
+        Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange forcerange gainprm biasprm lengthrange"),
     }
     table = {k: {f: getattr(m, f"{prefix}_{f}") for f in names.split()} for k, (prefix, names) in fields.items()}
     table[Kind.mjOBJ_JOINT] |= {"ref": m.qpos0[m.jnt_qposadr], "springref": m.qpos_spring[m.jnt_qposadr]}
@@ -259,12 +260,14 @@ def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
     passive = (m.dof_armature[dof] != 0) | (m.dof_damping[dof] != 0) | (m.jnt_stiffness != 0) | (loss != 0)
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
+    tendons = (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON).any()
     curved = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(_any(m, "dof_dampingpoly"))])
     rules = {
         "damping and stiffness are linear here, one number each": curved | _any(m, "jnt_stiffnesspoly"),
         "springs that yield are not simulated": _any(m, "jnt_springyield") | plastic,
         "frictionloss {loss:g} is negative": loss < 0,
         "the limit of a ball joint is not simulated": ball & limited,
+        "actuatorfrcrange beside muscles is not simulated": (m.jnt_actfrclimited != 0) & tendons,
         "a free joint has no armature, damping, stiffness or frictionloss here": free & passive,
         "one free joint, of the first moving body, is simulated": free & ~first,
         "range {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
@@ -288,7 +291,7 @@ def _tendons(m: mujoco.MjModel) -> Iterator[Obstacle]:
     yield from _where(m, Kind.mjOBJ_SITE, {"a muscle of a floating robot cannot hold on to the world": held & world})
 
 
-ON_JOINT = "motors with a gear and a ctrlrange on a hinge, a slide or one axis of a ball joint"
+ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
 
 
@@ -297,24 +300,31 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
     tendon, motor = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, motors(m)
     pulls, turns = _pulls(m, count), _turns(m)
     low, high = m.actuator_ctrlrange[:count].T
+    stiffness, damping = np.where(servos(m), -m.actuator_biasprm[:count, 1:3].T, 0.0)
+    bounded, joint = m.actuator_forcelimited[:count] != 0, np.where(tendon, -1, m.actuator_trnid[:count, 0])
+    shared = (joint[:, None] == joint).sum(1) > 1
     hill = text(m, "muscle_model", "linear") == "hill"
     idle = tendon & ~motor & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
     rules = {
         f"only {ON_TENDON}": tendon & ~pulls,
-        f"only {ON_JOINT}, or muscles on tendons": ~tendon & ~turns,
+        f"only {ON_JOINT}, without activation dynamics, or muscles on tendons": ~tendon & ~turns,
+        "its stiffness (minus biasprm's second number) is {stiffness:g}, must not be negative": turns & (stiffness < 0),
+        "its damping (minus biasprm's third number) is {damping:g}, must not be negative": turns & (damping < 0),
+        "forcerange of a muscle is not simulated": tendon & bounded,
+        "forcerange is simulated of a joint's only actuator": turns & bounded & shared,
         "muscle_model 'hill' needs a <muscle>": tendon & motor & hill,
         "its force follows from what it moves, and it moves nothing; give force": pulls & idle,
         "ctrlrange {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
     }
-    yield from _where(m, Kind.mjOBJ_ACTUATOR, rules, low=low, high=high)
+    yield from _where(m, Kind.mjOBJ_ACTUATOR, rules, low=low, high=high, stiffness=stiffness, damping=damping)
 
 
 def _turns(m: mujoco.MjModel) -> Mask:
-    """Motors of a hinge, of a slide or of one axis of a ball joint."""
-    turns = motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    """Motors and servos of a hinge or of a slide, and motors of one axis of a ball joint."""
+    turns = (motors(m) | servos(m)) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
     found = np.flatnonzero(turns)
     kind, axes = m.jnt_type[m.actuator_trnid[found, 0]], np.count_nonzero(m.actuator_gear[found, :3], axis=1)
-    turns[found] = np.where(kind == Joint.mjJNT_BALL, axes <= 1, kind != Joint.mjJNT_FREE)
+    turns[found] = np.where(kind == Joint.mjJNT_BALL, motors(m)[found] & (axes <= 1), kind != Joint.mjJNT_FREE)
     return turns
 
 

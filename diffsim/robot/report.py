@@ -173,7 +173,7 @@ def _actuators(scene: Scene) -> list[str]:
     free = [label(m, Kind.mjOBJ_ACTUATOR, a) for a in np.flatnonzero(m.actuator_ctrllimited == 0).tolist()]
     if free:
         sentences.append(f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {', '.join(free)}.")
-    if not motors(m).all():
+    if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         sentences.append("A control sets the activation of a <muscle> at once.")
         if scene.muscle_model != "hill":
             sentences.append("A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves.")
@@ -187,7 +187,7 @@ def _stability(scene: Scene) -> list[str]:
         sentences.append("Nothing damps the joints: semi_implicit drifts in energy; the extrapolated one hardly does.")
     first = 6 if scene.floating else 0
     inverse = np.linalg.inv(mass_matrix(scene.mj_model))[first:, first:]
-    laws = (scene.stiffness[1:], scene.damping[1:])
+    laws = ((scene.stiffness + scene.servo_stiffness)[1:], (scene.damping + scene.servo_damping)[1:])
     k, b = (abs(np.linalg.eigvals(inverse * law)).max(initial=0) for law in laws)
     if k * STEP**2 + 2 * b * STEP < 4:  # semi-implicit Euler of v' = -b v - k x
         return sentences

@@ -83,6 +83,13 @@ class Scene:
     damping: Array
     stiffness: Array
     spring_ref: Array
+    # Spring and damper of what drives the joint, if their sum with the motors' force is kept within bounds (infinite
+    # elsewhere); without bounds they are part of stiffness and damping
+    servo_stiffness: Array
+    servo_damping: Array
+    servo_ref: Array
+    force_low: Array
+    force_high: Array
     lower: Array  # bounds of the joint, infinite where unlimited
     upper: Array
     k_limit: Array  # stiffness and
@@ -172,7 +179,8 @@ class Scene:
             "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0) | constrained)).any()),
             "frictionloss": self.constraints is not None and bool(self.constraints.loss[:, 0].any()),
             "stiffness": bool(self.stiffness.any()),
-            "damping": bool(self.damping.any()),
+            "damping": bool(self.damping.any() or self.servo_damping.any()),
+            "clamp": bool((np.isfinite(self.force_low) | np.isfinite(self.force_high)).any()),
             "motor": bool((self.motor_link > 0).any()),
             "muscle": len(self.segment_muscle) > 0,
             "hill": len(self.segment_muscle) > 0 and self.muscle_model == "hill",
@@ -264,8 +272,8 @@ class Scene:
         gone: dict[str, dict[str, Any]] = {
             "contact": {name: getattr(self, name)[:0] for name in points},
             "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
-            "stiffness": {"stiffness": np.zeros(n)},
-            "damping": {"damping": np.zeros(n)},
+            "stiffness": {"stiffness": np.zeros(n), "servo_stiffness": np.zeros(n)},
+            "damping": {"damping": np.zeros(n), "servo_damping": np.zeros(n)},
             "muscle": {name: getattr(self, name)[:0] for name in segments},
             "drag": {"density": 0.0, "viscosity": 0.0},
         }

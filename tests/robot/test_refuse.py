@@ -49,7 +49,6 @@ REFUSED = [
     *cases(
         pendulum,
         {
-            'actuatorfrcrange="-1 1"': "hinge",
             'frictionloss="-1"': "joint 'hinge': frictionloss -1 is negative",
             'damping="1 2"': "hinge|damping",
             'stiffness="1 2"': "hinge|stiffness",
@@ -92,10 +91,12 @@ REFUSED = [
     *cases(
         actuated,
         {
-            '<position name="servo" kp="5"/>': "servo",
-            '<velocity name="drive"/>': "drive",
+            '<position name="servo" kp="-5"/>': "actuator 'servo': its stiffness .* is -5, must not be negative",
+            '<velocity name="drive" kv="-2"/>': "actuator 'drive': its damping .* is -2, must not be negative",
+            '<position name="soft" kp="5" timeconst="0.1"/>': "actuator 'soft': only motors .* servos .* activation",
+            '<damper name="brake" kv="1" ctrlrange="0 1"/>': "actuator 'brake': only motors",
             '<general name="slow" dyntype="filter" dynprm="1"/>': "slow",
-            '<motor name="weak" forcerange="-1 1"/>': "weak",
+            '<motor name="weak" forcerange="-1 1"/><motor joint="hinge"/>': "'weak': forcerange .* only actuator",
             '<motor name="stiff" damping="1"/>': "stiff|damping",
             '<motor name="heavy" armature="1"/>': "heavy|armature",
             '<motor name="m" ctrlrange="1 -1"/>': "actuator 'm': ctrlrange 1 -1 is empty",
@@ -186,10 +187,15 @@ REFUSED = [
             '<motor name="pusher" tendon="string"/>': "pusher.*never push",
             '<position name="servo" tendon="string" kp="1"/>': "servo",
             f'<muscle gear="2" {MUSCLE}/>': "biceps.*gear",
+            f'<muscle forcerange="-1 0" {MUSCLE}/>': "actuator 'biceps': forcerange of a muscle",
             '<muscle name="biceps" tendon="string" force="-5" lengthrange="1 2"/>': (
                 "actuator 'biceps': its force follows from what it moves, and it moves nothing; give force"
             ),
         },
+    ),
+    (
+        tendon(joint='<joint name="weak" actuatorfrcrange="-1 1"/>', actuator=f"<muscle {MUSCLE}/>"),
+        "joint 'weak': actuatorfrcrange beside muscles",
     ),
     (tendon('<geom geom="g"/>', actuator=f"<muscle {MUSCLE}/>"), "string"),
     (tendon('<pulley divisor="2"/><site site="w"/><site site="a"/>', actuator=f"<muscle {MUSCLE}/>"), "string"),
@@ -227,12 +233,15 @@ REFUSED = [
         ),
         "rocket",
     ),
-    (
-        robot(
-            '<body><joint name="hip" type="ball"/><geom size="0.1"/></body>',
-            '<actuator><motor name="twist" joint="hip" gear="1 1 0"/></actuator>',
-        ),
-        "twist.*one axis of a ball joint",
+    *(
+        (
+            robot(
+                '<body><joint name="hip" type="ball"/><geom size="0.1"/></body>',
+                f'<actuator><{actuator} name="twist" joint="hip" gear="1 {second} 0"/></actuator>',
+            ),
+            "twist.*one axis of a ball joint",
+        )
+        for actuator, second in (("motor", 1), ("position", 0))
     ),
     (pendulum(inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'), "hull"),
     (pendulum(inside='<body name="fin"><geom size="0.1"/></body>', rest='<option density="1"/>'), "fin"),
@@ -297,10 +306,10 @@ def test_all_obstacles_in_one_message():
     with pytest.raises(SceneError) as error:
         parse(
             pendulum(
-                'actuatorfrcrange="-1 1" damping="-2"',
+                'frictionloss="-1" damping="-2"',
                 inside='<geom name="egg" type="ellipsoid" size="1 2 3"/><geom name="can" type="cylinder" size="1 2"/>'
                 '<geom type="cylinder" size="1 2"/>',
-                rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="5"/></actuator>'
+                rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="-5"/></actuator>'
                 '<custom><numeric name="k_nn" data="1"/></custom>',
             )
         )
