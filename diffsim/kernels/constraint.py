@@ -167,6 +167,21 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return Ia, Ib, Id, F
 
     @wp.func
+    def contacts_along(
+        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, height: T, step: vec6, part: T
+    ):
+        """Of the contacts of link k after a part of a step of its twist: step . f and step . H step."""
+        found = vec2()
+        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+            centre, distance, on = place(m, c, R, x, height)
+            if block.any_of(on):
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
+                by = point_velocity(step, p)
+                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar + part * by, T(0.0))
+                found = found + vec2(wp.dot(by, f), wp.dot(by, H * by))
+        return found
+
+    @wp.func
     def add_contacts_adjoint(
         m: Model,
         law: Law,
@@ -251,7 +266,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(LOSS):
             loss = m.joint_loss[i]
             f = -T(loss[1]) * (qdd + T(loss[2]) * qd)
-            eta = pick(T(0.0), stuck, wp.abs(f) + T(1.0), T(loss[0]))
+            eta = T(loss[0])
             force = force + wp.max(wp.min(f, eta), -eta)
             slope = slope + pick(wp.abs(f), eta, T(loss[1]), T(0.0))
         return vec2(force, slope)
@@ -276,6 +291,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
 
     return SimpleNamespace(
         add_contacts=add_contacts,
+        contacts_along=contacts_along,
         add_contacts_adjoint=add_contacts_adjoint,
         joint_constraint=joint_constraint,
         joint_gain=joint_gain,

@@ -25,12 +25,15 @@ from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import MAX_SPEED, KernelSpec
 from diffsim.kernels.wide import blocks, module_options
 
+SEARCHES = 3  # evaluations of a line search, and the share of its first slope that is near enough to 0
+SLOPE = 0.05
+
 
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
     T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
-    Model, law_of = t.Model, environment_law(spec)
+    Model, Law, law_of = t.Model, t.Law, environment_law(spec)
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
@@ -46,6 +49,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
 
+    mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6))
+
     @wp.func
     def too_fast(rate: T):
         """1 where a rate is beyond any imaginable one, or no number, else 0."""
@@ -55,6 +60,95 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     def hand_back(out: t.array2, start: t.array2, e: int, column: int, broken: T, value: T):
         """Writes the value, but what it was at the start to broken environments."""
         write(out, e, column, pick(T(0.0), broken, read(start, e, column), value))
+
+    @wp.func
+    def slope_along(
+        m: Model,
+        law: Law,
+        at: int,
+        n: int,
+        R: mat3s,
+        x: vec3s,
+        V: vec6s,
+        B: vec6s,
+        height: T,
+        q: t.array,
+        qd: t.array,
+        guess: t.array,
+        step: t.array,
+        twist: vec6s,
+        part: T,
+    ):
+        """step . f and step . H step of all constraints after a part of a step."""
+        found = vec2()
+        for i in range(n):
+            k = at + i
+            if wp.static(CONTACT):
+                found = found + constraint.contacts_along(m, law, k, R[i], x[i], V[i], B[i], height, twist[i], part)
+            if i > 0:
+                held = constraint.joint_constraint(m, law, k, q[i], qd[i], guess[i] + part * step[i], T(0.0))
+                found = found + T(m.carried[k]) * step[i] * vec2(held[0], held[1] * step[i])
+        if wp.static(THREADS_PER_ENV > 1):
+            found = vec2(sums.add(found[0]), sums.add(found[1]))
+        return found
+
+    @wp.func
+    def search(
+        m: Model,
+        law: Law,
+        at: int,
+        n: int,
+        R: mat3s,
+        x: vec3s,
+        V: vec6s,
+        B: vec6s,
+        height: T,
+        q: t.array,
+        qd: t.array,
+        guess: t.array,
+        step: t.array,
+        twist: vec6s,
+        Ia: mat3s,
+        Ib: mat3s,
+        Id: mat3s,
+    ):
+        """The part of Newton's step that MuJoCo's cost is least after, or all of it where that is near.
+
+        The cost's slope after a part of the step is (part - 1) s.Ms - s.Hs + s.f(0) - s.f(part), as of Newton's step
+        s (M + H) s = s.f(0) - ...; it grows with the part, so secants between its signs find where it is zero.
+        """
+        inertia = T(0.0)
+        for i in range(n):
+            k = at + i
+            a = wp.spatial_top(twist[i])
+            l = wp.spatial_bottom(twist[i])
+            inertia = inertia + wp.dot(a, Ia[i] * a + T(2.0) * (Ib[i] * l)) + wp.dot(l, Id[i] * l)
+            if i > 0:
+                inertia = inertia + T(m.carried[k]) * T(m.armature[k]) * step[i] * step[i]
+        if wp.static(THREADS_PER_ENV > 1):
+            inertia = sums.add(inertia)
+        start = slope_along(m, law, at, n, R, x, V, B, height, q, qd, guess, step, twist, T(0.0))
+        steepest = inertia + start[1]
+        near = T(SLOPE) * steepest
+        low = T(0.0)
+        high = T(1.0)
+        at_low = -steepest
+        at_high = T(0.0)
+        part = T(1.0)
+        beyond = T(1.0)
+        for _ in range(SEARCHES):
+            if block.any_of(beyond):
+                now = slope_along(m, law, at, n, R, x, V, B, height, q, qd, guess, step, twist, part)
+                slope = inertia * (part - T(1.0)) - start[1] + start[0] - now[0]
+                beyond = pick(near, slope, T(1.0), T(0.0))
+                low = pick(near, slope, low, part)
+                at_low = pick(near, slope, at_low, slope)
+                high = pick(near, slope, part, high)
+                at_high = pick(near, slope, slope, at_high)
+                width = wp.max(at_high - at_low, T(1e-30))
+                part = low + (high - low) * wp.min(wp.max(-at_low, T(0.0)) / width, T(1.0))
+                beyond = pick(low, T(1.0), T(1.0), T(0.0))
+        return part
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def forward(
@@ -144,6 +238,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             P0 = wp.zeros(shape=SLOTS, dtype=vec6)
             B = wp.zeros(shape=SLOTS, dtype=vec6)  # the twist if the rates were the accelerations, see constraint.py
             guess = wp.zeros(shape=SLOTS, dtype=T)  # acceleration of the last pass, and that of the base
+            lam = wp.zeros(shape=SLOTS, dtype=T)  # step of a pass
             residual = T(0.0)
 
         for sub in range(substeps):
@@ -209,7 +304,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             factor_row = row
             if wp.static(CONSTRAINED):
                 end = passes + int(SOLVES) - 1
-                last_change = T(wp.inf)
                 wdot = vec3()
                 vdot = vec3()
                 A[0] = join(vec3(), -vec3(m.gravity))
@@ -330,17 +424,30 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if wp.static(FLOATING):
                             change = wp.length_sq(turning_up - wdot) + wp.length_sq(speeding_up - vdot)
                             size = size + wp.length_sq(turning_up) + wp.length_sq(speeding_up)
-                        for i in range(1, n):
-                            change = change + (u[i] - guess[i]) * (u[i] - guess[i])
+                            U[0] = join(R[0] * (turning_up - wdot), speeding_up - vdot)
+                        else:
+                            U[0] = vec6()
+                        for i in range(1, n):  # from here on the step's twists
+                            lam[i] = u[i] - guess[i]
+                            U[i] = U[m.parent[at + i]] + S[i] * lam[i]
+                            change = change + lam[i] * lam[i]
                             size = size + u[i] * u[i]
                         if wp.static(THREADS_PER_ENV > 1):
                             change = sums.add(change)
                             size = sums.add(size)
-                        # Newton's method may go to and fro between zones: where a step is no shorter, half of it.
-                        part = pick(last_change, change, T(0.5), T(1.0))
-                        last_change = change
+                        part = T(1.0)
+                        if solve > 0:
+                            part = search(m, law, at, n, R, x, V, B, place, q, qd, guess, lam, U, Ia0, Ib0, Id0)
                         if solve == passes - 1:
                             residual = wp.max(residual, wp.sqrt(change / size))
+                        if wp.static(SOLVES > 1):
+                            if record == 1 and solve == passes - 1:
+                                if wp.static(FLOATING):
+                                    for k in range(3):
+                                        store(ck_a, row, NV + k, e, vdot[k])
+                                        store(ck_a, row, NV + 3 + k, e, wdot[k])
+                                for i in range(1, n):
+                                    store(ck_a, row, NV + VADR + link_of(m, at + i), e, guess[i])
                         if wp.static(FLOATING):
                             wdot = wdot + part * (turning_up - wdot)
                             vdot = vdot + part * (speeding_up - vdot)
@@ -366,9 +473,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     for k in range(3):
                         store(ck_a, row, k, e, speeding_up[k])
                         store(ck_a, row, 3 + k, e, turning_up[k])
-                        if wp.static(SOLVES > 1):
-                            store(ck_a, row, NV + k, e, vdot[k])
-                            store(ck_a, row, NV + 3 + k, e, wdot[k])
                 v = v + h * speeding_up
                 w = w + h * turning_up
                 pos = pos + h * v
@@ -378,8 +482,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 q[i] = q[i] + h * qd[i]
                 if record == 1:
                     store(ck_a, row, VADR + link_of(m, at + i), e, u[i])
-                    if wp.static(SOLVES > 1):
-                        store(ck_a, row, NV + VADR + link_of(m, at + i), e, guess[i])
             if wp.static(NBALL > 0):
                 for b in range(m.ball_count[lane]):
                     i = m.ball_slot[lane * NBALL + b]
