@@ -44,8 +44,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint = muscle_law(spec, adjoint=True), constraint_law(spec)
-    CONSTRAINED, SOLVES, NV = spec.constrained, spec.solves, spec.nv
-    DAMPED = SOLVES > 1  # after the constraints are solved
+    CONSTRAINED, SOLVES, DAMPED, NV = spec.constrained, spec.solves, spec.damped, spec.nv
     CONTACT, TERRAIN, DRIVEN, CLAMP, MUSCLE, HILL, LIMIT = (
         name in spec.features for name in ("contact", "terrain", "motor", "clamp", "muscle", "hill", "limit")
     )
@@ -227,9 +226,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 V[0] = join(R[0] * w, v)
                 if wp.static(DAMPED):
                     D[0] = join(R[0] * wdot, vdot)
+                if wp.static(CONSTRAINED):
                     vdot = vec3(load(ck_a, row, NV, e), load(ck_a, row, NV + 1, e), load(ck_a, row, NV + 2, e))
                     vdot = vdot - vec3(m.gravity)
                     wdot = vec3(load(ck_a, row, NV + 3, e), load(ck_a, row, NV + 4, e), load(ck_a, row, NV + 5, e))
+                if wp.static(DAMPED):
                     D[0] = D[0] - join(R[0] * wdot, vdot)
                 A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v))
                 if wp.static(CONSTRAINED):
@@ -242,7 +243,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 turning = i
                 if wp.static(NBALL > 0):
                     turning = m.inboard[k]
-                qdd = load(ck_a, row, (SOLVES - 1) * NV + VADR + link_of(m, k), e)
+                qdd = load(ck_a, row, int(CONSTRAINED) * NV + VADR + link_of(m, k), e)
                 A[i] = A[p] + S[i] * qdd + wp.spatial_cross(V[turning], S[i] * qd[i])
                 if wp.static(CONSTRAINED):
                     rate[i] = qdd

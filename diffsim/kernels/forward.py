@@ -43,7 +43,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     )
     NU, FLOATING, IMPLICIT, FORCED = spec.nu, spec.floating, spec.implicit, spec.forced > 0
     # With MuJoCo's constraints a substep takes several solves.
-    CONSTRAINED, SOLVES = spec.constrained, spec.solves
+    CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
+    SEARCH = CONSTRAINED and "frictionloss" in spec.features
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LIMIT = spec.nball, MAX_SPEED
@@ -303,7 +304,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             end = 1
             factor_row = row
             if wp.static(CONSTRAINED):
-                end = passes + int(SOLVES) - 1
+                end = passes + int(DAMPED)
+                last_change = T(wp.inf)
                 wdot = vec3()
                 vdot = vec3()
                 A[0] = join(vec3(), -vec3(m.gravity))
@@ -403,7 +405,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                             store(ck_f, factor_row, f0 + 6, e, di)
                 # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base)
                 A[0] = join(vec3(), -vec3(m.gravity))
-                if wp.static(SOLVES > 1):
+                if wp.static(DAMPED):
                     A[0] = A[0] * T(newton)
                 if wp.static(FLOATING):
                     L, a0 = base.factor_base(Ia[0], Ib[0], Id[0], -P[0])
@@ -435,19 +437,23 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if wp.static(THREADS_PER_ENV > 1):
                             change = sums.add(change)
                             size = sums.add(size)
-                        part = T(1.0)
-                        if solve > 0:
-                            part = search(m, law, at, n, R, x, V, B, place, q, qd, guess, lam, U, Ia0, Ib0, Id0)
+                        # Newton's method may go to and fro between zones, of dry friction above all.
+                        if wp.static(SEARCH):
+                            part = T(1.0)
+                            if solve > 0:
+                                part = search(m, law, at, n, R, x, V, B, place, q, qd, guess, lam, U, Ia0, Ib0, Id0)
+                        else:  # where a step is no shorter, half of it
+                            part = pick(last_change, change, T(0.5), T(1.0))
+                            last_change = change
                         if solve == passes - 1:
                             residual = wp.max(residual, wp.sqrt(change / size))
-                        if wp.static(SOLVES > 1):
-                            if record == 1 and solve == passes - 1:
-                                if wp.static(FLOATING):
-                                    for k in range(3):
-                                        store(ck_a, row, NV + k, e, vdot[k])
-                                        store(ck_a, row, NV + 3 + k, e, wdot[k])
-                                for i in range(1, n):
-                                    store(ck_a, row, NV + VADR + link_of(m, at + i), e, guess[i])
+                        if record == 1 and solve == passes - 1:  # where the last step begins, of which the adjoint is
+                            if wp.static(FLOATING):
+                                for k in range(3):
+                                    store(ck_a, row, NV + k, e, vdot[k])
+                                    store(ck_a, row, NV + 3 + k, e, wdot[k])
+                            for i in range(1, n):
+                                store(ck_a, row, NV + VADR + link_of(m, at + i), e, guess[i])
                         if wp.static(FLOATING):
                             wdot = wdot + part * (turning_up - wdot)
                             vdot = vdot + part * (speeding_up - vdot)

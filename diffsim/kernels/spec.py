@@ -52,7 +52,12 @@ class KernelSpec:
     @property
     def solves(self) -> int:
         """Linear systems of a substep that its adjoint needs: MuJoCo's damping is one more, after the constraints'."""
-        return 2 if self.constrained and "damping" in self.features else 1
+        return 2 if self.damped else 1
+
+    @property
+    def damped(self) -> bool:
+        """Whether damping follows the constraints."""
+        return self.constrained and "damping" in self.features
 
     @property
     def nfactors(self) -> int:

@@ -148,10 +148,11 @@ class Stepper:
     def _rows(self, count: int) -> list[wp.array]:
         """Checkpoints of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix.
 
-        Where MuJoCo's damping follows the constraints: the acceleration after and before, and the factor of both.
+        With MuJoCo's constraints also the acceleration where the last pass began, and where damping follows them the
+        factors of both.
         """
         spec, n, device = self._launcher.spec, self._launcher.num_envs, str(self._launcher.device)
-        widths = (spec.nq, spec.nv, spec.solves * spec.nv, spec.nfactor)
+        widths = (spec.nq, spec.nv, (1 + spec.constrained) * spec.nv, spec.nfactor)
         counts = (count, count, count, spec.solves * count)
         numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
         check_memory("checkpoints", n, numbers * self._launcher.dtype.itemsize, self._launcher.device)
