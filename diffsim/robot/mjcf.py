@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.constants import (
-    POINTS,
     PairLaw,
     at_rest,
     contact_constants,
+    contact_points,
     disabled_flags,
     floating,
     ground_pairs,
@@ -363,11 +363,11 @@ class _Reader:
         }
 
     def _spheres(self, geom: int) -> list[Sphere]:
-        m, size = self.m, self.m.geom_size[geom]
+        m = self.m
         link, rotation, position = self.body[m.geom_bodyid[geom]]
         axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
-        half, radius = (size, 0.0) if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX else (size[1], size[0])
-        return [Sphere(link, centre + axes @ (point * half), radius, geom) for point in POINTS[m.geom_type[geom]]]
+        points, radius = contact_points(m, geom)
+        return [Sphere(link, centre + axes @ point, radius, geom) for point in points]
 
     def _outer_spheres(self, spheres: list[Sphere], slide: NDArray[np.bool_]) -> list[Sphere]:
         """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""

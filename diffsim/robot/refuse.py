@@ -17,11 +17,13 @@ from diffsim.robot.constants import (
     POINTS,
     asked,
     at_rest,
+    declared_pairs,
     disabled_flags,
     enabled_flags,
     floating,
     ground_pairs,
     label,
+    listed,
     mass_matrix,
     motors,
     numeric,
@@ -95,7 +97,7 @@ def _lines(found: Iterable[Obstacle]) -> list[str]:
     lines: dict[tuple[str, str], dict[str, None]] = {}
     for kind, name, why in found:
         lines.setdefault((kind, why), {})[name] = None
-    return [f"{kind} {', '.join(names)}: {why}" for (kind, why), names in lines.items()]
+    return [f"{kind} {listed(names)}: {why}" for (kind, why), names in lines.items()]
 
 
 def _where(
@@ -133,6 +135,7 @@ def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
     fields = {
         Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat"),
         Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solimp solmix margin gap"),
+        Kind.mjOBJ_PAIR: ("pair", "friction solref solimp margin gap"),
         Kind.mjOBJ_SITE: ("site", "pos"),
         Kind.mjOBJ_JOINT: ("jnt", "pos axis range actfrcrange stiffness solref solimp margin"),
         Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange forcerange gainprm biasprm lengthrange"),
@@ -155,6 +158,7 @@ def _not_finite(m: mujoco.MjModel) -> Iterator[Obstacle]:
 
 def _negative(m: mujoco.MjModel) -> Iterator[Obstacle]:
     signed = {Kind.mjOBJ_JOINT: ("armature", "damping", "stiffness"), Kind.mjOBJ_GEOM: ("friction", "solmix")}
+    signed[Kind.mjOBJ_PAIR] = ("friction",)
     for kind, field in ((kind, field) for kind, fields in signed.items() for field in fields):
         values = _numbers(m)[kind][field]
         least = values.min(tuple(range(1, values.ndim)))
@@ -221,10 +225,8 @@ def _options(m: mujoco.MjModel) -> Iterator[Obstacle]:
 
 
 def _unsimulated(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    touch = not disabled_flags(m) & {"constraint", "contact"}
     for kind, present, what in (
         (Kind.mjOBJ_EQUALITY, m.eq_active0, "equality constraints"),
-        (Kind.mjOBJ_PAIR, np.full(m.npair, touch), "contact pairs"),
         (Kind.mjOBJ_FLEX, np.ones(m.nflex), "deformable bodies"),
         (Kind.mjOBJ_PLUGIN, np.ones(m.nplugin), "plugins"),
     ):
@@ -359,18 +361,20 @@ def _contacts(m: mujoco.MjModel) -> Iterator[Obstacle]:
         return
     laws = {geom: pair_law(m, ground, geom) for ground, geom in pairs}
     geoms = list(laws)
-    condim, wrong, shaped = np.zeros(m.ngeom, int), np.full(m.ngeom, "", "U80"), np.ones(m.ngeom, bool)
-    condim[geoms] = [law.condim for law in laws.values()]
+    wrong, shaped = np.full(m.ngeom, "", "U80"), np.ones(m.ngeom, bool)
     wrong[geoms] = [_wrong(law.solref) for law in laws.values()]
     shaped[geoms] = np.isin(m.geom_type[geoms], list(POINTS))
-    smooth = (condim == 1) & (mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, "mu") < 0) & (condim > 1).any()
+    rules = {f"its shape cannot touch the ground here{only_drawn}": ~shaped, "solref {wrong}": wrong != ""}
+    yield from _where(m, Kind.mjOBJ_GEOM, rules, wrong=wrong)
+    ends = {tuple(sorted(pair)) for pair in pairs}
+    on_ground = np.array([k for pair, k in declared_pairs(m).items() if pair in ends], int)
+    first, second = m.pair_friction[:, :2].T
     rules = {
-        f"only spheres, capsules and boxes may touch the ground{only_drawn}": ~shaped,
-        "condim {condim}: torsional and rolling friction are not simulated; condim 3 is": condim > 3,
-        "condim 1: frictionless beside geoms with friction is not simulated; <numeric> 'mu' is for all": smooth,
-        "solref {wrong}": wrong != "",
+        "friction {first:g} {second:g} differs by direction; it is isotropic here": first != second,
+        "solreffriction is not simulated": m.pair_solreffriction.any(1),
     }
-    yield from _where(m, Kind.mjOBJ_GEOM, rules, condim=condim, wrong=wrong)
+    rules = {why: mask & np.isin(range(m.npair), on_ground) for why, mask in rules.items()}
+    yield from _where(m, Kind.mjOBJ_PAIR, rules, first=first, second=second)
 
 
 def _wrong(solref: ArrayLike) -> str:

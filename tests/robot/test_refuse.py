@@ -67,10 +67,7 @@ REFUSED = [
     *cases(
         with_inside,
         {
-            '<geom name="egg" type="ellipsoid" size="1 2 3"/>': "egg",
-            '<geom name="can" type="cylinder" size="1 2"/>': "can",
-            '<geom name="foot" size="0.1" condim="4"/>': "geom 'foot': condim 4: .*condim 3",
-            '<geom name="foot" size="0.1" condim="6"/>': "geom 'foot': condim 6: .*condim 3",
+            '<geom name="rock" type="sdf" mesh="tetra"/>': "rock",
             '<geom name="foot" size="0.1" solref="-1 1"/>': "geom 'foot': solref",
             '<geom name="foot" size="0.1" friction="-1"/>': "geom 'foot': friction is -1",
             '<geom size="0.1" mass="1e30"/>': "body 'arm': the robot weighs 1e\\+30 kg",
@@ -211,7 +208,6 @@ REFUSED = [
         "rope.*<muscle>",
     ),
     # several parts of a file
-    (pendulum(inside='<geom name="hull" type="mesh" mesh="tetra"/>', rest=MESH), "hull"),
     (
         robot(
             '<body name="a"><freejoint/><geom size="0.1"/></body>',
@@ -219,12 +215,28 @@ REFUSED = [
         ),
         "glue",
     ),
+    *(
+        (
+            pendulum(
+                inside='<geom name="a" size="0.1"/>',
+                rest=f'<contact><pair name="couple" geom1="a" geom2="floor" {numbers}/></contact>',
+            ),
+            f"pair 'couple': {what}",
+        )
+        for numbers, what in {
+            'friction="1 2"': "friction 1 2 differs by direction",
+            'friction="-1 -1"': "friction is -1, must not be negative",
+            'solreffriction="0.1 1"': "solreffriction",
+        }.items()
+    ),
     (
         pendulum(
+            world="",
             inside='<geom name="a" size="0.1"/>',
-            rest='<contact><pair name="couple" geom1="a" geom2="floor"/></contact>',
+            rest='<worldbody><geom name="rock" size="1" contype="0"/></worldbody>'
+            '<contact><pair geom1="a" geom2="rock"/></contact>',
         ),
-        "couple",
+        "geom 'rock': contact is simulated with one ground plane",
     ),
     (
         robot(
@@ -251,12 +263,6 @@ REFUSED = [
             rest='<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>',
         ),
         "geom 'hills': contact is simulated with one ground plane",
-    ),
-    (
-        pendulum(
-            inside='<geom name="ice" size="0.1" condim="1"/>', world='<geom type="plane" size="1 1 1" condim="1"/>'
-        ),
-        "geom 'ice': condim 1",
     ),
     # numbers
     *(
@@ -307,8 +313,8 @@ def test_all_obstacles_in_one_message():
         parse(
             pendulum(
                 'frictionloss="-1" damping="-2"',
-                inside='<geom name="egg" type="ellipsoid" size="1 2 3"/><geom name="can" type="cylinder" size="1 2"/>'
-                '<geom type="cylinder" size="1 2"/>',
+                inside='<geom name="egg" size="1" solref="-1 1"/><geom name="can" size="1" solref="-1 1"/>'
+                '<geom size="1" solref="-1 1"/>',
                 rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="-5"/></actuator>'
                 '<custom><numeric name="k_nn" data="1"/></custom>',
             )
@@ -323,6 +329,13 @@ def test_all_obstacles_in_one_message():
         "actuator 'servo'",
         "geom 'egg', 'can', number 4 of body 'arm'",
     ]
+
+
+def test_many_names_are_counted():
+    geoms = "".join(f'<geom name="g{k}" size="1" solref="-1 1"/>' for k in range(31))
+    with pytest.raises(SceneError, match="geom 'g0', 'g1', .*'g7', and 23 more: solref") as error:
+        parse(pendulum(inside=geoms))
+    assert len(str(error.value)) < 200
 
 
 @pytest.mark.parametrize(
