@@ -127,9 +127,10 @@ def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def base_geoms(m: mujoco.MjModel) -> NDArray[np.bool_]:
-    """(ngeom,) of bodies that are fixed to the world, planes and height fields aside."""
+    """(ngeom,) of bodies that are fixed to the world and carry moving ones, planes and height fields aside."""
+    carries = np.isin(m.body_rootid, m.body_rootid[m.body_weldid > 0])
     flat = (m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (m.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
-    mask: NDArray[np.bool_] = (m.body_weldid[m.geom_bodyid] == 0) & (m.geom_bodyid > 0) & ~flat
+    mask: NDArray[np.bool_] = carries[m.geom_bodyid] & (m.body_weldid[m.geom_bodyid] == 0) & (m.geom_bodyid > 0) & ~flat
     return mask
 
 

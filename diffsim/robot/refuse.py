@@ -133,7 +133,7 @@ def _finite(values: ArrayLike) -> Mask:
 def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
     """What must be finite, by kind and attribute; (n,) or (n, ...) each."""
     fields = {
-        Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat"),
+        Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat gravcomp"),
         Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solimp solmix margin gap"),
         Kind.mjOBJ_PAIR: ("pair", "friction solref solimp margin gap"),
         Kind.mjOBJ_SITE: ("site", "pos"),
@@ -246,7 +246,6 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Obstacle]:
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
     rules = {
-        "gravcomp is not simulated": (m.body_gravcomp != 0) & np.any(m.opt.gravity),
         "mocap is not simulated": m.body_mocapid >= 0,
         "a second base beside a floating one": second,
         "in a fluid each body needs a joint; merge its geoms": welded & fluid,
@@ -259,7 +258,8 @@ def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
     dof, limited, (low, high) = m.jnt_dofadr, m.jnt_limited != 0, m.jnt_range.T
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
     loss = m.dof_frictionloss[dof]
-    passive = (m.dof_armature[dof] != 0) | (m.dof_damping[dof] != 0) | (m.jnt_stiffness != 0) | (loss != 0)
+    inertial = (m.dof_armature[dof] != 0) & (m.opt.density + m.opt.viscosity > 0)
+    compensated = m.jnt_actgravcomp & m.jnt_actfrclimited
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
     tendons = (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON).any()
@@ -270,7 +270,9 @@ def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
         "frictionloss {loss:g} is negative": loss < 0,
         "the limit of a ball joint is not simulated": ball & limited,
         "actuatorfrcrange beside muscles is not simulated": (m.jnt_actfrclimited != 0) & tendons,
-        "a free joint has no armature, damping, stiffness or frictionloss here": free & passive,
+        "a free joint has no stiffness or frictionloss here": free & ((m.jnt_stiffness != 0) | (loss != 0)),
+        "armature of a free joint in a fluid is not simulated": free & inertial,
+        "actuatorgravcomp within actuatorfrcrange is not simulated": compensated,
         "one free joint, of the first moving body, is simulated": free & ~first,
         "range {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
     }

@@ -189,8 +189,8 @@ def test_only_what_may_touch_the_ground_touches():
         rest = f"<contact><pair {ends}/></contact>"
         assert parse(pendulum(inside=pair, rest=rest)).ncontact == 2
         assert parse(pendulum(inside=pair, rest=rest + '<option><flag contact="disable"/></option>')).ncontact == 0
-    post = '<body><geom type="box" size="1 1 1"/></body>'  # what stands on the world is no ground
-    assert parse(pendulum(world='<geom type="plane" size="1 1 1"/>' + post)).ncontact == 1
+    arm = '<body pos="0 0 2"><joint/><geom size="0.1" pos="0 0 1"/></body>'
+    assert parse(robot(f'<body><geom type="box" size="1 1 1"/>{arm}</body>')).ncontact == 1  # its base is no ground
     drawn = '<geom type="cylinder" size="0.1 0.1" contype="0" conaffinity="0"/>'
     assert parse(pendulum(inside=drawn)).ncontact == 1
 

@@ -79,6 +79,7 @@ REFUSED = [
         {
             '<geom name="slope" type="plane" size="1 1 1" euler="0.1 0 0"/>': "slope",
             '<geom name="table" type="box" size="1 1 1"/>': "table",
+            '<body><geom name="step" type="box" size="1 1 1"/></body>': "step",
             '<geom name="floor" type="plane" size="1 1 1"/>'
             '<geom name="second" type="plane" size="1 1 1" pos="0 0 1"/>': "floor|second",
             '<geom name="floor" type="plane" size="1 1 1"/><body name="hand" mocap="true"/>': "body 'hand': mocap",
@@ -148,9 +149,10 @@ REFUSED = [
         robot,
         {
             '<body><joint name="hip" type="ball" range="0 1" limited="true"/><geom size="0.1"/></body>': "hip",
-            '<body><joint name="r" type="free" damping="1"/><geom size="0.1"/></body>': "r",
-            '<body><joint name="r" type="free" armature="1"/><geom size="0.1"/></body>': "r",
-            '<body name="kite" gravcomp="1"><freejoint/><geom size="0.1"/></body>': "kite",
+            '<body><joint name="r" type="free" stiffness="1"/><geom size="0.1"/></body>': "joint 'r': .* no stiffness",
+            '<body name="kite" gravcomp="nan"><freejoint/><geom size="0.1"/></body>': "body 'kite': gravcomp is not",
+            '<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>'
+            '<geom size="0.1"/></body>': "joint 'j': actuatorgravcomp within actuatorfrcrange",
             '<body name="one"><freejoint name="one"/><geom size="0.1"/></body>'
             '<body name="two"><freejoint name="two"/><geom size="0.1"/></body>': "two",
             '<body><freejoint/><geom size="0.1"/></body><body name="post"><joint/><geom size="0.1"/></body>': "post",
@@ -254,6 +256,10 @@ REFUSED = [
             "twist.*one axis of a ball joint",
         )
         for actuator, second in (("motor", 1), ("position", 0))
+    ),
+    (
+        robot('<body><joint name="r" type="free" armature="1"/><geom size="0.1"/></body>', '<option density="1"/>'),
+        "joint 'r': armature of a free joint in a fluid",
     ),
     (pendulum(inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'), "hull"),
     (pendulum(inside='<body name="fin"><geom size="0.1"/></body>', rest='<option density="1"/>'), "fin"),
