@@ -103,6 +103,10 @@ def mass_and_bias(scene: Scene, links: list[Link]) -> tuple[Array, Array]:
         inertia = link.rotation @ scene.inertia[i] @ link.rotation.T
         mass += scene.mass[i] * jc.T @ jc + jw.T @ inertia @ jw
         bias += scene.mass[i] * jc.T @ (acceleration - scene.gravity)
+        _, jl, _ = link.point(link.rotation @ scene.lift_position[i])
+        bias += scene.lift[i] * jl.T @ scene.gravity + scene.base_damping[i] * (
+            link.jacobian.T @ link.velocity + link.angular_jacobian.T @ link.angular_velocity
+        )
         bias += jw.T @ (inertia @ link.angular_bias + np.cross(w, inertia @ w))
         if i > 0:
             mass[joint_dof(scene, i), joint_dof(scene, i)] += scene.armature[i]
@@ -333,7 +337,7 @@ def turned(quaternion: Array, rotation: Array) -> Array:
 
 def with_factors(scene: Scene, factors: Array) -> Scene:
     """The scene of an environment with a row of Simulator.factors."""
-    names = ("k_n", "k_d", "k_t", "mu", "k_limit", "d_limit"), ("mass", "inertia"), ("gear", "motor_bias")
+    names = ("k_n", "k_d", "k_t", "mu", "k_limit", "d_limit"), ("mass", "inertia", "lift"), ("gear", "motor_bias")
     given = dict(zip(names[0], factors, strict=False))
     given |= dict.fromkeys(names[1], factors[6]) | dict.fromkeys(names[2], factors[7])
     return dataclasses.replace(scene, **{name: factor * getattr(scene, name) for name, factor in given.items()})

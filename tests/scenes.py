@@ -137,6 +137,27 @@ BOUNDED_SERVOS = SERVOS.format(
     more='<position joint="b" kp="9" kv="2"/>',
 )
 
+# Gravity is compensated for a part of each link, two of which are two bodies, and a free joint has inertia and damping.
+COMPENSATED = """
+<mujoco>
+  <option gravity="1 2 -9"/>
+  <worldbody>
+    <body gravcomp="0.5">
+      <joint type="free" armature="0.7" damping="0.4"/> <inertial pos="0.1 0 -0.3" mass="2" diaginertia=".1 .1 .1"/>
+      <body pos="0 0 -0.5">
+        <joint axis="1 0 1"/> <inertial pos="0.1 0 -0.1" mass="1" diaginertia=".1 .2 .1"/>
+        <body pos="0.2 0 0" quat="1 2 3 4" gravcomp="1.5">
+          <inertial pos="0 .1 -.2" mass="1" diaginertia=".1 .1 .2"/>
+        </body>
+        <body pos="0.2 0 0">
+          <joint type="slide" axis="0 1 1"/> <inertial pos="0 0 0.2" mass="1" diaginertia=".2 .1 .1"/>
+          <body gravcomp="1"> <inertial pos="0.3 0 0.2" mass="2" diaginertia=".2 .1 .1"/> </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
 # A leg on a floating pelvis: a muscle over the hip, one over hip and knee with a piece along the thigh, one that begins
 # with a segment of no length at the hip's centre, one that goes to and fro; and a motor in their midst.
 LEG = """

@@ -146,6 +146,25 @@ def test_tree_steps_are_mujocos(base, seed, rng):
     assert check_step(scene, states, 0.75) == set(STATES.values())
 
 
+def test_pairs_and_meshes_touch_as_in_mujoco(rng):
+    """A <pair> has its own friction, time constants, impedance and margin; a frictionless mesh touches beside it."""
+    numbers = 'condim="3" friction="0.4 0.4" solref="-900 -40" solimp="0.7 0.95 0.01 0.4 2" margin="0.03"'
+    scene = parse(
+        robot(
+            '<body><freejoint/><geom name="foot" size="0.1" contype="0" conaffinity="0" friction="2"/>'
+            '<body pos="0.3 0 0"><joint axis="0 1 0" damping="0.1"/><geom type="mesh" mesh="tetra" mass="1"/>'
+            "</body></body>",
+            '<asset><mesh name="tetra" vertex="0 0 0 .3 0 0 0 .2 0 0 0 .2"/></asset>'
+            f'<contact><pair geom1="foot" geom2="floor" {numbers}/></contact>',
+            '<geom name="floor" type="plane" size="1 1 1" condim="1" priority="1"/>',
+        )
+    )
+    qpos, qvel, ctrl = free_states(scene, 64, rng)
+    qpos[:, 2] -= [reference.contacts(scene, *state)[0].min() + 0.02 for state in zip(qpos, qvel, strict=True)]
+    qpos[:, 2] += 0.04 * rng.random(64)
+    check_step(scene, (qpos, 0.3 * qvel, ctrl), 0.9)
+
+
 @pytest.mark.parametrize("mjcf", [FREE_SERVOS, BOUNDED_SERVOS])
 def test_servos_are_damped_as_by_implicitfast(mjcf, rng):
     """Their dampers are implicit, but where the force is at a bound."""

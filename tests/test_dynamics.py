@@ -15,6 +15,7 @@ from scenes import (
     BALL,
     BLOCK,
     BOUNDED_SERVOS,
+    COMPENSATED,
     CRANE,
     DISTINCT,
     FREE_SERVOS,
@@ -131,6 +132,12 @@ def test_bounds_of_actuators_are_mujocos(rng):
     assert relative_error(qacc, mujoco_acceleration(scene, *states)) < 1e-10
     for theta in (0.0, 0.5):
         check_against_reference(scene, *(x[:8] for x in states), "implicit", 16, theta)
+
+
+def test_gravity_compensation_and_a_free_joints_inertia_are_mujocos(rng):
+    scene = parse(COMPENSATED)
+    assert scene.features == {"floating", "hinge", "slide", "gravcomp", "base_damping"}
+    check_against_mujoco(scene, torch.float64, rng)
 
 
 @pytest.mark.parametrize("model", ["linear", "hill"])

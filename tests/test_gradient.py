@@ -8,6 +8,7 @@ import torch
 from scenes import (
     BALL,
     BOUNDED_SERVOS,
+    COMPENSATED,
     DISTINCT,
     HINGE,
     ROBOTS,
@@ -148,6 +149,18 @@ def test_gradient_of_bounded_servos_is_that_of_differences(integrator, theta, rn
         value, slope = (f(scene, states, w, optional={"factors": factors}, **how)[-1] for f in (gradients, differences))
         assert not slope[:, :6].any() and not value[:, :6].any()  # it has no contact and no limits
         np.testing.assert_allclose(value[:, 6:], slope[:, 6:], rtol=1e-6, atol=1e-6 * abs(slope).max())
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit", "mujoco"])
+def test_gradient_under_gravity_compensation_is_that_of_differences(integrator, rng):
+    """And in the factor of mass."""
+    scene, how = parse(COMPENSATED), {"integration": Integration(integrator, 8)}
+    states = free_states(scene, 16, rng)
+    check_gradients(scene, states, rng, **how)
+    w, factors = weights(scene, rng), rng.uniform(0.5, 2.0, (16, len(FACTORS)))
+    if integrator == "semi_implicit":
+        value, slope = (f(scene, states, w, optional={"factors": factors}, **how)[-1] for f in (gradients, differences))
+        np.testing.assert_allclose(value, slope, rtol=1e-6, atol=1e-6 * abs(slope).max())
 
 
 def test_quaternion_of_any_length(rng):

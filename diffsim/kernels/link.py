@@ -20,7 +20,15 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, vec6, mat3, Model, Law = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law
     momentum, Place, VARIED = sp.momentum, kinematics(spec).Place, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
+    LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
     DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
+
+    @wp.func
+    def lift(m: Model, k: int, R: mat3, x: vec3):
+        """Where gravity compensation acts on link k, its force and its wrench."""
+        p = x + R * vec3(m.lift_position[k])
+        f = -T(m.lift[k]) * vec3(m.gravity)
+        return p, f, sp.force_at(p, f)
 
     @wp.func
     def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, h: T, theta: T):
@@ -35,6 +43,13 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         Ia = inertia - Ib * wp.skew(com)
         Id = wp.diag(vec3(mass, mass, mass))
         F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
+        if wp.static(LIFT):
+            _p, _f, up = lift(m, k, R, x)
+            if wp.static(VARIED):
+                up = law.mass * up
+            F = F - up
+        if wp.static(DAMPED):
+            F = F + T(m.base_damping[k]) * V
         if wp.static(DRAG):
             F = F - drag.drag_wrench(m, k, R, com, V)
         if wp.static(CONTACT):
@@ -65,12 +80,21 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         adj_v = momentum(T(m.mass[k]), com, inertia, wp.spatial_cross(W, V))
         adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
         adj_p = vec6()
+        if wp.static(LIFT):  # as an external force, see force.py
+            p, f, up = lift(m, k, R, x)
+            adj_w = adj_w - up
+            adj_p = -sp.force_at(p, wp.cross(f, wp.spatial_top(W))) - wp.spatial_cross_dual(W, up)
         if wp.static(VARIED):
             # phi's inertial part is W . adj_w, and all of this is that of a factor of one.
             adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
             adj_a = law.mass * adj_a
             adj_w = law.mass * adj_w
             adj_v = law.mass * adj_v
+            if wp.static(LIFT):
+                adj_p = law.mass * adj_p
+        if wp.static(DAMPED):
+            adj_w = adj_w + T(m.base_damping[k]) * V
+            adj_v = adj_v + T(m.base_damping[k]) * W
         if wp.static(DRAG):
             adj_w = adj_w - drag.drag_wrench(m, k, R, com, V)
             adj_v = adj_v + drag.drag_adjoint(m, k, R, com, V, W)

@@ -43,6 +43,9 @@ def scene_types(dtype: type) -> SimpleNamespace:
         mass: wp.array(dtype=dtype)
         com: wp.array(dtype=vec3)
         inertia: wp.array(dtype=mat3)
+        lift: wp.array(dtype=dtype)  # read with gravity compensation only
+        lift_position: wp.array(dtype=vec3)
+        base_damping: wp.array(dtype=dtype)  # read where a floating base has some
         armature: wp.array(dtype=dtype)
         damping: wp.array(dtype=dtype)
         stiffness: wp.array(dtype=dtype)
@@ -221,6 +224,9 @@ class _Writer:
             carried=(carried[:, 0], int),
             mass=(scene.mass[link] * carried[:, 0], self.dtype),
             com=(scene.com[link], t.vec3),
+            lift=(scene.lift[link] * carried[:, 0], self.dtype),
+            lift_position=(scene.lift_position[link], t.vec3),
+            base_damping=(scene.base_damping[link] * carried[:, 0], self.dtype),
             inertia=(scene.inertia[link] * carried[:, None], t.mat3),
             drag_frame=(frame[link], t.mat3),
             drag_viscous=(viscous[link] * carried, t.vec3),

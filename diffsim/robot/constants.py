@@ -8,7 +8,7 @@ itself; FIRMNESS makes up for that as well as one number can (measured over gymn
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -19,16 +19,23 @@ from diffsim.robot.scene import Array
 
 Kind = mujoco.mjtObj
 
+MOST_NAMES = 8  # in one message
 STEP = 1 / 960  # s, 16 substeps of 1/60 s: explicit steps up to this one are stable with these constants
 CARRIERS = 4  # contact points that share the weight of a robot that has more
 FIRMNESS = 2.0  # times what solref asks for
 REBOUND = 2.0  # s/m, k_d / k_n at a dampratio of 1: the ground stops pushing what leaves at half a metre a second
 LIMIT_REBOUND = 4.0  # s/m or s/rad, d_limit / k_limit likewise
-# Where a geom's contact points are, by its type: along its axes, in half lengths
+HULL_POINTS = 16  # of a mesh, at most
+_CORNERS = np.array([[x, y, z] for y in (-1, 1) for x in (-1, 1) for z in (-1, 1)], float)
+_RIM = np.array([[np.cos(turn), np.sin(turn), z] for z in (-1, 1) for turn in np.arange(8) * np.pi / 4])
+# Where a geom's contact points are, by its type: along its axes, in half lengths; a mesh has its own
 POINTS = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): np.zeros((1, 3)),
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]),
-    int(mujoco.mjtGeom.mjGEOM_BOX): np.array([[x, y, z] for y in (-1, 1) for x in (-1, 1) for z in (-1, 1)]),
+    int(mujoco.mjtGeom.mjGEOM_BOX): _CORNERS,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): _RIM,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): np.concatenate((np.eye(3), -np.eye(3), _CORNERS / np.sqrt(3))),
+    int(mujoco.mjtGeom.mjGEOM_MESH): np.zeros((HULL_POINTS, 3)),
 }
 
 
@@ -42,6 +49,13 @@ def label(m: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
     bodies = {Kind.mjOBJ_GEOM: m.geom_bodyid, Kind.mjOBJ_JOINT: m.jnt_bodyid, Kind.mjOBJ_SITE: m.site_bodyid}
     body = mujoco.mj_id2name(m, Kind.mjOBJ_BODY, bodies[kind][index]) if kind in bodies else ""
     return f"number {index}" + (f" of body {body!r}" if body else "")
+
+
+def listed(names: Iterable[str]) -> str:
+    """Some names, and how many there are besides."""
+    first = list(names)
+    more = [f"and {len(first) - MOST_NAMES} more"] if len(first) > MOST_NAMES + 1 else []
+    return ", ".join([*(first[:MOST_NAMES] if more else first), *more])
 
 
 def text(m: mujoco.MjModel, name: str, default: str) -> str:
@@ -104,22 +118,42 @@ class PairLaw(NamedTuple):
 
 
 def ground_pairs(m: mujoco.MjModel) -> list[tuple[int, int]]:
-    """(fixed geom, moving geom) that may touch."""
+    """(fixed geom, moving geom) that may touch; what is part of the robot's own base is no ground."""
     weld = m.body_weldid[m.geom_bodyid]
-    moving = np.flatnonzero(weld)
-    return [(s, g) for s in np.flatnonzero(weld == 0).tolist() for g in moving[_collide(m, s, moving)].tolist()]
+    moving, ground = np.flatnonzero(weld), np.flatnonzero((weld == 0) & ~base_geoms(m))
+    pairs = {(s, g): None for s in ground.tolist() for g in moving[_collide(m, s, moving)].tolist()}
+    sides = {(s, g): None for pair in declared_pairs(m) for s, g in (pair, pair[::-1]) if weld[g] and s in ground}
+    return list(pairs | sides)
+
+
+def base_geoms(m: mujoco.MjModel) -> NDArray[np.bool_]:
+    """(ngeom,) of bodies that are fixed to the world and carry moving ones, planes and height fields aside."""
+    carries = np.isin(m.body_rootid, m.body_rootid[m.body_weldid > 0])
+    flat = (m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (m.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
+    mask: NDArray[np.bool_] = carries[m.geom_bodyid] & (m.body_weldid[m.geom_bodyid] == 0) & (m.geom_bodyid > 0) & ~flat
+    return mask
+
+
+def declared_pairs(m: mujoco.MjModel) -> dict[tuple[int, int], int]:
+    """The <pair> of two geoms, the lower one first, where the file has one."""
+    if disabled_flags(m) & {"constraint", "contact"}:
+        return {}
+    ends = np.sort(np.column_stack((m.pair_geom1, m.pair_geom2)), axis=1).tolist()
+    return {(a, b): k for k, (a, b) in enumerate(ends)}
 
 
 def self_pairs(m: mujoco.MjModel) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Moving geoms, each with the later ones of other bodies that it may touch."""
+    """The robot's geoms, each with the later ones of other bodies that it may touch."""
     weld = m.body_weldid[m.geom_bodyid]
     parent = m.body_weldid[m.body_parentid[weld]]
     filters = "filterparent" not in disabled_flags(m)
-    moving = np.flatnonzero(weld)
-    for k, a in enumerate(moving.tolist()):
-        b = moving[k + 1 :]
-        related = (parent[a] == weld[b]) | (parent[b] == weld[a])
-        if len(b := b[(weld[a] != weld[b]) & ~(filters & related) & _collide(m, a, b)]):
+    parts = np.flatnonzero((weld > 0) | base_geoms(m))
+    declared = [pair for pair in declared_pairs(m) if np.isin(pair, parts).all()]
+    for k, a in enumerate(parts.tolist()):
+        b = parts[k + 1 :]
+        related = ((parent[a] == weld[b]) | (parent[b] == weld[a])) & (weld[a] > 0) & (weld[b] > 0)
+        touch = (weld[a] != weld[b]) & ~(filters & related) & _collide(m, a, b)
+        if len(b := b[touch | np.isin(b, [second for first, second in declared if first == a])]):
             yield a, b
 
 
@@ -132,7 +166,15 @@ def _collide(m: mujoco.MjModel, a: int, b: NDArray[np.int64]) -> NDArray[np.bool
 
 
 def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
-    """The geom of higher priority decides; of equals friction and condim are the larger, solref and solimp the mean."""
+    """The geom of higher priority decides; of equals friction and condim are the larger, solref and solimp the mean.
+
+    A <pair> of the two has its own numbers.
+    """
+    if (pair := declared_pairs(m).get((min(a, b), max(a, b)))) is not None:
+        first, second = m.pair_solref[pair].tolist()
+        return PairLaw(
+            int(m.pair_dim[pair]), float(m.pair_friction[pair, 0]), (first, second), tuple(m.pair_solimp[pair])
+        )
     geoms = [a, b]
     if m.geom_priority[a] != m.geom_priority[b]:
         geoms = [a if m.geom_priority[a] > m.geom_priority[b] else b] * 2
@@ -146,6 +188,36 @@ def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
     friction = float(m.geom_friction[geoms, 0].max())
     condim = int(m.geom_condim[geoms].max())
     return PairLaw(condim, friction, (float(mixed[0]), float(mixed[1])), tuple(solimp.tolist()))
+
+
+def contact_points(m: mujoco.MjModel, geom: int) -> tuple[Array, float]:
+    """(n, 3) centres, in the geom's frame, of the spheres that touch in its place, and their radius."""
+    kind, size = mujoco.mjtGeom(m.geom_type[geom]), m.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        return _spread(_hull(m, m.geom_dataid[geom])), 0.0
+    points = POINTS[int(kind)]
+    if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+        return points * size[1], float(size[0])
+    return points * (size[[0, 0, 1]] if kind == mujoco.mjtGeom.mjGEOM_CYLINDER else size), 0.0
+
+
+def _hull(m: mujoco.MjModel, mesh: int) -> Array:
+    """(n, 3) corners of a mesh's convex hull, or all of its vertices where MuJoCo has made no hull."""
+    vertices: Array = m.mesh_vert[m.mesh_vertadr[mesh] :][: m.mesh_vertnum[mesh]].astype(float)
+    if m.mesh_graphadr[mesh] < 0:
+        return vertices
+    graph = m.mesh_graph[m.mesh_graphadr[mesh] :]  # counts of corners and faces, where edges begin, then the corners
+    return vertices[graph[2 + graph[0] :][: graph[0]]]
+
+
+def _spread(points: Array) -> Array:
+    """At most HULL_POINTS of them: the extremes along each axis, then each time the farthest from all before."""
+    chosen = list(dict.fromkeys([*points.argmin(0).tolist(), *points.argmax(0).tolist()]))
+    distance = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(1)
+    while len(chosen) < HULL_POINTS and distance.max() > 0.02 * np.ptp(points, axis=0).max():
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return points[chosen]
 
 
 # Constants ------------------------------------------------------------------------------------------------------------

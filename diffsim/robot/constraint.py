@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim.robot.constants import disabled_flags, enabled_flags, ground_pairs, label, pair_law
+from diffsim.robot.constants import declared_pairs, disabled_flags, enabled_flags, ground_pairs, label, listed, pair_law
 from diffsim.robot.scene import Array, Scene, SceneError
 
 # MuJoCo's own bounds: of an impedance, and of the friction of a contact that has any
@@ -70,7 +70,7 @@ def check_springs(scene: Scene, integrator: str) -> None:
     m = scene.mj_model
     joints = np.unique(m.dof_jntid[m.dof_frictionloss > 0]).tolist()
     if joints:
-        names = ", ".join(label(m, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints)
+        names = listed(label(m, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints)
         raise SceneError(f"{scene.name}: the integrator {integrator} has no frictionloss (joint {names}); mujoco has")
 
 
@@ -78,12 +78,15 @@ def _contact(m: mujoco.MjModel, ground: int, geom: int, fastest: float) -> Array
     law = pair_law(m, ground, geom)
     weight = m.body_invweight0[m.geom_bodyid[[ground, geom]], 0].sum()
     friction = max(law.friction, LEAST_FRICTION) if law.condim > 1 else 0.0
-    numbers = _numbers(law.solref, law.solimp, weight, _margin(m, ground, geom), fastest)
+    numbers = _numbers(law.solref, law.solimp, weight, contact_margin(m, ground, geom), fastest)
     numbers[2:4] = friction, 1 / m.opt.impratio
     return numbers
 
 
-def _margin(m: mujoco.MjModel, ground: int, geom: int) -> float:
+def contact_margin(m: mujoco.MjModel, ground: int, geom: int) -> float:
+    """Of a contact of these two: the distance at which it begins [m]."""
+    if (pair := declared_pairs(m).get((min(ground, geom), max(ground, geom)))) is not None:
+        return float(m.pair_margin[pair] - (0.0 if _margins_add() else m.pair_gap[pair]))
     margin, gap = m.geom_margin[[ground, geom]], m.geom_gap[[ground, geom]]
     return float(margin.sum() if not margin.any() or _margins_add() else margin.max() - gap.max())
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.constants import (
-    POINTS,
     PairLaw,
     at_rest,
     contact_constants,
+    contact_points,
     disabled_flags,
     floating,
     ground_pairs,
@@ -244,9 +244,13 @@ class _Reader:
         return bounds.T
 
     def _inertias(self) -> dict[str, Any]:
-        """mass, com and inertia (nlink, ...) of the bodies that are welded together."""
+        """mass, com, inertia and gravity compensation (nlink, ...) of the bodies that are welded together."""
         m = self.m
         mass, moment, inertia = np.zeros(self.nlink), np.zeros((self.nlink, 3)), np.zeros((self.nlink, 3, 3))
+        lift, lifted, base_damping = np.zeros(self.nlink), np.zeros((self.nlink, 3)), np.zeros(self.nlink)
+        if self.first:  # a free joint's armature is a point mass with moments of inertia that gravity does not pull on
+            mass[0], inertia[0], lift[0] = m.dof_armature[0], m.dof_armature[0] * np.eye(3), m.dof_armature[0]
+            base_damping[0] = m.dof_damping[0]
         for body, (link, rotation, position) in enumerate(self.body):
             if body == 0 or link < 0:
                 continue
@@ -254,11 +258,15 @@ class _Reader:
             com = position + rotation @ m.body_ipos[body]
             mass[link] += m.body_mass[body]
             moment[link] += m.body_mass[body] * com
+            lift[link] += m.body_gravcomp[body] * m.body_mass[body]
+            lifted[link] += m.body_gravcomp[body] * m.body_mass[body] * com
             about_com = principal @ np.diag(m.body_inertia[body]) @ principal.T
             inertia[link] = inertia[link] + about_com - m.body_mass[body] * _skew(com) @ _skew(com)
         com = moment / np.where(mass > 0, mass, 1.0)[:, None]
         about_com = inertia + mass[:, None, None] * np.array([_skew(c) @ _skew(c) for c in com])
-        return {"mass": mass, "com": com, "inertia": about_com}
+        lift_position = lifted / np.where(lift != 0, lift, 1.0)[:, None]
+        of_gravity = {"lift": lift, "lift_position": lift_position, "base_damping": base_damping}
+        return {"mass": mass, "com": com, "inertia": about_com} | of_gravity
 
     def _actuators(self, springs: Array) -> dict[str, Any]:
         """Columns (nu, ...); without a spring on their link, the constant forces of servos are the motors'."""
@@ -363,11 +371,11 @@ class _Reader:
         }
 
     def _spheres(self, geom: int) -> list[Sphere]:
-        m, size = self.m, self.m.geom_size[geom]
+        m = self.m
         link, rotation, position = self.body[m.geom_bodyid[geom]]
         axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
-        half, radius = (size, 0.0) if m.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX else (size[1], size[0])
-        return [Sphere(link, centre + axes @ (point * half), radius, geom) for point in POINTS[m.geom_type[geom]]]
+        points, radius = contact_points(m, geom)
+        return [Sphere(link, centre + axes @ point, radius, geom) for point in points]
 
     def _outer_spheres(self, spheres: list[Sphere], slide: NDArray[np.bool_]) -> list[Sphere]:
         """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""

@@ -17,11 +17,13 @@ from diffsim.robot.constants import (
     POINTS,
     asked,
     at_rest,
+    declared_pairs,
     disabled_flags,
     enabled_flags,
     floating,
     ground_pairs,
     label,
+    listed,
     mass_matrix,
     motors,
     numeric,
@@ -95,7 +97,7 @@ def _lines(found: Iterable[Obstacle]) -> list[str]:
     lines: dict[tuple[str, str], dict[str, None]] = {}
     for kind, name, why in found:
         lines.setdefault((kind, why), {})[name] = None
-    return [f"{kind} {', '.join(names)}: {why}" for (kind, why), names in lines.items()]
+    return [f"{kind} {listed(names)}: {why}" for (kind, why), names in lines.items()]
 
 
 def _where(
@@ -131,8 +133,9 @@ def _finite(values: ArrayLike) -> Mask:
 def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
     """What must be finite, by kind and attribute; (n,) or (n, ...) each."""
     fields = {
-        Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat"),
+        Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat gravcomp"),
         Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solimp solmix margin gap"),
+        Kind.mjOBJ_PAIR: ("pair", "friction solref solimp margin gap"),
         Kind.mjOBJ_SITE: ("site", "pos"),
         Kind.mjOBJ_JOINT: ("jnt", "pos axis range actfrcrange stiffness solref solimp margin"),
         Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange forcerange gainprm biasprm lengthrange"),
@@ -155,6 +158,7 @@ def _not_finite(m: mujoco.MjModel) -> Iterator[Obstacle]:
 
 def _negative(m: mujoco.MjModel) -> Iterator[Obstacle]:
     signed = {Kind.mjOBJ_JOINT: ("armature", "damping", "stiffness"), Kind.mjOBJ_GEOM: ("friction", "solmix")}
+    signed[Kind.mjOBJ_PAIR] = ("friction",)
     for kind, field in ((kind, field) for kind, fields in signed.items() for field in fields):
         values = _numbers(m)[kind][field]
         least = values.min(tuple(range(1, values.ndim)))
@@ -221,10 +225,8 @@ def _options(m: mujoco.MjModel) -> Iterator[Obstacle]:
 
 
 def _unsimulated(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    touch = not disabled_flags(m) & {"constraint", "contact"}
     for kind, present, what in (
         (Kind.mjOBJ_EQUALITY, m.eq_active0, "equality constraints"),
-        (Kind.mjOBJ_PAIR, np.full(m.npair, touch), "contact pairs"),
         (Kind.mjOBJ_FLEX, np.ones(m.nflex), "deformable bodies"),
         (Kind.mjOBJ_PLUGIN, np.ones(m.nplugin), "plugins"),
     ):
@@ -244,7 +246,6 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Obstacle]:
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
     rules = {
-        "gravcomp is not simulated": (m.body_gravcomp != 0) & np.any(m.opt.gravity),
         "mocap is not simulated": m.body_mocapid >= 0,
         "a second base beside a floating one": second,
         "in a fluid each body needs a joint; merge its geoms": welded & fluid,
@@ -257,7 +258,8 @@ def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
     dof, limited, (low, high) = m.jnt_dofadr, m.jnt_limited != 0, m.jnt_range.T
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
     loss = m.dof_frictionloss[dof]
-    passive = (m.dof_armature[dof] != 0) | (m.dof_damping[dof] != 0) | (m.jnt_stiffness != 0) | (loss != 0)
+    inertial = (m.dof_armature[dof] != 0) & (m.opt.density + m.opt.viscosity > 0)
+    compensated = m.jnt_actgravcomp & m.jnt_actfrclimited
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
     tendons = (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON).any()
@@ -268,7 +270,9 @@ def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
         "frictionloss {loss:g} is negative": loss < 0,
         "the limit of a ball joint is not simulated": ball & limited,
         "actuatorfrcrange beside muscles is not simulated": (m.jnt_actfrclimited != 0) & tendons,
-        "a free joint has no armature, damping, stiffness or frictionloss here": free & passive,
+        "a free joint has no stiffness or frictionloss here": free & ((m.jnt_stiffness != 0) | (loss != 0)),
+        "armature of a free joint in a fluid is not simulated": free & inertial,
+        "actuatorgravcomp within actuatorfrcrange is not simulated": compensated,
         "one free joint, of the first moving body, is simulated": free & ~first,
         "range {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
     }
@@ -359,18 +363,20 @@ def _contacts(m: mujoco.MjModel) -> Iterator[Obstacle]:
         return
     laws = {geom: pair_law(m, ground, geom) for ground, geom in pairs}
     geoms = list(laws)
-    condim, wrong, shaped = np.zeros(m.ngeom, int), np.full(m.ngeom, "", "U80"), np.ones(m.ngeom, bool)
-    condim[geoms] = [law.condim for law in laws.values()]
+    wrong, shaped = np.full(m.ngeom, "", "U80"), np.ones(m.ngeom, bool)
     wrong[geoms] = [_wrong(law.solref) for law in laws.values()]
     shaped[geoms] = np.isin(m.geom_type[geoms], list(POINTS))
-    smooth = (condim == 1) & (mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, "mu") < 0) & (condim > 1).any()
+    rules = {f"its shape cannot touch the ground here{only_drawn}": ~shaped, "solref {wrong}": wrong != ""}
+    yield from _where(m, Kind.mjOBJ_GEOM, rules, wrong=wrong)
+    ends = {tuple(sorted(pair)) for pair in pairs}
+    on_ground = np.array([k for pair, k in declared_pairs(m).items() if pair in ends], int)
+    first, second = m.pair_friction[:, :2].T
     rules = {
-        f"only spheres, capsules and boxes may touch the ground{only_drawn}": ~shaped,
-        "condim {condim}: torsional and rolling friction are not simulated; condim 3 is": condim > 3,
-        "condim 1: frictionless beside geoms with friction is not simulated; <numeric> 'mu' is for all": smooth,
-        "solref {wrong}": wrong != "",
+        "friction {first:g} {second:g} differs by direction; it is isotropic here": first != second,
+        "solreffriction is not simulated": m.pair_solreffriction.any(1),
     }
-    yield from _where(m, Kind.mjOBJ_GEOM, rules, condim=condim, wrong=wrong)
+    rules = {why: mask & np.isin(range(m.npair), on_ground) for why, mask in rules.items()}
+    yield from _where(m, Kind.mjOBJ_PAIR, rules, first=first, second=second)
 
 
 def _wrong(solref: ArrayLike) -> str:

@@ -9,12 +9,14 @@ import numpy as np
 
 from diffsim.robot.constants import (
     CARRIERS,
-    POINTS,
+    HULL_POINTS,
     STEP,
     PairLaw,
     asked,
+    base_geoms,
     ground_pairs,
     label,
+    listed,
     mass_matrix,
     motors,
     numeric,
@@ -22,11 +24,19 @@ from diffsim.robot.constants import (
     recovery,
     self_pairs,
 )
+from diffsim.robot.constraint import contact_margin
 from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
 
 Kind = mujoco.mjtObj
 FASTEST = 1e5  # m/s or rad/s, beyond which the simulator contains an environment
 MANY_POINTS = 1000
+
+# How a geom's points stand for it, by its type
+ROUGH_SHAPES = {
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "8 of each rim of a cylinder",
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "14 of an ellipsoid's surface",
+    int(mujoco.mjtGeom.mjGEOM_MESH): f"at most {HULL_POINTS} corners of a mesh's convex hull",
+}
 
 # Where a constant comes from that the file does not name.
 SOURCES = {
@@ -64,9 +74,11 @@ def _parts(scene: Scene) -> Iterator[str]:
     yield f"state      nq {scene.nq}, nv {scene.nv}"
     yield f"mass       {scene.mass.sum():.4g} kg"
     yield f"controls   {', '.join(f'{n} {what}' for what, n in shares.items() if n) or 'none'}"
-    yield f"contact    {scene.ncontact} points" + (
-        f", ground at z = {scene.ground_height:g} m" if scene.ncontact else ""
+    ground = (
+        f"ground at z = {scene.ground_height:g} m" if scene.ncontact else "the file has no ground that it may touch"
     )
+    ground = f"ground at z = {scene.ground_height:g} m" if scene.ncontact else "no ground that it may touch"
+    yield f"contact    {scene.ncontact} points, {ground}"
     yield f"features   {', '.join(sorted(scene.features))}"
 
 
@@ -116,7 +128,9 @@ def _self_contact(scene: Scene) -> list[str]:
     names = " and ".join(label(m, Kind.mjOBJ_GEOM, int(geom)) for geom in (pairs[0][0], pairs[0][1][0]))
     number = sum(len(others) for _, others in pairs)
     count = f"{number} pairs of geoms, such as" if number > 1 else "the geoms"
-    return [f"The robot's parts pass through each other: {count} {names}, would collide in MuJoCo."]
+    told = f"The robot's parts pass through each other: {count} {names}, would collide in MuJoCo."
+    base = any(base_geoms(m)[[a, *others]].any() for a, others in pairs)
+    return [told + " Geoms of its fixed base are among them." * base]
 
 
 def _ground(scene: Scene) -> list[str]:
@@ -130,9 +144,14 @@ def _ground(scene: Scene) -> list[str]:
     if scene.mu > 0:
         sentences.append("Friction is a ramp up to Coulomb's bound: what is pushed sideways creeps.")
     sentences += _one_law_for_all(scene, [pair_law(m, *pair) for pair in pairs])
-    if margin := max(m.geom_margin[list(pair)].max() for pair in pairs):
+    if margin := max(contact_margin(m, *pair) for pair in pairs):
         sentences.append(f"Geoms touch where they are, not at their margin of up to {margin:g} m.")
-    if inside := sum(len(POINTS[m.geom_type[geom]]) for _, geom in pairs) - scene.ncontact:
+    kinds = {int(m.geom_type[geom]) for _, geom in pairs}
+    if told := ", ".join(what for kind, what in ROUGH_SHAPES.items() if kind in kinds):
+        sentences.append(f"The ground feels these points of a shape: {told}.")
+    if max(pair_law(m, *pair).condim for pair in pairs) > 3:
+        sentences.append("Torsional and rolling friction, condim 4 and 6, are left out: contact has condim 3.")
+    if inside := len(scene.spheres.geom) - scene.ncontact:
         sentences.append(f"Contact points that lie inside others in every pose are left out: {inside}.")
     return sentences
 
@@ -140,7 +159,7 @@ def _ground(scene: Scene) -> list[str]:
 def _one_law_for_all(scene: Scene, laws: list[PairLaw]) -> list[str]:
     """Where the file distinguishes between geoms, or asks for more than a substep can follow."""
     m, sentences = scene.mj_model, []
-    frictions, solrefs = {law.friction for law in laws}, {law.solref for law in laws}
+    frictions, solrefs = {law.friction * (law.condim > 1) for law in laws}, {law.solref for law in laws}
     if not len(numeric(m, "mu")) and len(frictions) > 1:
         span = f"{min(frictions):g} to {max(frictions):g}"
         sentences.append(f"One coefficient of friction, {scene.mu:g}, serves all geoms; the file has {span}.")
@@ -161,7 +180,7 @@ def _limits(scene: Scene) -> list[str]:
     limited = np.flatnonzero(m.jnt_limited).tolist()
     fast = [joint for joint in limited if recovery(m.jnt_solref[joint]) != asked(m.jnt_solref[joint])]
     if fast and not len(numeric(m, "k_limit")):
-        joints = ", ".join(label(m, Kind.mjOBJ_JOINT, joint) for joint in fast)
+        joints = listed(label(m, Kind.mjOBJ_JOINT, joint) for joint in fast)
         sentences.append(f"A solreflimit faster than substeps of 1/960 s can follow is slowed down: {joints}.")
     if margin := m.jnt_margin[limited].max():
         sentences.append(f"Limits act where the range ends, not at their margin of up to {margin:g}.")
@@ -172,7 +191,7 @@ def _actuators(scene: Scene) -> list[str]:
     m, sentences = scene.mj_model, []
     free = [label(m, Kind.mjOBJ_ACTUATOR, a) for a in np.flatnonzero(m.actuator_ctrllimited == 0).tolist()]
     if free:
-        sentences.append(f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {', '.join(free)}.")
+        sentences.append(f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {listed(free)}.")
     if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         sentences.append("A control sets the activation of a <muscle> at once.")
         if scene.muscle_model != "hill":

@@ -79,6 +79,9 @@ class Scene:
     mass: Array  # kg
     com: Array  # (3,) m, in the link's frame
     inertia: Array  # (3, 3) kg m^2 about the centre of mass, link axes
+    lift: Array  # kg, of which gravity is compensated, and
+    lift_position: Array  # (3,) m, where that acts, in the link's frame
+    base_damping: Array  # of a floating base's velocity [N s/m] and angular velocity [N m s], 0 of other links
     armature: Array
     damping: Array
     stiffness: Array
@@ -178,6 +181,8 @@ class Scene:
             "terrain": self.ncontact > 0 and self.terrain is not None,
             "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0) | constrained)).any()),
             "frictionloss": self.constraints is not None and bool(self.constraints.loss[:, 0].any()),
+            "gravcomp": bool(self.lift.any() and self.gravity.any()),
+            "base_damping": bool(self.base_damping.any()),
             "stiffness": bool(self.stiffness.any()),
             "damping": bool(self.damping.any() or self.servo_damping.any()),
             "clamp": bool((np.isfinite(self.force_low) | np.isfinite(self.force_high)).any()),

@@ -120,6 +120,34 @@ def test_box_touches_with_its_corners():
     assert corners == {(5 + x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)}
 
 
+HEAP = " ".join(map(str, (np.random.default_rng(0).normal(size=(300, 3)) * [0.5, 0.3, 0.1]).round(3).flatten()))
+
+
+@pytest.mark.parametrize(
+    "geom, count, error",
+    [
+        ('type="mesh" mesh="tetra"', 4, 1e-6),
+        ('type="mesh" mesh="heap"', 16, 0.25),
+        ('type="cylinder" size="0.3 0.1"', 16, 1 - np.cos(np.pi / 8)),
+        ('type="ellipsoid" size="0.5 0.3 0.1"', 14, 0.2),
+    ],
+)
+def test_points_of_a_shape_are_as_deep_as_the_shape(geom, count, error, rng):
+    """Relative to its height over the ground in MuJoCo, in any orientation; never deeper."""
+    mesh = f'<mesh name="tetra" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/><mesh name="heap" vertex="{HEAP}"/>'
+    world = '<geom type="plane" size="1 1 1" margin="9"/>'
+    body = f'<body pos="0 0 3"><freejoint/><geom {geom} pos="0.1 0 0" euler="1 0 0" mass="1"/></body>'
+    scene = parse(robot(body, f"<asset>{mesh}</asset>", world))
+    assert scene.ncontact == count and not scene.contact_radius.any()
+    data = mujoco.MjData(scene.mj_model)
+    for qpos in free_states(scene, 50, rng)[0]:
+        data.qpos = [0, 0, 3, *qpos[3:7]]
+        mujoco.mj_forward(scene.mj_model, data)
+        lowest, middle = data.contact.dist.min(), data.geom_xpos[1, 2]
+        ours = reference.contacts(scene, data.qpos, np.zeros(6))[0].min()
+        assert -1e-6 < ours - lowest <= error * (middle - lowest) + 1e-6
+
+
 def test_spheres_inside_another_are_dropped():
     """Inside on the same link, or on a hinge whose parent has the same sphere there; a shifted or larger one stays."""
     scene = parse(
@@ -156,6 +184,13 @@ def test_only_what_may_touch_the_ground_touches():
     exclude = '<contact><exclude body1="world" body2="arm"/></contact>'
     assert parse(pendulum()).ncontact == 1 and parse(pendulum(rest=exclude)).ncontact == 0
     assert parse(pendulum(world="")).ncontact == 0
+    pair = '<geom name="foot" size="0.2" contype="0" conaffinity="0"/>'
+    for ends in ('geom1="foot" geom2="floor"', 'geom1="floor" geom2="foot"'):
+        rest = f"<contact><pair {ends}/></contact>"
+        assert parse(pendulum(inside=pair, rest=rest)).ncontact == 2
+        assert parse(pendulum(inside=pair, rest=rest + '<option><flag contact="disable"/></option>')).ncontact == 0
+    arm = '<body pos="0 0 2"><joint/><geom size="0.1" pos="0 0 1"/></body>'
+    assert parse(robot(f'<body><geom type="box" size="1 1 1"/>{arm}</body>')).ncontact == 1  # its base is no ground
     drawn = '<geom type="cylinder" size="0.1 0.1" contype="0" conaffinity="0"/>'
     assert parse(pendulum(inside=drawn)).ncontact == 1
 

@@ -67,10 +67,7 @@ REFUSED = [
     *cases(
         with_inside,
         {
-            '<geom name="egg" type="ellipsoid" size="1 2 3"/>': "egg",
-            '<geom name="can" type="cylinder" size="1 2"/>': "can",
-            '<geom name="foot" size="0.1" condim="4"/>': "geom 'foot': condim 4: .*condim 3",
-            '<geom name="foot" size="0.1" condim="6"/>': "geom 'foot': condim 6: .*condim 3",
+            '<geom name="rock" type="sdf" mesh="tetra"/>': "rock",
             '<geom name="foot" size="0.1" solref="-1 1"/>': "geom 'foot': solref",
             '<geom name="foot" size="0.1" friction="-1"/>': "geom 'foot': friction is -1",
             '<geom size="0.1" mass="1e30"/>': "body 'arm': the robot weighs 1e\\+30 kg",
@@ -82,6 +79,7 @@ REFUSED = [
         {
             '<geom name="slope" type="plane" size="1 1 1" euler="0.1 0 0"/>': "slope",
             '<geom name="table" type="box" size="1 1 1"/>': "table",
+            '<body><geom name="step" type="box" size="1 1 1"/></body>': "step",
             '<geom name="floor" type="plane" size="1 1 1"/>'
             '<geom name="second" type="plane" size="1 1 1" pos="0 0 1"/>': "floor|second",
             '<geom name="floor" type="plane" size="1 1 1"/><body name="hand" mocap="true"/>': "body 'hand': mocap",
@@ -151,9 +149,10 @@ REFUSED = [
         robot,
         {
             '<body><joint name="hip" type="ball" range="0 1" limited="true"/><geom size="0.1"/></body>': "hip",
-            '<body><joint name="r" type="free" damping="1"/><geom size="0.1"/></body>': "r",
-            '<body><joint name="r" type="free" armature="1"/><geom size="0.1"/></body>': "r",
-            '<body name="kite" gravcomp="1"><freejoint/><geom size="0.1"/></body>': "kite",
+            '<body><joint name="r" type="free" stiffness="1"/><geom size="0.1"/></body>': "joint 'r': .* no stiffness",
+            '<body name="kite" gravcomp="nan"><freejoint/><geom size="0.1"/></body>': "body 'kite': gravcomp is not",
+            '<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>'
+            '<geom size="0.1"/></body>': "joint 'j': actuatorgravcomp within actuatorfrcrange",
             '<body name="one"><freejoint name="one"/><geom size="0.1"/></body>'
             '<body name="two"><freejoint name="two"/><geom size="0.1"/></body>': "two",
             '<body><freejoint/><geom size="0.1"/></body><body name="post"><joint/><geom size="0.1"/></body>': "post",
@@ -211,7 +210,6 @@ REFUSED = [
         "rope.*<muscle>",
     ),
     # several parts of a file
-    (pendulum(inside='<geom name="hull" type="mesh" mesh="tetra"/>', rest=MESH), "hull"),
     (
         robot(
             '<body name="a"><freejoint/><geom size="0.1"/></body>',
@@ -219,12 +217,28 @@ REFUSED = [
         ),
         "glue",
     ),
+    *(
+        (
+            pendulum(
+                inside='<geom name="a" size="0.1"/>',
+                rest=f'<contact><pair name="couple" geom1="a" geom2="floor" {numbers}/></contact>',
+            ),
+            f"pair 'couple': {what}",
+        )
+        for numbers, what in {
+            'friction="1 2"': "friction 1 2 differs by direction",
+            'friction="-1 -1"': "friction is -1, must not be negative",
+            'solreffriction="0.1 1"': "solreffriction",
+        }.items()
+    ),
     (
         pendulum(
+            world="",
             inside='<geom name="a" size="0.1"/>',
-            rest='<contact><pair name="couple" geom1="a" geom2="floor"/></contact>',
+            rest='<worldbody><geom name="rock" size="1" contype="0"/></worldbody>'
+            '<contact><pair geom1="a" geom2="rock"/></contact>',
         ),
-        "couple",
+        "geom 'rock': contact is simulated with one ground plane",
     ),
     (
         robot(
@@ -243,6 +257,10 @@ REFUSED = [
         )
         for actuator, second in (("motor", 1), ("position", 0))
     ),
+    (
+        robot('<body><joint name="r" type="free" armature="1"/><geom size="0.1"/></body>', '<option density="1"/>'),
+        "joint 'r': armature of a free joint in a fluid",
+    ),
     (pendulum(inside='<geom name="hull" size="0.1" fluidshape="ellipsoid"/>', rest='<option density="1"/>'), "hull"),
     (pendulum(inside='<body name="fin"><geom size="0.1"/></body>', rest='<option density="1"/>'), "fin"),
     (
@@ -251,12 +269,6 @@ REFUSED = [
             rest='<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>',
         ),
         "geom 'hills': contact is simulated with one ground plane",
-    ),
-    (
-        pendulum(
-            inside='<geom name="ice" size="0.1" condim="1"/>', world='<geom type="plane" size="1 1 1" condim="1"/>'
-        ),
-        "geom 'ice': condim 1",
     ),
     # numbers
     *(
@@ -307,8 +319,8 @@ def test_all_obstacles_in_one_message():
         parse(
             pendulum(
                 'frictionloss="-1" damping="-2"',
-                inside='<geom name="egg" type="ellipsoid" size="1 2 3"/><geom name="can" type="cylinder" size="1 2"/>'
-                '<geom type="cylinder" size="1 2"/>',
+                inside='<geom name="egg" size="1" solref="-1 1"/><geom name="can" size="1" solref="-1 1"/>'
+                '<geom size="1" solref="-1 1"/>',
                 rest='<option wind="1 0 0"/><actuator><position name="servo" joint="hinge" kp="-5"/></actuator>'
                 '<custom><numeric name="k_nn" data="1"/></custom>',
             )
@@ -323,6 +335,13 @@ def test_all_obstacles_in_one_message():
         "actuator 'servo'",
         "geom 'egg', 'can', number 4 of body 'arm'",
     ]
+
+
+def test_many_names_are_counted():
+    geoms = "".join(f'<geom name="g{k}" size="1" solref="-1 1"/>' for k in range(31))
+    with pytest.raises(SceneError, match="geom 'g0', 'g1', .*'g7', and 23 more: solref") as error:
+        parse(pendulum(inside=geoms))
+    assert len(str(error.value)) < 200
 
 
 @pytest.mark.parametrize(

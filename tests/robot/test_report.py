@@ -41,14 +41,15 @@ def test_every_task_names_its_constants(name):
 
 
 def test_command(tmp_path, capsys):
-    good, bad = ASSETS / "ant.xml", ASSETS / "pusher_v5.xml"
+    good, bad = ASSETS / "ant.xml", tmp_path / "bad.xml"
+    bad.write_text(pendulum('damping="-1"'))
     for path, code in ((good, 0), (tmp_path / "nowhere.xml", 1), (bad, 1)):
         capsys.readouterr()
         with pytest.raises(SystemExit) if code else nullcontext() as exit:
             main(["check", str(path)])
         printed = capsys.readouterr().out
         assert (exit.value.code if exit else 0) == code and ("ant: can be simulated" in printed) == (path == good)
-    assert printed.startswith("Cannot be simulated.") and "geom number 18 of body 'object': only spheres" in printed
+    assert printed.startswith("Cannot be simulated.") and "joint 'hinge': damping is -1" in printed
 
 
 @pytest.mark.parametrize(
@@ -62,6 +63,27 @@ def test_command(tmp_path, capsys):
             "faster than substeps of 1/960 s can follow is slowed down: 'hinge'.",
         ),
         (pendulum('axis="0 1 0" damping="1e4"'), "joint 'hinge': semi_implicit needs 20 substeps of 1/60 s"),
+        (
+            pendulum(inside='<geom size="0.1" condim="1"/>', world='<geom type="plane" size="1 1 1" condim="1"/>'),
+            "One coefficient of friction, 1, serves all geoms; the file has 0 to 1.",
+        ),
+        (pendulum(inside='<geom size="0.1" condim="4"/>'), "Torsional and rolling friction, condim 4 and 6, are left"),
+        (
+            pendulum(inside='<geom type="cylinder" size="1 2"/><geom type="ellipsoid" size="1 2 3"/>'),
+            "points of a shape: 8 of each rim of a cylinder, 14 of an ellipsoid's surface.",
+        ),
+        (
+            robot('<body name="base"><geom name="a" size="1"/><body><joint/><geom name="b" size=".1"/></body></body>'),
+            "the geoms 'a' and 'b', would collide in MuJoCo. Geoms of its fixed base are among them.",
+        ),
+        (
+            robot(
+                '<body><joint/><geom name="a" size="1" contype="0" conaffinity="0"/></body>'
+                '<body><joint/><geom name="b" size="1"/></body>',
+                '<contact><pair geom1="b" geom2="a"/></contact>',
+            ),
+            "The robot's parts pass through each other: the geoms 'a' and 'b', would collide in MuJoCo.",
+        ),
         (pendulum(inside='<geom size="0.1"/><geom size="0.05"/>'), "inside others in every pose are left out: 1."),
         (pendulum(inside='<geom size="0.1" solref="0.1 1"/>'), "One solref serves all geoms"),
         (
@@ -87,6 +109,10 @@ def test_approximations_are_told(mjcf, sentence):
 
 def test_a_robot_that_meets_nothing_is_not_approximated():
     assert parse(pendulum('damping="0.1"', world="")).approximations == ()
+
+
+def test_a_robot_without_ground_is_told():
+    assert "contact    0 points, no ground that it may touch" in report(parse(pendulum(world="")))
 
 
 def test_an_undamped_robot_gets_an_integrator():
