@@ -23,6 +23,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim.robot.scene import FACTORS
+from diffsim.tasks import find_task
 from diffsim.training import command, fail
 
 STEPS = 6  # control steps of a segment: so few that errors of its start do not grow
@@ -114,8 +115,10 @@ def describe(args: Args, factors: Tensor) -> str:
 
 
 def main(args: Args) -> Tensor:
-    if args.env not in diffsim.TASKS:
-        fail(f"unknown task {args.env!r}: choose from {', '.join(diffsim.TASKS)}")
+    try:
+        find_task(args.env)
+    except ValueError as error:
+        fail(error)
     env = diffsim.make(args.env, args.segments, horizon=STEPS, contact="mujoco", factors=True)
     if args.recording:
         recording = read(args.recording, env.scene)

@@ -13,6 +13,7 @@ class Ant(Locomotion):
 
     name = "ant"
     asset = "ant.xml"
+    contact = "soft"
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)

@@ -16,6 +16,7 @@ class CartPole(Task):
 
     name = "cartpole"
     asset = "cartpole.xml"
+    contact = "soft"
     substeps = 4
     fast = Integration("implicit", 1)
     accurate = Integration("extrapolated", 4)

@@ -13,6 +13,7 @@ class HalfCheetah(Planar):
 
     name = "half_cheetah"
     asset = "half_cheetah.xml"
+    contact = "soft"
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)

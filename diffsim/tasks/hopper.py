@@ -15,6 +15,7 @@ class Hopper(Planar):
 
     name = "hopper"
     asset = "hopper.xml"
+    contact = "soft"
     substeps = 16
     fast = Integration("semi_implicit", 8)
     accurate = Integration("extrapolated", 32)

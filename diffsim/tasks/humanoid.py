@@ -14,6 +14,7 @@ class Humanoid(Locomotion):
 
     name = "humanoid"
     asset = "humanoid.xml"
+    contact = "soft"
     substeps = 48
     fast = Integration("implicit", 24)
     accurate = Integration("extrapolated", 96)

@@ -17,6 +17,7 @@ class HumanoidMTU(Locomotion):
 
     name = "humanoid_mtu"
     asset = "humanoid_mtu.xml"
+    contact = "soft"
     substeps = 48
     fast = Integration("implicit", 24)
     accurate = Integration("extrapolated", 96)

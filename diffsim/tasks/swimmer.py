@@ -15,6 +15,7 @@ class Swimmer(Planar):
 
     name = "swimmer"
     asset = "swimmer.xml"
+    contact = "soft"
     substeps = 10
     obs_dim = 8
     num_random = 10

@@ -15,6 +15,7 @@ class Walker(Planar):
 
     name = "walker"
     asset = "walker.xml"
+    contact = "soft"
     substeps = 16
     obs_dim = 17
     num_random = 18
