@@ -21,7 +21,7 @@ from tables import ROOT, Row
 
 from diffsim import DiffEnv
 from diffsim.sim.options import check_device
-from diffsim.tasks import find_task
+from diffsim.tasks import TaskError, find_task
 from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
 from diffsim.training.ranges import check_ranges
@@ -150,7 +150,7 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
     saved = load_policy(path)
     try:
         find_task(saved.args["env"])
-    except ValueError as error:
+    except TaskError as error:
         fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
     return Case(f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device))

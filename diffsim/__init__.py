@@ -20,8 +20,8 @@ from diffsim.sim.integration import Integration
 from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation, Task, find_task
-from diffsim.tasks.find import robot
 from diffsim.tasks.imitation.clip import Clip, read_clip
+from diffsim.tasks.own import robot
 
 __all__ = [
     "TASKS",

@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None:
     """Film a policy that comes with the package, as .mp4 or .gif; needs no display."""
-    find_task(task)
+    find_task(task)  # an unknown one ends the command
     policy = POLICIES / f"{task}.pt"
     if not policy.is_file():
         there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]

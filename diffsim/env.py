@@ -19,7 +19,7 @@ from diffsim.sim.launcher import check_memory
 from diffsim.sim.options import Options
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
-from diffsim.tasks.fit import fit
+from diffsim.tasks.own import fit
 from diffsim.terrain import Elevation
 from diffsim.view.screen import RENDER_MODES, Frames, RenderMode, Screen
 

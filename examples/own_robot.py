@@ -18,11 +18,12 @@ class WalkForward(Task):
     asset = "own_robot.xml"  # beside this file
     episode_length = 300  # control steps of control_dt = 1/60 s
     spread = 0.1  # of the start, which is the file's keyframe or else its reference pose
+    min_height = -0.3  # m, of obs[0]; below it the episode ends
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         """All but x."""
         return torch.cat((qpos[..., 1:], qvel), dim=-1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Forward speed, a level bar, small actions."""
-        return obs[..., 4] - obs[..., 1].square() - 0.1 * action.square().sum(-1)
+        """Forward speed, a level bar, small actions, and 1 for not falling."""
+        return 1.0 + obs[..., 4] - obs[..., 1].square() - 0.1 * action.square().sum(-1)

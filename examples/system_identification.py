@@ -23,7 +23,6 @@ from torch import Tensor
 
 import diffsim
 from diffsim.robot.scene import FACTORS
-from diffsim.tasks import find_task
 from diffsim.training import command, fail
 
 STEPS = 6  # control steps of a segment: so few that errors of its start do not grow
@@ -115,10 +114,6 @@ def describe(args: Args, factors: Tensor) -> str:
 
 
 def main(args: Args) -> Tensor:
-    try:
-        find_task(args.env)
-    except ValueError as error:
-        fail(error)
     env = diffsim.make(args.env, args.segments, horizon=STEPS, contact="mujoco", factors=True)
     if args.recording:
         recording = read(args.recording, env.scene)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffsim.env import DiffEnv
 from diffsim.planning.dynamics import REAL, Dynamics
-from diffsim.tasks.fit import fit
+from diffsim.tasks.own import fit
 from diffsim.terrain import Elevation, root
 
 

@@ -44,10 +44,7 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
     """
     if isinstance(path, mujoco.MjSpec):
-        try:
-            path = path.compile()
-        except ValueError as error:
-            raise SceneError(f"spec {path.modelname!r} is not valid: {' '.join(str(error).split())}") from error
+        path = path.compile()
     if isinstance(path, mujoco.MjModel):
         return _read(copy.copy(path), Path(path.names.partition(b"\0")[0].decode() or "robot"))
     file = Path(path)

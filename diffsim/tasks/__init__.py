@@ -5,12 +5,12 @@ from __future__ import annotations
 from diffsim.tasks.ant import Ant
 from diffsim.tasks.base import Accuracy, Contact, Task
 from diffsim.tasks.cartpole import CartPole
-from diffsim.tasks.find import is_file, task_of_file
 from diffsim.tasks.half_cheetah import HalfCheetah
 from diffsim.tasks.hopper import Hopper
 from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.humanoid_mtu import HumanoidMTU
 from diffsim.tasks.imitation.task import HumanoidImitation
+from diffsim.tasks.own import FILE, TaskError, task_of_file
 from diffsim.tasks.swimmer import Swimmer
 from diffsim.tasks.walker import Walker
 
@@ -23,18 +23,14 @@ SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid
 
 
 def find_task(name: str | type[Task]) -> type[Task]:
-    """The task of a name in TASKS, of a file, my_task.py or my_task.py:Class, or a class of the user's as it is.
-
-    Raises:
-        ValueError: there is none, see task_of_file.
-    """
+    """The task of a name in TASKS or of a file, my_task.py or my_task.py:Class; a class is one. Raises TaskError."""
     if isinstance(name, type) and issubclass(name, Task):
         return name
     if name in TASKS:
         return TASKS[name]
-    if not is_file(name):
-        raise ValueError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
+    if not FILE.fullmatch(str(name)):
+        raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
     return task_of_file(name)
 
 
-__all__ = ["SHAC_TASKS", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task", "find_task", "is_file"]
+__all__ = ["FILE", "SHAC_TASKS", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task", "TaskError", "find_task"]

@@ -29,11 +29,11 @@ class Task:
     """A task. Subclasses fill in the attributes and the methods `observe` and `reward`.
 
     An episode starts uniformly in start +- spread / 2, where both list qpos, then qvel. Without a start it is at the
-    robot's keyframe "home", its first one, or qpos0. What else may be left out: see tasks/fit.py.
+    robot's keyframe "home", its first one, or qpos0. What else may be left out: see own.fit.
     """
 
     name: ClassVar[str] = "task"
-    asset: ClassVar[Asset]  # of a file's name, find.robot says where it is looked for
+    asset: ClassVar[Asset]  # of a file's name, own.robot says where it is looked for
     contact: ClassVar[Contact] = "mujoco"  # unless the user asks for the other one
     substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy on this contact
     fast: ClassVar[Integration]  # the other two on soft contact, chosen by measurement: docs/accuracy.md

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.base import Task
-from diffsim.tasks.find import robot
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
+from diffsim.tasks.own import robot
 
 FORWARD_VELOCITY = 5  # column of the observation: v_x
 

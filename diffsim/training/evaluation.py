@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -158,13 +159,10 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
 def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
     """A policy on the device of an environment, whose task may have changed since it was trained."""
     network, obs_dim, nu = network.to(env.device), env.task.obs_dim, env.scene.nu
-    try:
-        fits = network(torch.zeros(1, obs_dim, device=env.device)).shape == (1, nu)
-    except RuntimeError:
-        fits = False
-    if not fits:
-        fail(f"the policy is not for task {env.task.name!r} as it is now, with {obs_dim} observations and {nu} actions")
-    return network
+    with suppress(RuntimeError):
+        if network(torch.zeros(1, obs_dim, device=env.device)).shape == (1, nu):
+            return network
+    fail(f"the policy is not for task {env.task.name!r} as it is now, with {obs_dim} observations and {nu} actions")
 
 
 # Environments as the flags say, and --evaluate ------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 import tyro
 
 from diffsim.sim.integration import PASSES
-from diffsim.tasks import Contact, HumanoidImitation, Task, find_task, is_file
+from diffsim.tasks import FILE, Contact, HumanoidImitation, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
@@ -173,10 +173,11 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         fail("--resume and --evaluate exclude each other")
     if path := args.resume or args.evaluate:
         args = _continue(kind, argv, args, path)
-        task = _task(args)
+        task = find_task(args.env)
     else:
-        task, args.device = _task(args), distributed.choose_device(args.device)
-        if flag("contact") not in _words(argv):
+        words = {word.partition("=")[0] for word in argv}
+        task, args.device = find_task(args.env), distributed.choose_device(args.device)
+        if flag("contact") not in words:
             args.contact = task.contact
         defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
         if issubclass(task, HumanoidImitation):
@@ -197,21 +198,10 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     return args
 
 
-def _words(argv: Sequence[str]) -> set[str]:
-    return {word.partition("=")[0] for word in argv}
-
-
-def _task(args: Flags) -> type[Task]:
-    try:
-        return find_task(args.env)
-    except ValueError as error:
-        fail(error)
-
-
 def _presets(args: Flags) -> dict[str, Any]:
     """What --accuracy and --contact stand for."""
     try:
-        return _task(args).integration(args.accuracy, args.contact)._asdict()
+        return find_task(args.env).integration(args.accuracy, args.contact)._asdict()
     except ValueError as error:
         fail(error)
 
@@ -229,9 +219,10 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     defaults = kind(**saved["args"])
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained
-    if {"--env", "--env-id"} & _words(argv) and is_file(given.env) and is_file(defaults.env):
+    if FILE.fullmatch(given.env) and FILE.fullmatch(defaults.env):
         defaults.env = given.env  # the same file, seen from another directory
-    if chosen := {name: getattr(given, name) for name in ("accuracy", "contact") if flag(name) in _words(argv)}:
+    words = {word.partition("=")[0] for word in argv}
+    if chosen := {name: getattr(given, name) for name in ("accuracy", "contact") if flag(name) in words}:
         # A preset replaces the saved numbers.
         defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
     args = _cli(kind, argv, defaults)

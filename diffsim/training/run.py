@@ -288,7 +288,7 @@ class Run:
         skipped = scalars.get("grad/skipped", 0.0)
         if skipped > self._skipped and time.monotonic() >= self._report:
             self._skipped, self._report = skipped, time.monotonic() + REPORT_EVERY
-            self.message(f"iteration {entry.iteration}: {skipped:.0f} updates skipped so far, of gradients not finite")
+            self.message(f"iteration {entry.iteration}: updates skipped so far as not finite: {skipped:.0f}")
         if self._log is not None:
             with self._writing():
                 self._log.write(entry.iteration, self.control_steps, self.seconds, scalars)

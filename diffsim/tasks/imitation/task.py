@@ -10,10 +10,10 @@ from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.base import Task
-from diffsim.tasks.find import robot
 from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.tasks.imitation.kinematics import Kinematics, difference, matrix
+from diffsim.tasks.own import robot
 
 END_EFFECTORS = ("right_hand", "left_hand", "right_foot_inner", "left_foot_inner")  # the middle of each geom
 STRAY = 0.5  # m; the episode ends when the root is further from the reference's
