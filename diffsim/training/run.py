@@ -288,7 +288,8 @@ class Run:
         skipped = scalars.get("grad/skipped", 0.0)
         if skipped > self._skipped and time.monotonic() >= self._report:
             self._skipped, self._report = skipped, time.monotonic() + REPORT_EVERY
-            self.message(f"iteration {entry.iteration}: updates skipped so far as not finite: {skipped:.0f}")
+            why = "updates skipped so far, their gradients too large or not finite"
+            self.message(f"iteration {entry.iteration}: {why}: {skipped:.0f}")
         if self._log is not None:
             with self._writing():
                 self._log.write(entry.iteration, self.control_steps, self.seconds, scalars)
