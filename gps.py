@@ -32,9 +32,9 @@ from diffsim.planning.restarts import best_of_random_starts, receding_horizon, s
 from diffsim.planning.samples import Samples, SampleSet, log_weights, phi
 from diffsim.planning.system import System
 from diffsim.planning.terrains import named_terrains, random_terrain
-from diffsim.tasks import TASKS
+from diffsim.tasks import find_task
 from diffsim.training import command, distributed, evaluate_checkpoint, fail
-from diffsim.training.evaluation import SEED, Evaluation, travels
+from diffsim.training.evaluation import SEED, Evaluation
 from diffsim.training.flags import Flags, parse
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive, Repeats
@@ -139,7 +139,7 @@ class Args(Flags):
         super().check()
         if distributed.size() > 1:
             fail("trains in one process; start it without torchrun")
-        if TASKS[self.env].timed:
+        if find_task(self.env).timed:
             fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
         if self.env == "cartpole" and self.reward == "target":
             fail("--reward target needs a robot that walks or swims; cartpole has --reward native")
@@ -529,13 +529,16 @@ def evaluate(search: Search) -> Evaluation:
     (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
     fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & search.args.early_termination).int()
     alive = fallen.cumsum(1) - fallen == 0
-    returns, lengths, x = (S.native * alive).sum(1), alive.sum(1), S.x[..., 0]
-    distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
-    speed = (distance / (lengths * system.control_dt)).mean().item() if travels(system.scene) else None
+    returns, lengths, forward, speed = (S.native * alive).sum(1), alive.sum(1), system.task.forward, None
+    if forward is not None:
+        x = S.x[..., forward]
+        distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
+        speed = (distance / (lengths * system.control_dt)).mean().item()
     qpos, action = system.in_world(rollouts.x)[1:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
     others = dict(without_noise=without_noise, plan=search.plan_return, guides=search.guide_return[0])
     others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
-    return Evaluation(returns, lengths, speed, qpos, action, system.copies(count, 1), system.control_dt, others)
+    motion = qpos, action, system.copies(count, 1), system.control_dt
+    return Evaluation(returns, lengths, speed, *motion, others, forward)
 
 
 def train(args: Args, learner: type[Search] = Search) -> None:

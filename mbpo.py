@@ -25,7 +25,7 @@ from torch.func import functional_call
 
 from diffsim import DiffEnv
 from diffsim.planning import Dynamics
-from diffsim.tasks import TASKS
+from diffsim.tasks import find_task
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags, parse
@@ -130,7 +130,7 @@ class Args(ParallelFlags):
             fail(f"--rollout-lengths {self.rollout_lengths[0]} {self.rollout_lengths[1]} are the wrong way round")
         if self.buffer_size < (rows := self.num_envs * (1 + self.sample_enhance)):
             fail(f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a control step")
-        if self.sample_enhance and TASKS[self.env].timed:
+        if self.sample_enhance and find_task(self.env).timed:
             fail(f"--sample-enhance takes Jacobians of states that do not hold the time, on which {self.env} depends")
         if self.sample_enhance and self.randomise:
             fail("--sample-enhance takes Jacobians of one robot: leave out --randomise")

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.planning import REAL, AfterStep, Cost, Dynamics, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
-from diffsim.tasks import TASKS, Task
+from diffsim.tasks import Task, find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, distributed, evaluate, evaluate_checkpoint, fail
 from diffsim.training.flags import Flags, parse
 from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
@@ -88,7 +88,7 @@ class Args(Flags):
 
     def check(self) -> None:
         super().check()
-        task = TASKS[self.env]
+        task = find_task(self.env)
         if distributed.size() > 1:
             fail("one process alone: sequences are not shared among ranks")
         if task.timed:

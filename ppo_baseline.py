@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.tasks import TASKS, Task
+from diffsim.tasks import Task, find_task
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
 from diffsim.training.flags import ParallelFlags, parse
 from diffsim.training.layers import ObsNormalizer, moments
@@ -105,7 +105,7 @@ class Args(ParallelFlags):
         least, largest = self.lr_bounds
         if least > largest:
             fail(f"--lr-bounds {least} {largest} are the wrong way round")
-        if self.symmetric and TASKS[self.env].mirror is Task.mirror:
+        if self.symmetric and find_task(self.env).mirror is Task.mirror:
             fail(f"--symmetric: task {self.env!r} has no mirror image")
 
 

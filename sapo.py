@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
-from diffsim.tasks import TASKS, Task
+from diffsim.tasks import TASKS, Task, find_task
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import ParallelFlags, parse
@@ -141,7 +141,7 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        if self.symmetric and TASKS[self.env].mirror is Task.mirror:
+        if self.symmetric and find_task(self.env).mirror is Task.mirror:
             fail(f"--symmetric: task {self.env!r} has no mirror image")
         if (self.num_envs // distributed.size()) % self.population:
             fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")

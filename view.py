@@ -27,6 +27,7 @@ import tyro
 from numpy.typing import NDArray
 
 from diffsim import DiffEnv
+from diffsim.tasks import find_task
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED
 from diffsim.view import render, web
@@ -51,6 +52,8 @@ class Args:
     """how much of an episode video and page show"""
     episodes: int = 8
     """of as many episodes they show the one of median return"""
+    env: str | None = None
+    """file of the task, if it is your own and not where it was in training"""
     seed: int = SEED
     """of the start states"""
     substeps: int | None = None
@@ -99,8 +102,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def show(args: Args) -> None:
     path = args.paths[0]
     saved = load_policy(path / "checkpoint.pt" if path.is_dir() else path)
-    changes: dict[str, Any] = {} if args.substeps is None else {"substeps": args.substeps}
-    task, name = saved.args["env"], f"{saved.script}.py, iteration {saved.iteration}"
+    changes: dict[str, Any] = {name: x for name in ("env", "substeps") if (x := getattr(args, name)) is not None}
+    task, name = find_task(args.env or saved.args["env"]).name, f"{saved.script}.py, iteration {saved.iteration}"
     if args.viewer:
         print(f"{task}, {name}", (__doc__ or "").rstrip().rpartition("\n\n")[2], sep="\n")
         play(make_policy_env(saved, 1, forces=True, **changes), saved.network, args.seed)

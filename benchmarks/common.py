@@ -19,9 +19,9 @@ import torch
 import tyro
 from tables import ROOT, Row
 
-import diffsim
 from diffsim import DiffEnv
 from diffsim.sim.options import check_device
+from diffsim.tasks import TaskError, find_task
 from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
 from diffsim.training.ranges import check_ranges
@@ -148,9 +148,10 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
     """The policy of a checkpoint or of a run's; one of another task than ours ends the benchmark with one line."""
     path = checkpoint_of(path)
     saved = load_policy(path)
-    name = saved.args["env"]
-    if name not in diffsim.TASKS:
-        fail(f"{path} was trained on {name!r}, which is no task; choose from {', '.join(diffsim.TASKS)}")
+    try:
+        find_task(saved.args["env"])
+    except TaskError as error:
+        fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
     return Case(f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device))
 

@@ -255,7 +255,7 @@ def panels(rows: list[dict[str, str]]) -> list[Panel]:
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each learner on a task: each seed's smallest pushes, and the change of speed that they would cause."""
-    tasks, groups = [*diffsim.TASKS], dict[tuple[str, ...], list[dict[str, str]]]()
+    tasks, groups = [*diffsim.TASKS, *(row["task"] for row in rows)], dict[tuple[str, ...], list[dict[str, str]]]()
     for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"])):
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
     each = ({name: ", ".join(seed.get(name, "") for seed in seeds) for name in EACH} for seeds in groups.values())

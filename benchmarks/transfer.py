@@ -43,7 +43,7 @@ from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Task
 from diffsim.training import Count, Positive, fail
 from diffsim.training.checkpoint import HOME
-from diffsim.training.evaluation import FINER, SEED, travels
+from diffsim.training.evaluation import FINER, SEED
 from diffsim.view import gait, render
 
 Array = NDArray[np.float64]
@@ -214,10 +214,10 @@ def act(
     return Motion(positions, rates, returns, lengths, fallen)
 
 
-def speed(motion: Motion, control_dt: float) -> float:
+def speed(motion: Motion, control_dt: float, forward: int = 0) -> float:
     """Mean forward speed over all control steps of all episodes, m/s."""
-    ends = np.take_along_axis(motion.qpos[..., 0], motion.lengths[None], 0)[0]
-    return float((ends - motion.qpos[0, :, 0]).sum() / (control_dt * motion.lengths.sum()))
+    x = motion.qpos[..., forward]
+    return float((np.take_along_axis(x, motion.lengths[None], 0)[0] - x[0]).sum() / (control_dt * motion.lengths.sum()))
 
 
 def feet(scene: Scene) -> list[Flags]:
@@ -226,11 +226,11 @@ def feet(scene: Scene) -> list[Flags]:
     return [body == k for k in np.unique(body) if k not in parents and parents[k]]
 
 
-def measure(motion: Motion, scene: Scene, control_dt: float) -> dict[str, object]:
+def measure(motion: Motion, scene: Scene, control_dt: float, forward: int | None = 0) -> dict[str, object]:
     """The csv's columns of one motion; empty ones where there is no ground, or no foot on it."""
     row: dict[str, object] = {
         "return": float(np.median(motion.returns)),
-        "speed": speed(motion, control_dt) if travels(scene) else "",
+        "speed": "" if forward is None else speed(motion, control_dt, forward),
         "whole": float((~motion.fallen).mean()),
     }
     deepest = np.zeros(0)
@@ -265,7 +265,7 @@ def compare(case: Case, args: Args) -> dict[str, Motion]:
     task, motions, own = type(env.task)(dtype=torch.float64), dict[str, Motion](), math.nan
     for name, world in conditions(case, args).items():
         motion = motions[name] = act(world, task, case.saved.network, qpos, qvel, env.scene.nu, args.steps)
-        found = measure(motion, env.scene, env.control_dt)
+        found = measure(motion, env.scene, env.control_dt, env.task.forward)
         if isinstance(value := found["speed"], float):
             own = value if len(motions) == 1 else own
             found["kept"] = value / own
@@ -293,7 +293,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     Runs that are not named {learner}/{task}__{seed} have a line each.
     """
     groups = dict[tuple[str, ...], dict[str, list[dict[str, str]]]]()
-    tasks = [*diffsim.TASKS]
+    tasks = [*diffsim.TASKS, *(row["task"] for row in rows)]
     for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft")):
         folder, _, run = row["checkpoint"].rpartition("/")
         learner = folder if run == f"{row['task']}__{row['seed']}" else row["checkpoint"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,9 @@ from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
-from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation
+from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation, Task, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
+from diffsim.tasks.own import robot
 
 __all__ = [
     "TASKS",
@@ -40,7 +40,7 @@ __all__ = [
 
 
 def make(
-    name: str,
+    name: str | type[Task],
     num_envs: int = 64,
     device: str | torch.device = "cpu",
     seed: int | None = None,
@@ -51,7 +51,7 @@ def make(
     passes: int | None = None,
     touchdown: bool | None = None,
     accuracy: Accuracy = "default",
-    contact: Contact = "soft",
+    contact: Contact | None = None,
     penalty: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float32,
     clip: Clip | Path | str | None = None,
@@ -61,7 +61,7 @@ def make(
     """Build the tensor environment of a task.
 
     Args:
-        name: one of diffsim.TASKS.
+        name: one of diffsim.TASKS, a file with a task of your own, "my_task.py" or "my_task.py:Class", or its class.
         num_envs, device, dtype: how many environments, where, and in which precision.
         seed, horizon: see DiffEnv.
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
@@ -69,6 +69,7 @@ def make(
         substeps, integrator, theta, passes, touchdown: each in place of the preset's, if given.
         contact: "soft" (the paper's springs) or "mujoco" (MuJoCo's own constraints, see Integration): the laws of
             contact and limits and how they are integrated; docs/transfer.md has what policies keep of their speed.
+            Default the task's: soft for those of diffsim.TASKS, mujoco for others.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
             of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
@@ -80,18 +81,16 @@ def make(
     Raises:
         ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; choose from {', '.join(TASKS)}")
     device, dtype = check_device(device), check_dtype(dtype)
+    kind = find_task(name)
     startup.check_kernel_cache()
-    kind = TASKS[name]
     if clip is None:
         task = kind(device, dtype)
     elif issubclass(kind, HumanoidImitation):
         task = kind(device, dtype, clip if isinstance(clip, Clip) else read_clip(clip))
     else:
-        raise ValueError(f"task {name!r} tracks no clip; {HumanoidImitation.name} does")
-    scene = load_scene(str(files("diffsim") / "assets" / task.asset))
+        raise ValueError(f"task {kind.name!r} tracks no clip; {HumanoidImitation.name} does")
+    scene = load_scene(robot(task))
     integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes, touchdown)
     if penalty and integration.integrator == "mujoco":
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")

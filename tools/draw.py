@@ -20,7 +20,6 @@ from tyro.conf import Positional
 
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
 from diffsim.training import Evaluation, command, evaluate, fail, load_policy, make_policy_env
-from diffsim.training.evaluation import travels
 from diffsim.view.render import Frame, Renderer, save_video
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
@@ -62,7 +61,7 @@ def loops(
             frames = [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in drawn]
         fps = 1 / (every * episodes.control_dt)
         first, last = 0, round(3.5 * fps)
-        if travels(episodes.scene):
+        if episodes.forward is not None:
             first, last = find_loop(frames, round(start * fps), *(round(length * fps) for length in seconds))
         path = save_video(FIGURES / f"{task}.gif", frames[first:last], fps)
         print(f"{path}, {(last - first) / fps:.2f} s, {path.stat().st_size / 1000:.0f} kB")

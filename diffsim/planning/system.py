@@ -11,6 +11,7 @@ from torch import Tensor
 
 from diffsim.env import DiffEnv
 from diffsim.planning.dynamics import REAL, Dynamics
+from diffsim.tasks.own import fit
 from diffsim.terrain import Elevation, root
 
 
@@ -34,6 +35,7 @@ class System(Dynamics):
         self._elevations: dict[int, Elevation] = {}
         super().__init__(scene, env.sim.integration, env.control_dt, device=env.device, threads=threads)
         self.task = type(env.task)(self.device, REAL)
+        fit(self.task, scene)
         self._no_action = torch.zeros(self.nu, dtype=REAL, device=self.device)
         start = self.start()
         still, moved = (self._observe(start, action.unsqueeze(0)) for action in (self._no_action, self._no_action + 1))

@@ -11,6 +11,7 @@ from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.humanoid_mtu import HumanoidMTU
 from diffsim.tasks.imitation.task import HumanoidImitation
 from diffsim.tasks.joystick import G1, Go1, Go2
+from diffsim.tasks.own import FILE, TaskError, task_of_file
 from diffsim.tasks.swimmer import Swimmer
 from diffsim.tasks.walker import Walker
 
@@ -21,4 +22,16 @@ TASKS: dict[str, type[Task]] = {
 # Those of the SHAC paper, which have presets of every accuracy
 SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
 
-__all__ = ["SHAC_TASKS", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task"]
+
+def find_task(name: str | type[Task]) -> type[Task]:
+    """The task of a name in TASKS or of a file, my_task.py or my_task.py:Class; a class is one. Raises TaskError."""
+    if isinstance(name, type) and issubclass(name, Task):
+        return name
+    if name in TASKS:
+        return TASKS[name]
+    if not FILE.fullmatch(str(name)):
+        raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
+    return task_of_file(name)
+
+
+__all__ = ["FILE", "SHAC_TASKS", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task", "TaskError", "find_task"]

@@ -12,7 +12,7 @@ class Ant(Locomotion):
     """8 joints; action: 200 N m per joint."""
 
     name = "ant"
-    asset = "ant.xml"
+    asset, contact = "ant.xml", "soft"
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)

@@ -7,9 +7,12 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, get_args
+import os
+from typing import ClassVar, Literal, TypeAlias, get_args
 
+import mujoco
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from diffsim.sim.integration import Integration
@@ -17,22 +20,27 @@ from diffsim.tasks.mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
 Contact = Literal["soft", "mujoco"]
+Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
+RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
 FIRM_IS_GONE = "firm contact is gone: choose mujoco, MuJoCo's own"
 
 
 class Task:
     """A task. Subclasses fill in the attributes and the methods `observe` and `reward`.
 
-    An episode starts uniformly in start +- spread / 2, where both list qpos, then qvel.
+    An episode starts uniformly in start +- spread / 2, where both list qpos, then qvel. Without a start it is at the
+    robot's keyframe "home", its first one, or qpos0. What else may be left out: see own.fit.
     """
 
-    name: ClassVar[str]
-    asset: ClassVar[str]  # MJCF file in diffsim/assets
-    substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy, semi-implicit Euler
-    fast: ClassVar[Integration]  # the other two, chosen by measurement: docs/accuracy.md
+    name: ClassVar[str] = "task"
+    asset: ClassVar[Asset]  # of a file's name, own.robot says where it is looked for
+    contact: ClassVar[Contact] = "mujoco"  # unless the user asks for the other one
+    substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy on this contact
+    fast: ClassVar[Integration]  # the other two on soft contact, chosen by measurement: docs/accuracy.md
     accurate: ClassVar[Integration]
-    obs_dim: ClassVar[int]
-    num_random: ClassVar[int]  # random numbers per reset
+    obs_dim: int
+    num_random: int  # random numbers per reset
+    forward: int | None  # column of qpos [m] that grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
@@ -40,29 +48,35 @@ class Task:
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: ClassVar[float] = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
-    start: tuple[float, ...]
-    spread: tuple[float, ...]
+    start: tuple[float, ...] = ()
+    spread: tuple[float, ...] | float = 0.0
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         self._start = torch.tensor(self.start, device=device, dtype=dtype)
         self._spread = torch.tensor(self.spread, device=device, dtype=dtype)
+        self._nq, self._quaternions = (len(self.start) + 1) // 2, list[int]()
 
     @classmethod
-    def integration(cls, accuracy: str, contact: str = "soft") -> Integration:
-        """The preset "fast", "default" (the paper's) or "accurate"; with MuJoCo's contact the first two are one.
+    def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
+        """The preset "fast", "default" (the paper's) or "accurate" on a contact, without one the task's.
+
+        With MuJoCo's contact the first two are one.
 
         Raises:
             ValueError: another name, or a preset that the task has not.
         """
+        contact = cls.contact if contact is None else contact
         if contact not in get_args(Contact):
             names = ", ".join(get_args(Contact))
             raise ValueError(FIRM_IS_GONE if contact == "firm" else f"unknown contact {contact!r}; choose from {names}")
         if accuracy not in get_args(Accuracy):
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
+        own = hasattr(cls, "substeps") and contact == cls.contact
+        substeps = cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt))
         if contact == "mujoco":
-            return Integration("mujoco", 16 if accuracy == "accurate" else 4)
+            return Integration("mujoco", substeps * (4 if accuracy == "accurate" else 1))
         if accuracy == "default":
-            return Integration("semi_implicit", cls.substeps)
+            return Integration("semi_implicit", substeps)
         if not hasattr(cls, accuracy):
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
         return getattr(cls, accuracy)
@@ -86,8 +100,10 @@ class Task:
 
         rand = 0.5 everywhere gives the unperturbed start.
         """
-        qpos, qvel = torch.addcmul(self._start, rand - 0.5, self._spread).chunk(2, dim=-1)
-        return qpos, qvel
+        drawn = torch.addcmul(self._start, rand - 0.5, self._spread)
+        for k in self._quaternions:
+            drawn[..., k : k + 4] = F.normalize(drawn[..., k : k + 4], dim=-1)
+        return drawn[..., : self._nq], drawn[..., self._nq :]
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         """Observation (..., obs_dim) of qpos (..., nq) and qvel (..., nv).

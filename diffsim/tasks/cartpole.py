@@ -15,7 +15,7 @@ class CartPole(Task):
     """qpos = (x [m], theta [rad], 0 upright); action: 1000 N on the cart."""
 
     name = "cartpole"
-    asset = "cartpole.xml"
+    asset, contact = "cartpole.xml", "soft"
     substeps = 4
     fast = Integration("implicit", 1)
     accurate = Integration("extrapolated", 4)

@@ -12,7 +12,7 @@ class HalfCheetah(Planar):
     """qpos = (x, height above 1 m, pitch, 6 joints) [m, rad]; action: 200 N m per joint."""
 
     name = "half_cheetah"
-    asset = "half_cheetah.xml"
+    asset, contact = "half_cheetah.xml", "soft"
     substeps = 16
     fast = Integration("implicit", 8)
     accurate = Integration("extrapolated", 16)

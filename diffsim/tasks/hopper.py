@@ -14,7 +14,7 @@ class Hopper(Planar):
     """qpos = (x, height above 1.25 m, pitch, 3 joints) [m, rad]; action: 200 N m per joint."""
 
     name = "hopper"
-    asset = "hopper.xml"
+    asset, contact = "hopper.xml", "soft"
     substeps = 16
     fast = Integration("semi_implicit", 8)
     accurate = Integration("extrapolated", 32)

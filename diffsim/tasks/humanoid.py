@@ -13,7 +13,7 @@ class Humanoid(Locomotion):
     """21 joints; action: 35 to 210 N m per joint."""
 
     name = "humanoid"
-    asset = "humanoid.xml"
+    asset, contact = "humanoid.xml", "soft"
     substeps = 48
     fast = Integration("implicit", 24)
     accurate = Integration("extrapolated", 96)

@@ -16,7 +16,7 @@ class HumanoidMTU(Locomotion):
     """4 ball and 6 hinge joints; action: activation of 0 (at -1) to 1 (at 1) of 152 muscles of 16 to 645 N."""
 
     name = "humanoid_mtu"
-    asset = "humanoid_mtu.xml"
+    asset, contact = "humanoid_mtu.xml", "soft"
     substeps = 48
     fast = Integration("implicit", 24)
     accurate = Integration("extrapolated", 96)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from importlib.resources import files
 from typing import ClassVar
 
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.base import Task
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
+from diffsim.tasks.own import robot
 
 FORWARD_VELOCITY = 5  # column of the observation: v_x
 
@@ -55,7 +55,7 @@ class Locomotion(Task):
     @cached_property
     def mirror(self) -> Mirror:
         """See Task. It is made when first asked for, which a CUDA graph cannot capture, so ask before."""
-        model = load_scene(str(files("diffsim") / "assets" / self.asset)).mj_model
+        model = load_scene(robot(self)).mj_model
         device, dtype = self._start.device, self._start.dtype
         qpos, qvel, action = reflections(model, self.sides, device, dtype)
         root = (1.0, *PSEUDOVECTOR, 1.0, *VECTOR, *PSEUDOVECTOR)  # height to angular velocity

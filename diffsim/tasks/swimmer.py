@@ -14,7 +14,7 @@ class Swimmer(Planar):
     """qpos = (x, y, yaw, 2 joints) [m, rad]; action: 200 N m per joint."""
 
     name = "swimmer"
-    asset = "swimmer.xml"
+    asset, contact = "swimmer.xml", "soft"
     substeps = 10
     obs_dim = 8
     num_random = 10

@@ -14,7 +14,7 @@ class Walker(Planar):
     """qpos = (x, height above 1.4 m, pitch, 6 joints) [m, rad]; action: 150 N m per joint."""
 
     name = "walker"
-    asset = "walker.xml"
+    asset, contact = "walker.xml", "soft"
     substeps = 16
     obs_dim = 17
     num_random = 18

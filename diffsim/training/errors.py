@@ -18,6 +18,7 @@ from diffsim.env import ActionError
 from diffsim.robot.scene import SceneError, TerrainError
 from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError
+from diffsim.tasks.own import TaskError
 from diffsim.training import distributed
 
 P = ParamSpec("P")
@@ -29,7 +30,7 @@ class UsageError(ValueError):
 
 # Errors whose message says all that a user needs.
 EXPECTED = (
-    *(UsageError, SceneError, TerrainError, TooLargeError, KernelCacheError, ActionError),
+    *(UsageError, SceneError, TaskError, TerrainError, TooLargeError, KernelCacheError, ActionError),
     *(FloatingPointError, torch.OutOfMemoryError),
 )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 import diffsim
 from diffsim.env import DiffEnv
@@ -46,6 +47,7 @@ class Evaluation:
         action: (T, n, nu) of each step.
         scene, control_dt: what the episodes are of, to draw them; of several terrains episode i has number i % M.
         others: what else a script measured, by name.
+        forward: the task's way forward, see Task.
     """
 
     returns: Tensor
@@ -56,6 +58,7 @@ class Evaluation:
     scene: Scene
     control_dt: float
     others: dict[str, float] = field(default_factory=dict)
+    forward: int | None = 0
 
     @property
     def length(self) -> float:
@@ -108,7 +111,7 @@ class Evaluation:
         """How the robot moves over the ground, see diffsim.view.gait.describe."""
         from diffsim.view import gait  # no training needs it
 
-        return gait.describe(self.scene, self.control_dt, map(self.episode, range(len(self.returns))))
+        return gait.describe(self.scene, self.control_dt, map(self.episode, range(len(self.returns))), self.forward)
 
     def save_video(self, path: Path, seconds: float = render.VIDEO_SECONDS) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
@@ -129,11 +132,6 @@ def kept(own: float, finer: float) -> float:
     return own / finer if finer < 0 else 1.0
 
 
-def travels(scene: Scene) -> bool:
-    """Whether a ground or a fluid carries the robot, whose first coordinate is then its x."""
-    return bool(scene.features & {"contact", "drag"})
-
-
 @torch.no_grad()
 def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED) -> Evaluation:
     """The first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu)."""
@@ -149,11 +147,22 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
         lengths += alive
         alive &= ~(terminated | truncated)
     path = torch.stack(qpos)
-    speed = None
-    if travels(env.scene):
-        distance = path[..., 0].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, 0]
+    speed, forward = None, env.task.forward
+    if forward is not None:
+        x = path[..., forward]
+        distance = x.gather(0, lengths.unsqueeze(0) - 1)[0] - x[0]
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
-    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt)
+    motion = path, torch.stack(actions), env.scene, env.control_dt
+    return Evaluation(returns, lengths, speed, *motion, forward=forward)
+
+
+def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
+    """A policy on the device of an environment, whose task may have changed since it was trained."""
+    network, obs_dim, nu = network.to(env.device), env.task.obs_dim, env.scene.nu
+    with suppress(RuntimeError):
+        if network(torch.zeros(1, obs_dim, device=env.device)).shape == (1, nu):
+            return network
+    fail(f"the policy is not for task {env.task.name!r} as it is now, with {obs_dim} observations and {nu} actions")
 
 
 # Environments as the flags say, and --evaluate ------------------------------------------------------------------------
@@ -188,7 +197,9 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
     """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
     names = {field.name for field in dataclasses.fields(Flags)} & saved.args.keys()
     args = Flags(**{name: saved.args[name] for name in names} | {"device": "cpu", "threads": 0} | changes)
-    return make_env(args, num_envs, forces=forces)
+    env = make_env(args, num_envs, forces=forces)
+    fitting(saved.network, env)
+    return env
 
 
 def evaluate_checkpoint(
@@ -216,7 +227,7 @@ def evaluate_checkpoint(
             restored = learner(flags, env)
             checkpoint.restore(restored, state)
             return method(restored)
-        return evaluate(env, checkpoint.load_policy(path).network.to(env.device))
+        return evaluate(env, fitting(checkpoint.load_policy(path).network, env))
 
     evaluation, found = measure(args), dict[str, Any]()
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")

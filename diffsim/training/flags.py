@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 import tyro
 
 from diffsim.sim.integration import PASSES
-from diffsim.tasks import TASKS, Contact, HumanoidImitation
+from diffsim.tasks import FILE, Contact, HumanoidImitation, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
@@ -39,7 +39,7 @@ class SimulatorFlags:
     """The task and how it is simulated."""
 
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
-    """task, one of diffsim.TASKS"""
+    """task, one of diffsim.TASKS, or the file of your own: my_task.py or my_task.py:Class (docs/own_robot.md)"""
     accuracy: Literal["fast", "default", "accurate"] = "default"
     """preset of integrator, substeps and theta (docs/accuracy.md); default is the paper's"""
     integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
@@ -53,7 +53,7 @@ class SimulatorFlags:
     touchdown: bool = True
     """with --integrator mujoco, gradients count that a contact begins with a jump (docs/physics.md)"""
     contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
-    """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md)"""
+    """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
     penalty: tuple[str, ...] = ()
     """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
     early_termination: bool = True
@@ -115,7 +115,7 @@ class Flags(SimulatorFlags, RunFlags):
 
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
-        if self.clip and not issubclass(TASKS[self.env], HumanoidImitation):
+        if self.clip and not issubclass(find_task(self.env), HumanoidImitation):
             fail(f"--clip is of {HumanoidImitation.name}: {self.env} tracks no motion")
 
     @classmethod
@@ -171,14 +171,16 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     args = _cli(kind, [word for word in argv if word not in ("-h", "--help")], kind())
     if args.resume and args.evaluate:
         fail("--resume and --evaluate exclude each other")
-    if args.env not in TASKS:
-        fail(f"unknown task {args.env!r}: choose from {', '.join(TASKS)}")
     if path := args.resume or args.evaluate:
         args = _continue(kind, argv, args, path)
+        task = find_task(args.env)
     else:
-        args.device = distributed.choose_device(args.device)
-        defaults = dataclasses.replace(kind(), **(_presets(args) | args.task_defaults()))
-        if issubclass(task := TASKS[args.env], HumanoidImitation):
+        words = {word.partition("=")[0] for word in argv}
+        task, args.device = find_task(args.env), distributed.choose_device(args.device)
+        if flag("contact") not in words:
+            args.contact = task.contact
+        defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
+        if issubclass(task, HumanoidImitation):
             defaults.clip = read_clip(task.default_clip)
         args = _cli(kind, argv, defaults)
         args.device = distributed.choose_device(args.device)
@@ -191,7 +193,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         except RuntimeError as error:
             fail(f"--capture-video: {error}")
     if args.run_dir is None:
-        name = f"{args.env}__{args.script()}__{args.seed}__{int(time.time())}"
+        name = f"{task.name}__{args.script()}__{args.seed}__{int(time.time())}"
         args.run_dir = path.parent if path else Path("runs") / name
     return args
 
@@ -199,7 +201,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 def _presets(args: Flags) -> dict[str, Any]:
     """What --accuracy and --contact stand for."""
     try:
-        return TASKS[args.env].integration(args.accuracy, args.contact)._asdict()
+        return find_task(args.env).integration(args.accuracy, args.contact)._asdict()
     except ValueError as error:
         fail(error)
 
@@ -217,6 +219,8 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     defaults = kind(**saved["args"])
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained
+    if FILE.fullmatch(given.env) and FILE.fullmatch(defaults.env):
+        defaults.env = given.env  # the same file, seen from another directory
     words = {word.partition("=")[0] for word in argv}
     if chosen := {name: getattr(given, name) for name in ("accuracy", "contact") if flag(name) in words}:
         # A preset replaces the saved numbers.

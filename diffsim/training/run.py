@@ -32,6 +32,7 @@ L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
+REPORT_EVERY = 10.0  # s between lines about skipped updates
 RANK_SEED = 1_000_003  # between the seeds of two ranks
 
 
@@ -127,6 +128,7 @@ class Run:
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
         self._stopping = False
+        self._skipped, self._report = 0.0, 0.0  # updates said to be skipped, when the next line may come [s]
 
     # Setting up ------------------------------------------------------------------------------------------------------
 
@@ -283,6 +285,11 @@ class Run:
         self._scalars = scalars
         if entry.evaluation is not None:
             self.message(f"iteration {entry.iteration}: {entry.evaluation}")
+        skipped = scalars.get("grad/skipped", 0.0)
+        if skipped > self._skipped and time.monotonic() >= self._report:
+            self._skipped, self._report = skipped, time.monotonic() + REPORT_EVERY
+            why = "updates skipped so far, their gradients too large or not finite"
+            self.message(f"iteration {entry.iteration}: {why}: {skipped:.0f}")
         if self._log is not None:
             with self._writing():
                 self._log.write(entry.iteration, self.control_steps, self.seconds, scalars)

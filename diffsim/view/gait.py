@@ -55,7 +55,7 @@ class Gait:
 
     feet: tuple[Foot, ...]  # in the order of the MJCF; the first is the one that phases refer to
     trunk: float  # share of the frames in which the trunk, the body without a parent, touches the ground
-    speed: float  # mean forward speed, m/s
+    speed: float | None  # mean forward speed, m/s; None of a task that knows no way forward
     # Sum over motors and muscles of |force times mean rate over a control step|, which pays for positive and negative
     # work alike, over m g v. None if the robot does not move forward, weighs nothing, or has Hill-type muscles.
     cost_of_transport: float | None
@@ -101,8 +101,12 @@ class Gait:
         return f"{self.verdict}; {duty}{cost}peak joint speed {self.peak_joint_speed:.1f} rad/s, {depth}"
 
 
-def describe(scene: Scene, control_dt: float, episodes: Iterable[tuple[Rows, Rows]]) -> Gait | None:
+def describe(
+    scene: Scene, control_dt: float, episodes: Iterable[tuple[Rows, Rows]], forward: int | None = 0
+) -> Gait | None:
     """The gait of the first EPISODES episodes, each qpos (F, nq) and action (F, nu) of control steps of control_dt [s].
+
+    Column `forward` of qpos grows as the robot moves forward.
 
     None without contact with a plane, or if no episode lasts over a second.
     """
@@ -114,7 +118,7 @@ def describe(scene: Scene, control_dt: float, episodes: Iterable[tuple[Rows, Row
     traces, distance, work = [trace(scene, qpos) for qpos, _ in settled], 0.0, 0.0
     for (qpos, action), found in zip(settled, traces, strict=True):
         force = scene.gear * action[:-1].clip(-1.0, 1.0) + scene.motor_bias
-        distance += float(qpos[-1, 0] - qpos[0, 0])
+        distance += 0.0 if forward is None else float(qpos[-1, forward] - qpos[0, forward])
         work += float(np.abs(force * np.diff(found.path, axis=0)).sum())  # J
     depth = np.concatenate([found.depth for found in traces])
     limbs = _limbs(scene, depth > 0)
@@ -126,7 +130,7 @@ def describe(scene: Scene, control_dt: float, episodes: Iterable[tuple[Rows, Row
     return Gait(
         feet=_feet([*limbs], [feet > 0 for feet in stance], control_dt),
         trunk=float((depth[:, trunk] > 0).any(1).mean()),
-        speed=distance / (control_dt * sum(len(qpos) - 1 for qpos, _ in settled)),
+        speed=None if forward is None else distance / (control_dt * sum(len(qpos) - 1 for qpos, _ in settled)),
         cost_of_transport=work / (weight * distance) if priced else None,
         peak_joint_speed=max(found.turned.max(initial=0.0) for found in traces) / control_dt,
         max_penetration=max(float(depth.max()), 0.0),

@@ -177,7 +177,7 @@ def test_the_table_joins_seeds() -> None:
         ("", "of what? give a checkpoint"),
         ("none.pt", "no such checkpoint: "),
         ("humanoid_mtu.pt", "humanoid_mtu, whose muscles are not simulated in MuJoCo here"),
-        ("other.pt", "was trained on 'juggler', which is no task; choose from cartpole, hopper"),
+        ("other.pt", "was trained elsewhere: unknown task 'juggler': choose from cartpole, hopper"),
     ],
 )
 def test_what_cannot_be_compared(name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -246,9 +246,9 @@ def test_a_preset_that_a_task_lacks_is_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Bare(Task):
-        name, substeps = "bare", 8
+        name, substeps, contact = "bare", 8, "soft"
 
-    monkeypatch.setitem(flags.TASKS, "bare", Bare)
+    monkeypatch.setitem(diffsim.TASKS, "bare", Bare)
     assert parse(shac.Args, ["--env", "bare"]).substeps == 8
     line = refusal(lambda: parse(shac.Args, ["--env", "bare", "--accuracy", "fast"]), capsys)
     assert "'bare' has no preset 'fast'" in line

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -256,6 +257,30 @@ def test_progress_and_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str
     run(bptt, tmp_path / "quiet", *arguments, "--quiet")
     out = capsys.readouterr().out
     assert out.startswith("cartpole: 3 iterations, ") and "it/s" not in out
+
+
+def test_skipped_updates_are_told_while_it_trains(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first at once, later ones after a while; none that did not happen."""
+
+    class Broken(ClippedAdam):
+        def descend(self, gradient: Tensor) -> Tensor:
+            return super().descend(gradient * math.nan)
+
+    def lines(name: str) -> list[str]:
+        run(bptt, tmp_path / name, *TINY, "--iterations", 3)
+        return re.findall(
+            r"iteration (\d: updates skipped so far, their gradients too large or not finite: \d)",
+            capsys.readouterr().out,
+        )
+
+    assert lines("sound") == []
+    monkeypatch.setattr(bptt, "ClippedAdam", Broken)
+    words = "updates skipped so far, their gradients too large or not finite"
+    assert lines("first") == [f"1: {words}: 1"]
+    monkeypatch.setattr("diffsim.training.run.REPORT_EVERY", 0.0)
+    assert lines("each") == [f"{k}: {words}: {k}" for k in (1, 2, 3)]
 
 
 def test_track(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from importlib.resources import files
 from typing import ClassVar
 
 import torch
@@ -14,6 +13,7 @@ from diffsim.tasks.base import Task
 from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.tasks.imitation.kinematics import Kinematics, difference, matrix
+from diffsim.tasks.own import robot
 
 END_EFFECTORS = ("right_hand", "left_hand", "right_foot_inner", "left_foot_inner")  # the middle of each geom
 STRAY = 0.5  # m; the episode ends when the root is further from the reference's
@@ -30,7 +30,7 @@ class HumanoidImitation(Task):
     """
 
     name = "humanoid_imitation"
-    asset = Humanoid.asset
+    asset, contact = Humanoid.asset, Humanoid.contact
     substeps, fast, accurate = Humanoid.substeps, Humanoid.fast, Humanoid.accurate
     obs_dim = 57
     num_random = 1
@@ -42,7 +42,7 @@ class HumanoidImitation(Task):
         self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
     ) -> None:
         super().__init__(device, dtype)
-        scene = load_scene(str(files("diffsim") / "assets" / self.asset))
+        scene = load_scene(robot(self))
         model, trunk = scene.mj_model, scene.contact_link == 0
         self.clip = read_clip(self.default_clip) if clip is None else clip
         self.clip.check(model)

@@ -1,0 +1,337 @@
+"""A user's own task: where it comes from, what it may leave out, and the one line that says what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scenes import parse as scene_of
+from torch import Tensor
+
+import diffsim
+from diffsim.tasks import TASKS, Task, TaskError, find_task
+from diffsim.tasks.own import fit, forward, robot
+from diffsim.training import evaluate
+from diffsim.training.evaluation import fitting
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_robot.xml"
+TASK = """
+from diffsim.tasks import Task
+
+class {name}(Task):
+    asset = "own_robot.xml"
+
+    def observe(self, qpos, qvel, action):
+        return qpos
+
+    def reward(self, obs, action):
+        return obs[..., 0]
+"""
+
+
+class Bare(Task):
+    """All that a task must say, but for its robot."""
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        return torch.cat((qpos, qvel), -1)
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        return obs[..., 0]
+
+
+def write(path: Path, *names: str, more: str = "") -> str:
+    path.write_text("".join(TASK.format(name=name) for name in names) + more)
+    return str(path)
+
+
+def line_of(error: pytest.ExceptionInfo[ValueError]) -> str:
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+# Where a task comes from ----------------------------------------------------------------------------------------------
+
+
+def test_a_file_with_one_task_or_with_several(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = (
+        write(tmp_path / "one.py", "Only"),
+        write(tmp_path / "two.py", "First", "Second", more='    name = "2nd"'),
+    )
+    only = find_task(one)
+    assert (only.__name__, only.name, Task.name) == ("Only", "one", "task")  # the file's name, and the base unchanged
+    assert find_task(f"{one}:Only") is only and find_task(only) is only and find_task("ant") is TASKS["ant"]
+    assert [find_task(f"{two}:{name}").name for name in ("First", "Second")] == ["two", "2nd"]
+    monkeypatch.chdir(tmp_path)
+    assert find_task("one.py") is only
+    (tmp_path / "helper.py").write_text("WEIGHT = 3.0\n")
+    assert (
+        find_task(write(tmp_path / "three.py", "Third", more="    import helper\n    name = str(helper.WEIGHT)")).name
+        == "3.0"
+    )
+
+
+def test_a_file_that_changes_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    before = find_task(write(path, "Old"))
+    write(path, "New", more="    episode_length = 7\n")
+    assert before.__name__ == "Old" and find_task(str(path)).episode_length == 7
+
+
+@pytest.mark.parametrize(
+    "content, name, message",
+    [
+        (None, "none.py", "no such file: none.py in {cwd}; give its path, in scripts --env path/to/none.py"),
+        ("x = 1\n", "task.py", "task.py defines no task, a class that extends diffsim.tasks.Task"),
+        ("from diffsim.tasks.hopper import Hopper\n", "task.py", "task.py defines no task"),
+        (TASK.format(name="A"), "task.py:B", "task.py has no task B: choose from task.py:A"),
+        (TASK.format(name="A") + TASK.format(name="B"), "task.py",
+         "task.py has several tasks: choose from task.py:A, task.py:B"),
+        ("\n\nx = 1 / 0\n", "task.py", "task.py, line 3: ZeroDivisionError: division by zero"),
+        ("import json\njson.loads('{')\n", "task.py", "task.py, line 2: JSONDecodeError: Expecting property name"),
+        ("x = 1\ndef f(:\n", "task.py", "task.py, line 2: SyntaxError: invalid syntax"),
+        ("import sys\nsys.exit(3)\n", "task.py", "task.py, line 2: SystemExit: 3"),
+        ("import nowhere\n", "task.py:Any", "task.py, line 1: ModuleNotFoundError: No module named 'nowhere'"),
+        (None, "anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant"),
+        (None, "anty", "humanoid_imitation, or give a file such as my_task.py"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_file(
+    content: str | None, name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if content is not None:
+        (tmp_path / "task.py").write_text(content)
+    for call in (lambda: find_task(name), lambda: diffsim.make(name)):
+        with pytest.raises(TaskError) as error:
+            call()
+        assert message.format(cwd=tmp_path) in line_of(error)
+
+
+# Its robot ------------------------------------------------------------------------------------------------------------
+
+SLED = """
+<mujoco model="sled">
+  <option> <flag gravity="disable"/> </option>
+  <worldbody> <body> <joint type="slide"/> <geom size=".1"/> </body> </worldbody>
+</mujoco>"""
+
+
+def test_where_the_file_of_a_robot_is_sought(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the class that names it, in the working directory, in diffsim/assets; diffsim's own only there."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir(), here.mkdir()
+    monkeypatch.chdir(here)
+    task = find_task(write(there / "task.py", "Mine"))()
+    with pytest.raises(TaskError) as error:
+        robot(task)
+    assert line_of(error) == f"task 'task': no robot file 'own_robot.xml' in {there} or {here}"
+    for folder in (here, there):
+        (folder / "own_robot.xml").write_text(SLED)
+        assert robot(task) == folder / "own_robot.xml"
+    for folder in (here, there):
+        (folder / "hopper.xml").write_text(SLED)
+    hopper = Path(diffsim.__file__).parent / "assets" / "hopper.xml"
+    assert robot(TASKS["hopper"]()) == hopper
+    stand = "from diffsim.tasks.hopper import Hopper\nclass Stand(Hopper): pass\n"
+    (there / "stand.py").write_text(stand)
+    assert robot(find_task(str(there / "stand.py"))()) == hopper
+    (there / "stand.py").write_text(stand + "class Sled(Stand):\n    asset = 'hopper.xml'\n")
+    assert robot(find_task(str(there / "stand.py:Sled"))()) == there / "hopper.xml"
+    with pytest.raises(TaskError, match="task 'task' names no robot: give it an asset"):
+        robot(Bare())
+
+
+def test_a_robot_may_be_a_model_or_a_spec_which_stays_as_it_is() -> None:
+    spec = mujoco.MjSpec.from_string(SLED)
+    model = spec.compile()
+    for asset in (spec, model):
+        scene = diffsim.load_scene(asset)
+        assert scene.name == "sled" and scene.mj_model is not model and not scene.gravity.any()
+    assert model.opt.gravity[2] < 0
+
+    class Mine(Bare):
+        asset = model
+
+    env = diffsim.make(Mine, num_envs=2, dtype=torch.float64)
+    assert env.scene.nq == 1 and env.task.obs_dim == 2
+    _, reward, *_ = env.step(torch.zeros(2, 0, dtype=torch.float64))
+    assert reward.tolist() == [0, 0]
+
+
+# Its numbers ----------------------------------------------------------------------------------------------------------
+
+BALLS = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 1"> <freejoint/> <geom size=".1"/>
+      <body> <joint type="ball"/> <geom size=".1" pos="0 0 .3"/> </body>
+    </body>
+  </worldbody>
+  <keyframe>
+    <key name="flat" qpos="0 0 .2 1 0 0 0 1 0 0 0"/>
+    {key}
+  </keyframe>
+</mujoco>"""
+HOME = '<key name="home" qpos="1 0 .5 0 1 0 0 0 0 1 0"/>'
+
+
+def fitted(kind: type[Task], scene: diffsim.Scene) -> Task:
+    task = kind(dtype=torch.float64)
+    fit(task, scene)
+    return task
+
+
+def test_a_task_starts_at_the_keyframe() -> None:
+    home, flat = (scene_of(BALLS.format(key=key)) for key in (HOME, ""))
+    task, rand = fitted(Bare, home), torch.rand(5, 20, dtype=torch.float64)
+    assert (task.num_random, task.obs_dim, task.forward) == (20, 20, 0)
+    qpos, qvel = task.reset(rand)
+    assert qpos.tolist() == [[1, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0]] * 5 and qvel.tolist() == [[0] * 9] * 5
+    assert fitted(Bare, flat).reset(rand)[0][0].tolist() == [0, 0, 0.2, 1, 0, 0, 0, 1, 0, 0, 0]
+    bare = scene_of(EXAMPLE.read_text())
+    np.testing.assert_array_equal(fitted(Bare, bare).reset(rand[:, :10])[0][0], bare.qpos0)
+
+    class Spread(Bare):
+        spread = 0.4
+
+    qpos, qvel = fitted(Spread, home).reset(rand)
+    torch.testing.assert_close(qvel, 0.4 * (rand[:, 11:] - 0.5))
+    torch.testing.assert_close(qpos[:, :3] - torch.tensor([1, 0, 0.5]), 0.4 * (rand[:, :3] - 0.5), check_dtype=False)
+    for k in (3, 7):  # quaternions stay such
+        turned = torch.eye(4, dtype=torch.float64)[1 if k == 3 else 2] + 0.4 * (rand[:, k : k + 4] - 0.5)
+        torch.testing.assert_close(qpos[:, k : k + 4], turned / turned.norm(dim=1, keepdim=True))
+
+    class Full(Bare):
+        start, spread = tuple(range(10)), (0.0,) * 9 + (2.0,)
+
+    qpos, qvel = fitted(Full, bare).reset(rand[:, :10])
+    assert qpos[0].tolist() == [0, 1, 2, 3, 4] and qvel[0, :4].tolist() == [5, 6, 7, 8]
+    torch.testing.assert_close(qvel[:, 4], 9 + 2 * (rand[:, 9] - 0.5))
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(obs_dim=9), "obs_dim is 9, must be 10 (what observe returns)"),
+        (dict(num_random=9), "num_random is 9, must be 10 (nq + nv)"),
+        (dict(start=(0.0,) * 9), "the length of start is 9, must be 10 (nq + nv)"),
+        (dict(spread=(0.1,) * 5), "the length of spread is 5, must be 10 (nq + nv)"),
+        (dict(reset=lambda self, rand: (rand[..., :4], rand[..., 5:])),
+         "the width of qpos and of qvel from reset is (4, 5), must be (5, 5)"),
+        (dict(observe=lambda self, qpos, qvel, action: qpos[..., 0]), "the shape of two observations is (2,), must be"),
+        (dict(reward=lambda self, obs, action: obs[..., :1]), "the shape of two rewards is (2, 1), must be (2,)"),
+        (dict(reward=lambda self, obs, action: obs.sum()), "the shape of two rewards is (), must be (2,)"),
+        (dict(terminated=lambda self, obs: obs > 0), "the shape of two of terminated is (2, 10), must be (2,)"),
+    ],
+)  # fmt: skip
+def test_a_number_that_does_not_fit_is_named(changes: dict[str, object], message: str) -> None:
+    wrong = type("Wrong", (Bare,), changes | {"name": "wrong"})
+    with pytest.raises(TaskError) as error:
+        diffsim.DiffEnv(wrong(), scene_of(EXAMPLE.read_text()), 1)
+    assert line_of(error).startswith(f"task 'wrong': {message}")
+
+
+def test_a_policy_of_a_task_that_has_changed_since_is_refused() -> None:
+    env = diffsim.make("cartpole", 1)
+    for inputs, outputs in ((4, 1), (5, 2)):
+        with pytest.raises(ValueError, match="not for task 'cartpole' as it is now, with 5 observations and 1 actions"):
+            fitting(torch.nn.Linear(inputs, outputs), env)
+    assert fitting(torch.nn.Linear(5, 1), env)
+
+
+# Forward --------------------------------------------------------------------------------------------------------------
+
+SLIDES = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 1" {turn}> {joints} <geom size=".1" mass="1"/>
+      <body> <joint type="slide" axis="1 0 0" range="-1 1"/> <geom size=".1" mass="1"/> </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+Z, X, Y = (f'<joint type="slide" axis="{axis}"/>' for axis in ("0 0 1", "1 0 0", "0 1 0"))
+
+
+@pytest.mark.parametrize(
+    "joints, turn, column",
+    [
+        (Z + X, "", 1),  # as of dm_control's walker
+        (X + Z, "", 0),
+        (Y + Z, 'euler="0 0 -90"', 0),
+        ("<freejoint/>", "", 0),
+        ("<joint/>", "", None),  # an arm
+        (Z + Y, "", None),
+    ],
+)
+def test_forward_is_along_x(joints: str, turn: str, column: int | None) -> None:
+    text = SLIDES.format(joints=joints, turn=turn)
+    assert forward(scene_of(text)) == column
+    assert forward(scene_of(text.replace("<geom type", "<geom contype='0' conaffinity='0' type"))) is None
+
+
+def test_the_shipped_robots_move_along_their_first_coordinate() -> None:
+    found = {name: forward(diffsim.load_scene(robot(task()))) for name, task in TASKS.items()}
+    assert found == {name: None if name == "cartpole" else 0 for name in TASKS}
+
+
+def test_a_speed_is_that_of_the_way_forward() -> None:
+    """A sled that glides at 2 m/s along x, its second joint, just above the ground."""
+
+    class Glide(Bare):
+        asset = mujoco.MjSpec.from_string(
+            SLIDES.format(joints=Z + X, turn="").replace("<worldbody>", "<option gravity='0 0 0'/><worldbody>")
+        )
+        episode_length = 90
+        start = (-0.89, 0.0, 0.0, 0.0, 2.0, 0.0)
+
+    class Sideways(Glide):
+        forward = 0
+
+    class Nowhere(Glide):
+        forward = None
+
+    results = [
+        evaluate(diffsim.make(kind, num_envs=2, dtype=torch.float64), lambda obs: obs[:, :0])
+        for kind in (Glide, Sideways, Nowhere)
+    ]
+    assert results[0].speed == pytest.approx(2.0, rel=1e-6) and results[2].speed is None
+    assert results[1].speed is not None and abs(results[1].speed) < 1e-6
+    gaits = [result.gait() for result in results]
+    assert all(gaits)
+    speeds = [gait.speed for gait in gaits if gait]
+    assert speeds[0] == pytest.approx(2.0, rel=1e-6) and abs(speeds[1] or 0.0) < 1e-6 and speeds[2] is None
+
+
+# Contact --------------------------------------------------------------------------------------------------------------
+
+
+def test_own_tasks_have_mujocos_contact_and_the_shipped_ones_the_papers() -> None:
+    class Slow(Bare):
+        control_dt = 0.05
+
+    class Own(Bare):
+        substeps = 7
+
+    class Soft(Own):
+        contact = "soft"
+
+    find: Callable[..., diffsim.Integration] = lambda kind, *words: kind.integration(*words)  # noqa: E731
+    assert {task.contact for task in TASKS.values()} == {"soft"} and Bare.contact == "mujoco"
+    assert find(Bare, "default") == find(TASKS["ant"], "default", "mujoco") == diffsim.Integration("mujoco", 4)
+    assert find(Bare, "accurate") == diffsim.Integration("mujoco", 16)
+    assert find(Slow, "default") == diffsim.Integration("mujoco", 12)
+    assert find(Own, "default") == find(Own, "fast") == diffsim.Integration("mujoco", 7)
+    assert find(Bare, "default", "soft") == find(Own, "default", "soft") == diffsim.Integration("semi_implicit", 16)
+    assert find(Soft, "default") == diffsim.Integration("semi_implicit", 7)
+    assert find(Soft, "default", "mujoco") == diffsim.Integration("mujoco", 4)
+    assert TASKS["ant"].integration("default") == diffsim.Integration("semi_implicit", 16)
+    env = diffsim.DiffEnv(Bare(), scene_of(SLED), 1)
+    assert env.sim.integration == diffsim.Integration("mujoco", 4)
+    with pytest.raises(ValueError, match="unknown contact 'hard'"):
+        Bare.integration("default", "hard")

@@ -1,0 +1,122 @@
+"""A new user's way, as docs/own_robot.md describes it: each of its commands and snippets runs, in small."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+from learners import ROOT, refusal
+
+import diffsim
+import shac
+import view
+from diffsim.__main__ import main as diffsim_main
+from diffsim.training import checkpoint, parse
+
+PAGE = (ROOT / "docs" / "own_robot.md").read_text()
+LISTING, SNIPPET = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+COMMANDS = [
+    line.split()[1:] for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.M | re.S) for line in block.splitlines()
+]
+FEW = "--eval-episodes 2 --eval-every 0 --device cpu --no-finer".split()
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the example and a trained run."""
+    folder = tmp_path_factory.mktemp("home")
+    (folder / "examples").mkdir()
+    for suffix in ("py", "xml"):
+        shutil.copy(ROOT / "examples" / f"own_robot.{suffix}", folder / "examples")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        (words,) = (words for words in COMMANDS if words[0] == "shac.py" and "--env" in words)
+        shac.main([*small(words), "--num-envs", "4"])
+    return folder
+
+
+def small(words: Sequence[str], run: Path | None = None, iterations: int = 2) -> list[str]:
+    text = re.sub(r"--iterations \w+", f"--iterations {iterations}", " ".join(words[1:]))
+    return [*text.replace("runs/<run>", str(run)).split(), *(FEW if words[0] == "shac.py" else ())]
+
+
+def test_the_page_is_short_and_lists_the_example() -> None:
+    assert len(PAGE.split()) <= 500 and LISTING in (ROOT / "examples" / "own_robot.py").read_text()
+    assert LISTING.count("\n") <= 30 and "class WalkForward(Task):" in LISTING
+    assert [words[0] for words in COMMANDS] == ["-m", "shac.py", "view.py", "shac.py", "shac.py"]
+
+
+def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(home)
+    (run,) = (home / "runs").iterdir()
+    assert re.fullmatch(r"walk_forward__shac__1__\d+", run.name)
+    saved = checkpoint.load(run / "checkpoint.pt")
+    assert saved["args"]["env"] == "examples/own_robot.py" and saved["iteration"] == 2
+    assert saved["args"]["contact"] == saved["args"]["integrator"] == "mujoco"
+    check, _, watch, judge, resume = COMMANDS
+    diffsim_main(check[2:])
+    assert "own_robot: can be simulated" in capsys.readouterr().out
+    view.main(small(watch, run))
+    assert "walk_forward, shac.py, iteration 2" in capsys.readouterr().out and (home / "run.html").is_file()
+    shac.main(small(judge, run))
+    written = json.loads((run / "evaluation.json").read_text())
+    assert len(written["returns"]) == 2 and written["speed"] is not None
+    shac.main(small(resume, run, 3))
+    assert checkpoint.load(run / "checkpoint.pt")["iteration"] == 3
+
+
+def test_the_snippet_runs(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the class itself makes the same environment."""
+    monkeypatch.chdir(home)
+    names: dict[str, object] = {}
+    exec(SNIPPET, names)
+    env = names["env"]
+    assert isinstance(env, diffsim.DiffEnv) and (env.num_envs, env.task.obs_dim) == (16, 9)
+    envs = [diffsim.make(task, 3, seed=1) for task in ("examples/own_robot.py:WalkForward", type(env.task))]
+    for one in envs:
+        assert one.sim.integration == diffsim.Integration("mujoco", 4) and one.task.name == "walk_forward"
+    assert torch.equal(*(one.reset(seed=1)[0] for one in envs))
+    steps = [one.step(torch.full((3, 2), 0.5)) for one in envs]
+    assert torch.equal(steps[0][0], steps[1][0]) and torch.equal(steps[0][1], steps[1][1])
+
+
+def test_from_another_directory(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (run,), there = (home / "runs").iterdir(), str(home / "examples" / "own_robot.py")
+    path = run / "checkpoint.pt"
+    missing = f"no such file: examples/own_robot.py in {tmp_path}; give its path, in scripts --env path/to/own_robot.py"
+    monkeypatch.setattr(sys, "argv", ["script.py"])
+    for words in (["--evaluate", path], ["--resume", path, "--iterations", "9"]):
+        assert refusal(lambda words=words: shac.main([*map(str, words), *FEW]), capsys) == f"script.py: {missing}"
+    assert refusal(lambda: view.main([str(run), "--web", "a.html"]), capsys) == f"script.py: {missing}"
+    shac.main(["--evaluate", str(path), "--env", there, "--run-dir", str(tmp_path), *FEW])
+    assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["env"] == there
+    view.main([str(run), "--web", "a.html", "--env", there])
+    assert (tmp_path / "a.html").is_file()
+    line = refusal(lambda: shac.main(["--evaluate", str(path), "--env", "ant"]), capsys)
+    assert "has --env examples/own_robot.py, not ant" in line
+
+
+def test_flags_of_an_own_task(home: Path) -> None:
+    env = ["--env", str(home / "examples" / "own_robot.py")]
+    args = parse(shac.Args, env)
+    assert (args.contact, args.integrator, args.substeps, args.horizon) == ("mujoco", "mujoco", 4, 8)
+    args = parse(shac.Args, [*env, "--contact", "soft"])
+    assert (args.contact, args.integrator, args.substeps, args.horizon) == ("soft", "semi_implicit", 16, 32)
+    args = parse(shac.Args, ["--env", "hopper"])
+    assert (args.contact, args.integrator) == ("soft", "semi_implicit")
+
+
+def test_help_says_that_contact_depends_on_the_task(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        shac.main(["--help"])
+    words = " ".join(re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+    assert "docs/transfer.md; per task" in words and "my_task.py:Class" in words
