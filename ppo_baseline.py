@@ -22,7 +22,7 @@ from diffsim import DiffEnv
 from diffsim.tasks import Task, find_task
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
 from diffsim.training.flags import ParallelFlags, parse
-from diffsim.training.layers import ObsNormalizer, moments
+from diffsim.training.layers import ObsNormalizer, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
 
@@ -112,24 +112,29 @@ class Args(ParallelFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
+def hidden(inputs: int, args: Args) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for width in args.hidden:
+        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True)]
+        inputs = width
+    return nn.Sequential(*layers)
+
+
 class ActorCritic(nn.Module):
     """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        layers: list[nn.Module] = []
-        for width in args.hidden:
-            layers += [nn.Linear(obs_dim, width), nn.ELU(inplace=True)]
-            obs_dim = width
-        self.features = nn.Sequential(*layers)
-        self.mean, self.value = nn.Linear(obs_dim, action_dim), nn.Linear(obs_dim, 1)
+        self.features = seeing(seen, hidden(seen or obs_dim, args))
+        self.own = None if seen is None else hidden(obs_dim, args)  # of V, which sees more
+        self.mean, self.value = nn.Linear(args.hidden[-1], action_dim), nn.Linear(args.hidden[-1], 1)
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
         features = self.features(obs)
-        return self.mean(features), self.value(features).squeeze(-1)
+        return self.mean(features), self.value(features if self.own is None else self.own(obs)).squeeze(-1)
 
     def deterministic(self) -> nn.Sequential:
         """The mean alone, of observations as they come, with the same weights."""
@@ -172,7 +177,7 @@ class PPO:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor_critic = ActorCritic(args, obs_dim, action_dim).to(env.device)
+        self.actor_critic = ActorCritic(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, args.max_grad_norm, lr=args.lr)

@@ -26,7 +26,7 @@ from diffsim.tasks import TASKS, Task, find_task
 from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import ParallelFlags, parse
-from diffsim.training.layers import ObsNormalizer
+from diffsim.training.layers import ObsNormalizer, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
 
@@ -179,11 +179,11 @@ class Actor(nn.Module):
     mean: Any
     spread: Any
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         width = args.actor_hidden[-1]
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = mlp(obs_dim, args.actor_hidden, args.activation)
+        self.body = seeing(seen, mlp(seen or obs_dim, args.actor_hidden, args.activation))
         self.mean = nn.Linear(width, action_dim)
         self.spread = spread(args, width, action_dim) if args.state_std else None
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not args.state_std)
@@ -252,7 +252,7 @@ class SAPO:
         self.value = torch.zeros(samples, device=env.device)
 
     def make_actor(self, obs_dim: int, action_dim: int) -> Actor:
-        return Actor(self.args, obs_dim, action_dim)
+        return Actor(self.args, obs_dim, action_dim, self.env.task.actor_dim)
 
     def make_optimizer(self, module: nn.Module) -> ClippedAdam:
         limits = self.args.max_grad_norm, self.args.betas
@@ -412,11 +412,12 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
 class Actors(Actor):
     """The actors of K members, on (K, B, ...). Observations are normalized by the statistics of all."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         nn.Module.__init__(self)
         K, width = args.population, args.actor_hidden[-1]
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = Ensemble([mlp(obs_dim, args.actor_hidden, args.activation) for _ in range(K)])
+        bodies = [seeing(seen, mlp(seen or obs_dim, args.actor_hidden, args.activation)) for _ in range(K)]
+        self.body = Ensemble(bodies)
         self.mean = Ensemble([nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)])
         shared = nn.Sequential(spread(args, width, action_dim))
         self.spread = Ensemble([shared] * K) if args.state_std else None
@@ -454,7 +455,7 @@ class Population(SAPO):
         self.obs, self.value = (tensor.unflatten(0, (args.population, -1)) for tensor in (self.obs, self.value))
 
     def make_actor(self, obs_dim: int, action_dim: int) -> Actors:
-        return Actors(self.args, obs_dim, action_dim)
+        return Actors(self.args, obs_dim, action_dim, self.env.task.actor_dim)
 
     def make_optimizer(self, module: nn.Module) -> EnsembleAdam:
         args = self.args

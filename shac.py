@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, ObsNormalizer, Regression, Run, command, evaluate, evaluate_checkpoint
 from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
@@ -114,10 +115,11 @@ def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Seque
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state; or of its mean alone."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.mean = mlp(obs_dim, args.actor_hidden, action_dim, orthogonal=args.deterministic_policy)
+        network = mlp(seen or obs_dim, args.actor_hidden, action_dim, orthogonal=args.deterministic_policy)
+        self.mean = seeing(seen, network)
         log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
         self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)
 
@@ -156,7 +158,7 @@ class SHAC:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
         self.critic = mlp(obs_dim, args.critic_hidden, 1, orthogonal=True).to(env.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)

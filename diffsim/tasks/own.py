@@ -101,7 +101,12 @@ def fit(task: Task, scene: Scene) -> None:
     rand, action = task._start.new_full((2, task.num_random), 0.5), task._start.new_zeros(2, scene.nu)
     qpos, qvel = task.reset(rand)
     _check(task, "the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
-    obs = task.observe_at(qpos, qvel, action, task.first_step(rand))
+    if task.num_memory:
+        memory = task.begin(rand)
+        _check(task, "the width of what begin returns", memory.shape[-1], task.num_memory, "num_memory")
+        obs = task.observe_with(qpos, qvel, action, memory)
+    else:
+        obs = task.observe_at(qpos, qvel, action, task.first_step(rand))
     _check(task, "the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
     task.obs_dim = getattr(task, "obs_dim", obs.shape[-1])
     _check(task, "obs_dim", task.obs_dim, obs.shape[-1], "what observe returns")

@@ -18,7 +18,7 @@ from diffsim.env import DiffEnv
 from diffsim.tasks import TASKS
 from diffsim.tasks.base import FIRM_IS_GONE
 from diffsim.training.errors import fail
-from diffsim.training.layers import Likeliest, ObsNormalizer
+from diffsim.training.layers import First, Likeliest, ObsNormalizer
 from diffsim.training.ranges import fits
 
 FORMAT = 2
@@ -27,6 +27,7 @@ HOME = "diffsim"  # the simulator in which policies are trained, unless a checkp
 # What a policy may consist of, and the attributes that its constructor takes.
 LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
     "ELU": (nn.ELU, ()),
+    "First": (First, ("columns",)),
     "LayerNorm": (nn.LayerNorm, ("normalized_shape",)),
     "Likeliest": (Likeliest, ("actions", "components", "shared")),
     "Linear": (nn.Linear, ("in_features", "out_features")),

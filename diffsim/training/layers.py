@@ -78,6 +78,22 @@ class Likeliest(nn.Module):
         return loc.gather(-1, index).squeeze(-1)
 
 
+class First(nn.Module):
+    """The first columns of an observation: what an actor sees of it, where a critic sees all (Task.actor_dim)."""
+
+    def __init__(self, columns: int) -> None:
+        super().__init__()
+        self.columns = columns
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x[..., : self.columns]
+
+
+def seeing(columns: int | None, network: nn.Sequential) -> nn.Sequential:
+    """A network that sees the first columns of its input alone; None: all."""
+    return network if columns is None else nn.Sequential(First(columns), *network)
+
+
 def moments(x: Tensor) -> tuple[Tensor, Tensor]:
     """Variance and mean of x (B, ...) over the B of all ranks."""
     var, own = torch.var_mean(x, dim=0, correction=0)

@@ -1,0 +1,182 @@
+"""How well policies of the joystick tasks follow commands, here and in MuJoCo on any file of their robot.
+
+    python benchmarks/joystick.py runs/go2__shac__1 --file path/to/unitree_go2/scene.xml
+    python benchmarks/joystick.py runs/joystick/* --push 0.5
+
+Each command is held for 20 s from the keyframe. The error of an episode is the mean distance of the velocity, averaged
+over a second, from the command, after the first second. In MuJoCo the joints are those of the same names; servos get
+the policy's targets, and a motor the torque that the task's servo would have. Nothing else of the file is changed.
+
+Writes joystick.csv, a row for each policy and world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import common
+import mujoco
+import numpy as np
+import torch
+from common import ABOUT, Case, load_case, run
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffsim.sim.launcher import available_cores
+from diffsim.tasks.joystick import Joystick
+from diffsim.tasks.locomotion import rotate
+from diffsim.training import NonNegative, Positive, fail
+
+Array = NDArray[np.float64]
+FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
+COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) for v in SIDEWAYS)]
+COMMANDS += [(0.0, 0.0, w) for w in TURNING] + [(v, 0.0, w) for v in (0.5, -0.5) for w in TURNING]
+
+
+@dataclass
+class Args(common.CheckpointFlags):
+    file: Path | None = None  # MJCF of the robot with a ground, in place of the task's
+    friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
+    push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
+    seconds: Positive = 20.0  # of an episode
+
+
+class Robot:
+    """A robot in MuJoCo, driven as the task's.
+
+    Raises:
+        ValueError: the file lacks a joint or its actuator.
+    """
+
+    def __init__(self, case: Case, file: Path | None, friction: float) -> None:
+        self.scene, self.task = case.env.scene, case.env.task
+        own = self.scene.mj_model
+        m = self.model = mujoco.MjModel.from_xml_path(str(file or self.scene.path))
+        m.geom_friction[:, 0] *= friction
+        m.pair_friction[:, :2] *= friction
+        names = [own.joint(j).name for j in range(1, own.njnt)]
+        try:
+            joints = np.array([m.joint(name).id for name in names])
+        except KeyError as error:
+            raise ValueError(f"{file}: {error}") from error
+        actuator = {int(m.actuator_trnid[a, 0]): a for a in range(m.nu)}
+        if missing := [name for name, j in zip(names, joints, strict=True) if j not in actuator]:
+            raise ValueError(f"{file}: no actuator of {', '.join(missing)}")
+        self.qpos, self.qvel = m.jnt_qposadr[joints], m.jnt_dofadr[joints]
+        self.ctrl = np.array([actuator[j] for j in joints])
+        self.servo = m.actuator_biastype[self.ctrl] == mujoco.mjtBias.mjBIAS_AFFINE
+        order = [own.actuator_trnid[:, 0].tolist().index(j) for j in range(1, own.njnt)]
+        low, high = own.actuator_ctrlrange[order].T
+        self.middle, self.half, self.order = (low + high) / 2, (high - low) / 2, order
+        self.stiffness, self.damping = own.actuator_gainprm[order, 0], -own.actuator_biasprm[order, 2]
+        # The file's passive damping of a motor's joint acts there, and so do its clamps.
+        self.steps = max(1, round(self.task.control_dt / m.opt.timestep))
+        self.least, self.most = m.actuator_ctrlrange[self.ctrl].T
+        self.limited = m.actuator_ctrllimited[self.ctrl] != 0
+
+    def start(self, qpos: Array) -> mujoco.MjData:
+        data = mujoco.MjData(self.model)
+        data.qpos[:7], data.qpos[self.qpos] = qpos[:7], qpos[7:]
+        mujoco.mj_forward(self.model, data)
+        return data
+
+    def step(self, data: mujoco.MjData, action: Array) -> None:
+        target = self.middle + self.half * action[self.order]
+        for _ in range(self.steps):
+            torque = self.stiffness * (target - data.qpos[self.qpos]) - self.damping * data.qvel[self.qvel]
+            ctrl = np.where(self.servo, target, torque)
+            data.ctrl[self.ctrl] = np.where(self.limited, ctrl.clip(self.least, self.most), ctrl)
+            mujoco.mj_step(self.model, data)
+
+    def state(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        qpos = np.concatenate((data.qpos[:7], data.qpos[self.qpos]))
+        return qpos, np.concatenate((data.qvel[:6], data.qvel[self.qvel]))
+
+
+class Follower:
+    """The task's memory under commands that are held, without noise of the sensors."""
+
+    def __init__(self, case: Case, commands: Tensor) -> None:
+        self.task, self.commands = case.env.task, commands
+        assert isinstance(self.task, Joystick)
+        self.memory = self.task.begin(torch.full((len(commands), self.task.num_random), 0.5))
+        self.memory[:, :3] = commands
+
+    def observe(self, qpos: Array, qvel: Array, action: Tensor) -> Tensor:
+        return self.task.observe_with(torch.tensor(qpos).float(), torch.tensor(qvel).float(), action, self.memory)
+
+    def remember(self, action: Tensor) -> None:
+        quiet = torch.full((len(action), self.task.num_noise), 0.5)
+        self.memory = self.task.remember(self.memory, action, quiet)
+        self.memory[:, :3] = self.commands
+
+
+def root_velocity(qpos: Tensor, qvel: Tensor) -> Tensor:
+    """(..., 3) vx, vy in the root's frame, and its yaw rate."""
+    inverse = torch.cat((qpos[..., 3:4], -qpos[..., 4:7]), dim=-1)
+    return torch.cat((rotate(inverse, qvel[..., :3])[..., :2], qvel[..., 5:6]), dim=-1)
+
+
+@torch.no_grad()
+def follow(case: Case, robot: Robot, args: Args) -> tuple[Array, Array, Array]:
+    """Velocities (T, n, 3) of the root, falls (n,) and the way (T, n, nq), of an episode for each command."""
+    commands, steps = torch.tensor(COMMANDS), round(args.seconds / case.env.task.control_dt)
+    follower, policy, n = Follower(case, commands), case.saved.network, len(COMMANDS)
+    home = case.env.task._start[: case.env.scene.nq].numpy().astype(float)
+    data = [robot.start(home) for _ in range(n)]
+    action, fallen = torch.zeros(n, case.env.scene.nu), np.zeros(n, bool)
+    generator, velocities, way = np.random.default_rng(1), [], []
+    with ThreadPoolExecutor(available_cores()) as pool:
+        for t in range(steps):
+            qpos, qvel = (np.stack(parts) for parts in zip(*map(robot.state, data), strict=True))
+            obs = follower.observe(qpos, qvel, action)
+            fallen |= case.env.task.terminated(obs).numpy() | ~np.isfinite(qpos).all(1)
+            velocities.append(root_velocity(torch.tensor(qpos), torch.tensor(qvel)).numpy())
+            way.append(qpos)
+            action = policy(obs).clamp(-1.0, 1.0)
+            follower.remember(action)
+            if args.push and t and t % round(4.0 / case.env.task.control_dt) == 0:
+                for each, angle in zip(data, generator.uniform(0, 2 * np.pi, n), strict=True):
+                    each.qvel[:2] += args.push * np.array((np.cos(angle), np.sin(angle)))
+            list(pool.map(robot.step, data, action.numpy().astype(float)))
+    return np.stack(velocities), fallen, np.stack(way)
+
+
+def errors(velocities: Array, second: int) -> Array:
+    """(n, 2) mean error of the velocity [m/s] and of the yaw rate [rad/s], averaged over a second, after the first."""
+    sums = np.cumsum(velocities, axis=0)
+    means = (sums[2 * second :] - sums[second:-second]) / second
+    off = means - np.array(COMMANDS)
+    return np.stack((np.linalg.norm(off[..., :2], axis=-1).mean(0), np.abs(off[..., 2]).mean(0)), axis=-1)
+
+
+def measure(path: Path, args: Args) -> list[dict[str, object]]:
+    case, rows = load_case(path, 1, "cpu"), list[dict[str, object]]()
+    if not isinstance(case.env.task, Joystick):
+        fail(f"{path} was trained on {case.env.task.name}, which follows no command")
+    for friction in args.friction:
+        try:
+            robot = Robot(case, args.file, friction)
+        except ValueError as error:
+            fail(error)
+        velocities, fallen, _ = follow(case, robot, args)
+        found = errors(velocities, round(1 / case.env.task.control_dt))
+        row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
+        row |= {"error": found[:, 0].mean(), "worst error": found[:, 0].max(), "yaw error": found[:, 1].mean()}
+        row |= {"whole": 1 - fallen.mean(), "seconds": args.seconds}
+        rows.append(case.about | row)
+        print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, found[:, 0], strict=True)))
+    return rows
+
+
+def main(args: Args) -> None:
+    for path in args.measured:
+        for row in measure(path, args):
+            args.keep("joystick", row, (*ABOUT[:-1], "file", "friction", "push"))
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
