@@ -89,12 +89,12 @@ def difference(scene: Scene, count: int, seed: int) -> float:
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     csv = (RESULTS if args.update_results else OUTPUT) / "cpu" / "foreign.csv"
-    name = args.name or args.folder.name
-    scenes = {path: load(path) for path in sorted(args.folder.glob(args.pattern))}
+    name, folder = args.name or args.folder.name, args.folder.resolve()  # meshes may lie beside the folder
+    scenes = {path: load(path) for path in sorted(folder.glob(args.pattern))}
     if not scenes:
-        fail(f"{args.folder} has no {args.pattern}")
+        fail(f"{folder} has no {args.pattern}")
     for path, (scene, why) in sorted(scenes.items(), key=lambda item: not (item[1][0] and item[1][0].floating)):
-        row: dict[str, object] = {"collection": name, "file": path.relative_to(args.folder).as_posix(), "refused": why}
+        row: dict[str, object] = {"collection": name, "file": path.relative_to(folder).as_posix(), "refused": why}
         if scene:
             row |= {"nq": scene.nq, "nv": scene.nv, "nu": scene.nu, "contact points": scene.ncontact}
             row["relative error of qacc"] = difference(scene, args.states, args.seed) if args.states else ""
