@@ -314,7 +314,7 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
         f"only {ON_JOINT}, without activation dynamics, or muscles on tendons": ~tendon & ~turns,
         "its stiffness (minus biasprm's second number) is {stiffness:g}, must not be negative": turns & (stiffness < 0),
         "its damping (minus biasprm's third number) is {damping:g}, must not be negative": turns & (damping < 0),
-        "forcerange of a muscle is not simulated": tendon & bounded,
+        "forcerange of what pulls a tendon is not simulated": tendon & bounded,
         "forcerange is simulated of a joint's only actuator": turns & bounded & shared,
         "muscle_model 'hill' needs a <muscle>": tendon & motor & hill,
         "its force follows from what it moves, and it moves nothing; give force": pulls & idle,

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from diffsim.robot.constants import servos
 from diffsim.robot.scene import Array, Index, Scene
 
 Flags = NDArray[np.bool_]
@@ -126,7 +127,7 @@ def describe(
     standing = np.concatenate([feet[feet > 0] for feet in stance])
     trunk = _parents(scene.mj_model)[contact_bodies(scene)] == 0
     weight = float(scene.mass.sum() * np.linalg.norm(scene.gravity))
-    priced = distance > 0 and weight > 0 and "hill" not in scene.features
+    priced = distance > 0 and weight > 0 and "hill" not in scene.features and not servos(scene.mj_model).any()
     return Gait(
         feet=_feet([*limbs], [feet > 0 for feet in stance], control_dt),
         trunk=float((depth[:, trunk] > 0).any(1).mean()),

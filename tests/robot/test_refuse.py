@@ -186,7 +186,7 @@ REFUSED = [
             '<motor name="pusher" tendon="string"/>': "pusher.*never push",
             '<position name="servo" tendon="string" kp="1"/>': "servo",
             f'<muscle gear="2" {MUSCLE}/>': "biceps.*gear",
-            f'<muscle forcerange="-1 0" {MUSCLE}/>': "actuator 'biceps': forcerange of a muscle",
+            f'<muscle forcerange="-1 0" {MUSCLE}/>': "actuator 'biceps': forcerange of what pulls",
             '<muscle name="biceps" tendon="string" force="-5" lengthrange="1 2"/>': (
                 "actuator 'biceps': its force follows from what it moves, and it moves nothing; give force"
             ),

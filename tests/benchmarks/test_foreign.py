@@ -1,0 +1,29 @@
+"""What loads of a folder, and how far its accelerations are from MuJoCo's."""
+
+from __future__ import annotations
+
+import sys
+
+import foreign
+from scenes import BOUNDED_SERVOS, pendulum
+from tables import read_csv
+
+
+def test_a_folder_becomes_a_table(tmp_path, monkeypatch, capsys):
+    robots = {
+        "servos": BOUNDED_SERVOS,
+        "rubbed": pendulum('axis="0 1 0" frictionloss="1"'),
+        "bad": pendulum('damping="-1"'),
+    }
+    for name, mjcf in robots.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.xml").write_text(mjcf)
+    monkeypatch.setattr(foreign, "OUTPUT", tmp_path / "out")
+    monkeypatch.setattr(sys, "argv", ["foreign.py", str(tmp_path), "--name", "mine", "--states", "8"])
+    foreign.main()
+    assert "2 of 3 load" in capsys.readouterr().out
+    rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "cpu" / "foreign.csv")}
+    assert rows["bad/scene.xml"]["refused"] == "joint: damping is -1, must not be negative"
+    for name in ("servos", "rubbed"):
+        assert rows[f"{name}/scene.xml"]["refused"] == ""
+        assert float(rows[f"{name}/scene.xml"]["relative error of qacc"]) < 1e-9
