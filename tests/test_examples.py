@@ -39,12 +39,6 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 # The simulator on its own ---------------------------------------------------------------------------------------------
 
 
-def test_own_robot() -> None:
-    first, last = load("own_robot").train(iterations=3, num_envs=16)
-    assert first.returns.isfinite().all() and (last.returns != first.returns).any()
-    assert (last.lengths == 300).all()
-
-
 def test_trajectory_optimisation() -> None:
     path, costs = load("trajectory_optimisation").optimise(guesses=16, iterations=25)
     assert path.shape == (90, 2) and costs.shape == (25, 16)

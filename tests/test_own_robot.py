@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from learners import ROOT, refusal
+from learners import ROOT, assert_same, refusal
 
 import diffsim
+import ppo_baseline
 import shac
 import view
 from diffsim.__main__ import main as diffsim_main
@@ -24,6 +25,8 @@ LISTING, SNIPPET = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re
 COMMANDS = [
     line.split()[1:] for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.M | re.S) for line in block.splitlines()
 ]
+LEARNER = "ppo_baseline.py"
+TINY = "--num-envs 4 --horizon 8 --minibatch-size 16 --epochs 1".split()
 FEW = "--eval-episodes 2 --eval-every 0 --device cpu --no-finer".split()
 
 
@@ -36,26 +39,32 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(ROOT / "examples" / f"own_robot.{suffix}", folder / "examples")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        (words,) = (words for words in COMMANDS if words[0] == "shac.py" and "--env" in words)
-        shac.main([*small(words), "--num-envs", "4"])
+        (words,) = (words for words in COMMANDS if words[0] == LEARNER and "--env" in words)
+        ppo_baseline.main([*small(words), *TINY])
     return folder
 
 
 def small(words: Sequence[str], run: Path | None = None, iterations: int = 2) -> list[str]:
     text = re.sub(r"--iterations \w+", f"--iterations {iterations}", " ".join(words[1:]))
-    return [*text.replace("runs/<run>", str(run)).split(), *(FEW if words[0] == "shac.py" else ())]
+    return [*text.replace("runs/<run>", str(run)).split(), *(FEW if words[0] == LEARNER else ())]
 
 
 def test_the_page_is_short_and_lists_the_example() -> None:
     assert len(PAGE.split()) <= 500 and LISTING in (ROOT / "examples" / "own_robot.py").read_text()
-    assert LISTING.count("\n") <= 30 and "class WalkForward(Task):" in LISTING
-    assert [words[0] for words in COMMANDS] == ["-m", "shac.py", "view.py", "shac.py", "shac.py"]
+    assert LISTING.count("\n") <= 30 and "class RunForward(Task):" in LISTING
+    assert [words[0] for words in COMMANDS] == [
+        "-m",
+        "ppo_baseline.py",
+        "view.py",
+        "ppo_baseline.py",
+        "ppo_baseline.py",
+    ]
 
 
 def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(home)
     (run,) = (home / "runs").iterdir()
-    assert re.fullmatch(r"walk_forward__shac__1__\d+", run.name)
+    assert re.fullmatch(r"run_forward__ppo_baseline__1__\d+", run.name)
     saved = checkpoint.load(run / "checkpoint.pt")
     assert saved["args"]["env"] == "examples/own_robot.py" and saved["iteration"] == 2
     assert saved["args"]["contact"] == saved["args"]["integrator"] == "mujoco"
@@ -63,11 +72,11 @@ def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     diffsim_main(check[2:])
     assert "own_robot: can be simulated" in capsys.readouterr().out
     view.main(small(watch, run))
-    assert "walk_forward, shac.py, iteration 2" in capsys.readouterr().out and (home / "run.html").is_file()
-    shac.main(small(judge, run))
+    assert "run_forward, ppo_baseline.py, iteration 2" in capsys.readouterr().out and (home / "run.html").is_file()
+    ppo_baseline.main(small(judge, run))
     written = json.loads((run / "evaluation.json").read_text())
     assert len(written["returns"]) == 2 and written["speed"] is not None
-    shac.main(small(resume, run, 3))
+    ppo_baseline.main(small(resume, run, 3))
     assert checkpoint.load(run / "checkpoint.pt")["iteration"] == 3
 
 
@@ -78,9 +87,9 @@ def test_the_snippet_runs(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exec(SNIPPET, names)
     env = names["env"]
     assert isinstance(env, diffsim.DiffEnv) and (env.num_envs, env.task.obs_dim) == (16, 9)
-    envs = [diffsim.make(task, 3, seed=1) for task in ("examples/own_robot.py:WalkForward", type(env.task))]
+    envs = [diffsim.make(task, 3, seed=1) for task in ("examples/own_robot.py:RunForward", type(env.task))]
     for one in envs:
-        assert one.sim.integration == diffsim.Integration("mujoco", 4) and one.task.name == "walk_forward"
+        assert one.sim.integration == diffsim.Integration("mujoco", 4) and one.task.name == "run_forward"
     assert torch.equal(*(one.reset(seed=1)[0] for one in envs))
     steps = [one.step(torch.full((3, 2), 0.5)) for one in envs]
     assert torch.equal(steps[0][0], steps[1][0]) and torch.equal(steps[0][1], steps[1][1])
@@ -95,14 +104,32 @@ def test_from_another_directory(
     missing = f"no such file: examples/own_robot.py in {tmp_path}; give its path, in scripts --env path/to/own_robot.py"
     monkeypatch.setattr(sys, "argv", ["script.py"])
     for words in (["--evaluate", path], ["--resume", path, "--iterations", "9"]):
-        assert refusal(lambda words=words: shac.main([*map(str, words), *FEW]), capsys) == f"script.py: {missing}"
+        assert (
+            refusal(lambda words=words: ppo_baseline.main([*map(str, words), *FEW]), capsys) == f"script.py: {missing}"
+        )
     assert refusal(lambda: view.main([str(run), "--web", "a.html"]), capsys) == f"script.py: {missing}"
-    shac.main(["--evaluate", str(path), "--env", there, "--run-dir", str(tmp_path), *FEW])
+    ppo_baseline.main(["--evaluate", str(path), "--env", there, "--run-dir", str(tmp_path), *FEW])
     assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["env"] == there
     view.main([str(run), "--web", "a.html", "--env", there])
     assert (tmp_path / "a.html").is_file()
-    line = refusal(lambda: shac.main(["--evaluate", str(path), "--env", "ant"]), capsys)
+    line = refusal(lambda: ppo_baseline.main(["--evaluate", str(path), "--env", "ant"]), capsys)
     assert "has --env examples/own_robot.py, not ant" in line
+
+
+def test_shac_trains_evaluates_and_resumes_an_own_task(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that is stopped and resumed ends as one that is not; the file is given in another way each time."""
+    monkeypatch.chdir(home / "examples")
+    common = ["--iterations", "3", "--num-envs", "4", *FEW, "--quiet"]
+    shac.main(["--env", "own_robot.py:RunForward", *common, "--run-dir", str(tmp_path / "whole")])
+    path = tmp_path / "part" / "checkpoint.pt"
+    shac.main(["--env", "own_robot.py", *common, "--stop-after", "2", "--run-dir", str(path.parent)])
+    shac.main(["--resume", str(path), "--env", str(home / "examples" / "own_robot.py"), *FEW, "--quiet"])
+    ends = [checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("whole", "part")]
+    assert_same(ends[0]["modules"], ends[1]["modules"])
+    shac.main(["--evaluate", str(path), *FEW])
+    assert (path.parent / "evaluation.json").is_file()
 
 
 def test_flags_of_an_own_task(home: Path) -> None:

@@ -37,38 +37,31 @@ MOST_BYTES = 2e6  # of an MJCF without its meshes; MuJoCo takes half a minute fo
 
 
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
-    """Read an MJCF file, or a model or spec of MuJoCo's, which stays as it is.
-
-    A warning tells of a robot that leaves the finite numbers at once or is slow to simulate.
+    """Read an MJCF file or copy a model; a warning tells of a robot that leaves the finite numbers at once or is slow.
 
     Raises:
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
     """
     if isinstance(path, mujoco.MjSpec):
         path = path.compile()
-    if isinstance(path, mujoco.MjModel):
-        return _read(copy.copy(path), Path(path.names.partition(b"\0")[0].decode() or "robot"))
-    file = Path(path)
-    if not file.is_file():
+    file = Path(path if isinstance(path, str | os.PathLike) else path.names.partition(b"\0")[0].decode())
+    given = isinstance(path, mujoco.MjModel)
+    if not given and not file.is_file():
         raise SceneError(f"robot file {str(path)!r} does not exist")
-    if file.stat().st_size > MOST_BYTES:
+    if not given and file.stat().st_size > MOST_BYTES:
         raise SceneError(
             f"robot file {str(path)!r} has {file.stat().st_size / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:g}"
         )
     try:
-        model = mujoco.MjModel.from_xml_path(str(file))
+        model = copy.copy(path) if given else mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
         raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
-    return _read(model, file)
-
-
-def _read(model: mujoco.MjModel, file: Path) -> Scene:
     _obey_flags(model)
     _refuse(file, obstacles(model))
     scene = _Reader(model, file).scene()
     _refuse(file, overflows(scene))
     for sentence in troubles(scene):
-        warnings.warn(f"{file.name}: {sentence}", stacklevel=3)
+        warnings.warn(f"{file.name}: {sentence}", stacklevel=2)
     return dataclasses.replace(scene, approximations=approximations(scene))
 
 

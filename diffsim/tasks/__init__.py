@@ -27,11 +27,9 @@ def find_task(name: str | type[Task]) -> type[Task]:
     """The task of a name in TASKS or of a file, my_task.py or my_task.py:Class; a class is one. Raises TaskError."""
     if isinstance(name, type) and issubclass(name, Task):
         return name
-    if name in TASKS:
-        return TASKS[name]
-    if not FILE.fullmatch(str(name)):
+    if name not in TASKS and not FILE.fullmatch(str(name)):
         raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
-    return task_of_file(name)
+    return TASKS.get(name) or task_of_file(name)
 
 
 __all__ = ["FILE", "SHAC_TASKS", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task", "TaskError", "find_task"]

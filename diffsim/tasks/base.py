@@ -28,8 +28,7 @@ FIRM_IS_GONE = "firm contact is gone: choose mujoco, MuJoCo's own"
 class Task:
     """A task. Subclasses fill in the attributes and the methods `observe` and `reward`.
 
-    An episode starts uniformly in start +- spread / 2, where both list qpos, then qvel. Without a start it is at the
-    robot's keyframe "home", its first one, or qpos0. What else may be left out: see own.fit.
+    An episode starts uniformly in start +- spread / 2, where both list qpos, then qvel.
     """
 
     name: ClassVar[str] = "task"
@@ -39,7 +38,7 @@ class Task:
     fast: ClassVar[Integration]  # the other two on soft contact, chosen by measurement: docs/accuracy.md
     accurate: ClassVar[Integration]
     obs_dim: int
-    num_random: int  # random numbers per reset
+    num_random: int  # random numbers per reset; own.fit finds it, obs_dim and forward if they are not given
     forward: int | None  # column of qpos [m] that grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
@@ -48,7 +47,7 @@ class Task:
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: ClassVar[float] = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
-    start: tuple[float, ...] = ()
+    start: tuple[float, ...] = ()  # by default the robot's keyframe "home", its first one, or qpos0; at rest
     spread: tuple[float, ...] | float = 0.0
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
@@ -58,9 +57,7 @@ class Task:
 
     @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
-        """The preset "fast", "default" (the paper's) or "accurate" on a contact, without one the task's.
-
-        With MuJoCo's contact the first two are one.
+        """The preset "fast", "default" (the paper's) or "accurate"; with MuJoCo's contact the first two are one.
 
         Raises:
             ValueError: another name, or a preset that the task has not.

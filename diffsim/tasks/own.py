@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 import os
 import re
 import sys
@@ -18,7 +17,7 @@ from diffsim.robot.scene import Scene
 from diffsim.tasks.base import Asset, Task
 
 FILE = re.compile(r"(.+\.py)(?::(\w+))?")  # my_task.py or my_task.py:Class
-HOME = Path(__file__).resolve().parents[1]
+ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
 class TaskError(ValueError):
@@ -32,8 +31,8 @@ def task_of_file(name: str) -> type[Task]:
     if not path.is_file():
         raise TaskError(f"no such file: {file} in {Path.cwd()}; give its path, in scripts --env path/to/{path.name}")
     module = _module(path, path.stat().st_mtime_ns)
-    kinds = [kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, Task)]
-    tasks = {kind.__name__: kind for kind in kinds if kind.__module__ == module.__name__}
+    own = (kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == str(path))
+    tasks = {kind.__name__: kind for kind in own if issubclass(kind, Task)}
     if not tasks:
         raise TaskError(f"{file} defines no task, a class that extends diffsim.tasks.Task")
     wanted = wanted or (None if len(tasks) > 1 else next(iter(tasks)))
@@ -48,12 +47,11 @@ def task_of_file(name: str) -> type[Task]:
 @functools.cache
 def _module(path: Path, _changed: int) -> ModuleType:
     """A file as a module, which finds other modules beside it."""
-    spec = importlib.util.spec_from_file_location(str(path), path)
-    assert spec and spec.loader
-    sys.modules[spec.name] = module = importlib.util.module_from_spec(spec)  # where dataclasses look for it
+    sys.modules[str(path)] = module = ModuleType(str(path))  # where dataclasses look for it
+    module.__file__ = str(path)
     sys.path.insert(0, str(path.parent))
     try:
-        spec.loader.exec_module(module)
+        exec(compile(path.read_bytes(), path, "exec"), vars(module))
     except (Exception, SystemExit) as error:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1]
@@ -74,7 +72,7 @@ def robot(task: Task) -> Asset:
         return asset
     beside = getattr(sys.modules.get(owner), "__file__", None) or "."
     folders = [] if owner.startswith("diffsim.") else [Path(beside).resolve().parent, Path.cwd()]
-    for folder in (*folders, HOME / "assets"):
+    for folder in (*folders, ASSETS):
         if (folder / asset).is_file():
             return folder / asset
     raise TaskError(f"task {task.name!r}: no robot file {str(asset)!r} in {' or '.join(map(str, folders))}")
@@ -84,20 +82,16 @@ def robot(task: Task) -> Asset:
 def fit(task: Task, scene: Scene) -> None:
     """Give a task start, num_random, obs_dim and forward if it lacks them; a TaskError names a number that is wrong."""
     n, m = scene.nq + scene.nv, scene.mj_model
-    if not hasattr(task, "forward"):
-        task.forward = forward(scene)
-    if not hasattr(task, "num_random"):
-        task.num_random = n
+    task.forward, task.num_random = getattr(task, "forward", forward(scene)), getattr(task, "num_random", n)
     if type(task).reset is Task.reset:
         task._nq, task._quaternions = scene.nq, scene.quaternion_adr.tolist()
         if not len(task._start):
             key = max(mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
             home = torch.tensor(m.key_qpos[key] if m.nkey else scene.qpos0)
             task._start = torch.cat((home.to(task._start), task._start.new_zeros(scene.nv)))
-        _check(task, "num_random", task.num_random, n, "nq + nv")
-        for name, values in (("start", task._start), ("spread", task._spread)):
-            if values.ndim:
-                _check(task, f"the length of {name}", len(values), n, "nq + nv")
+        sizes = {"num_random": task.num_random, "the length of start": len(task._start)}
+        for name, size in (sizes | {"the length of spread": len(task._spread) if task._spread.ndim else n}).items():
+            _check(task, name, size, n, "nq + nv")
     rand, action = task._start.new_full((2, task.num_random), 0.5), task._start.new_zeros(2, scene.nu)
     qpos, qvel = task.reset(rand)
     _check(task, "the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
@@ -110,7 +104,6 @@ def fit(task: Task, scene: Scene) -> None:
     _check(task, "the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
     task.obs_dim = getattr(task, "obs_dim", obs.shape[-1])
     _check(task, "obs_dim", task.obs_dim, obs.shape[-1], "what observe returns")
-    _check(task, "the shape of two of terminated", tuple(task.terminated(obs).shape), (2,))
     if type(task).reward is not Task.reward:  # who only watches needs none
         _check(task, "the shape of two rewards", tuple(task.reward(obs, action).shape), (2,))
 
@@ -124,11 +117,8 @@ def forward(scene: Scene) -> int | None:
     """Column of qpos that is the root's x, of its free joint or its slide along x; None if neither ground nor fluid
     carries the robot, or if it has no such joint, as an arm."""
     m = scene.mj_model
-    data = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, data)
-    for joint in range(m.njnt) if scene.features & {"contact", "drag"} else ():
-        along = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE and data.xaxis[joint, 0] > 0.99
-        root = m.body_weldid[m.body_parentid[m.jnt_bodyid[joint]]] == 0
-        if root and (along or m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE):
-            return int(m.jnt_qposadr[joint])
-    return None
+    mujoco.mj_kinematics(m, data := mujoco.MjData(m))
+    along = (m.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (data.xaxis[:, 0] > 0.99)
+    along |= m.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    found = m.jnt_qposadr[along & (m.body_weldid[m.body_parentid[m.jnt_bodyid]] == 0)]
+    return int(found[0]) if len(found) and scene.features & {"contact", "drag"} else None

@@ -149,11 +149,9 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
     path = torch.stack(qpos)
     speed, forward = None, env.task.forward
     if forward is not None:
-        x = path[..., forward]
-        distance = x.gather(0, lengths.unsqueeze(0) - 1)[0] - x[0]
+        distance = path[..., forward].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, forward]
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
-    motion = path, torch.stack(actions), env.scene, env.control_dt
-    return Evaluation(returns, lengths, speed, *motion, forward=forward)
+    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt, {}, forward)
 
 
 def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:

@@ -173,11 +173,9 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         fail("--resume and --evaluate exclude each other")
     if path := args.resume or args.evaluate:
         args = _continue(kind, argv, args, path)
-        task = find_task(args.env)
     else:
-        words = {word.partition("=")[0] for word in argv}
         task, args.device = find_task(args.env), distributed.choose_device(args.device)
-        if flag("contact") not in words:
+        if not any(word.partition("=")[0] == flag("contact") for word in argv):
             args.contact = task.contact
         defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
         if issubclass(task, HumanoidImitation):
@@ -193,7 +191,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         except RuntimeError as error:
             fail(f"--capture-video: {error}")
     if args.run_dir is None:
-        name = f"{task.name}__{args.script()}__{args.seed}__{int(time.time())}"
+        name = f"{find_task(args.env).name}__{args.script()}__{args.seed}__{int(time.time())}"
         args.run_dir = path.parent if path else Path("runs") / name
     return args
 

@@ -128,7 +128,7 @@ class Run:
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
         self._stopping = False
-        self._skipped, self._report = 0.0, 0.0  # updates said to be skipped, when the next line may come [s]
+        self._skipped = self._report = 0.0  # updates told to be skipped, when the next line may come [s]
 
     # Setting up ------------------------------------------------------------------------------------------------------
 
@@ -288,8 +288,7 @@ class Run:
         skipped = scalars.get("grad/skipped", 0.0)
         if skipped > self._skipped and time.monotonic() >= self._report:
             self._skipped, self._report = skipped, time.monotonic() + REPORT_EVERY
-            why = "updates skipped so far, their gradients too large or not finite"
-            self.message(f"iteration {entry.iteration}: {why}: {skipped:.0f}")
+            self.message(f"iteration {entry.iteration}: updates skipped so far for their gradients: {skipped:.0f}")
         if self._log is not None:
             with self._writing():
                 self._log.write(entry.iteration, self.control_steps, self.seconds, scalars)

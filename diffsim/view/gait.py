@@ -22,6 +22,7 @@ from diffsim.robot.scene import Array, Index, Scene
 Flags = NDArray[np.bool_]
 Frames = NDArray[np.intp]
 Rows = NDArray[np.floating[Any]]
+Episodes = Iterable[tuple[Rows, Rows]]
 
 EPISODES = 8  # how many are looked at
 SETTLING = 1.0  # s at the start of an episode that are left out
@@ -102,14 +103,10 @@ class Gait:
         return f"{self.verdict}; {duty}{cost}peak joint speed {self.peak_joint_speed:.1f} rad/s, {depth}"
 
 
-def describe(
-    scene: Scene, control_dt: float, episodes: Iterable[tuple[Rows, Rows]], forward: int | None = 0
-) -> Gait | None:
+def describe(scene: Scene, control_dt: float, episodes: Episodes, forward: int | None = 0) -> Gait | None:
     """The gait of the first EPISODES episodes, each qpos (F, nq) and action (F, nu) of control steps of control_dt [s].
 
-    Column `forward` of qpos grows as the robot moves forward.
-
-    None without contact with a plane, or if no episode lasts over a second.
+    Column `forward` of qpos is the way. None without contact with a plane, or if no episode lasts over a second.
     """
     start = round(SETTLING / control_dt)
     settled = [(q[start:].astype(float), u[start:].astype(float)) for q, u in islice(episodes, EPISODES)]

@@ -226,7 +226,6 @@ def test_a_task_starts_at_the_keyframe() -> None:
         (dict(observe=lambda self, qpos, qvel, action: qpos[..., 0]), "the shape of two observations is (2,), must be"),
         (dict(reward=lambda self, obs, action: obs[..., :1]), "the shape of two rewards is (2, 1), must be (2,)"),
         (dict(reward=lambda self, obs, action: obs.sum()), "the shape of two rewards is (), must be (2,)"),
-        (dict(terminated=lambda self, obs: obs > 0), "the shape of two of terminated is (2, 10), must be (2,)"),
     ],
 )  # fmt: skip
 def test_a_number_that_does_not_fit_is_named(changes: dict[str, object], message: str) -> None:
