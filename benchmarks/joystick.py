@@ -12,7 +12,6 @@ Writes joystick.csv, a row for each policy and world.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path

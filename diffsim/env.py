@@ -398,14 +398,14 @@ class DiffEnv(VectorEnv):
         """The first step (...), qpos, qvel, obs and memory, if any (..., each) of rand (..., num_random)."""
         if not self.stochastic_init:
             rand = torch.full_like(rand, 0.5)
-        first, (qpos, qvel), memory = self.task.first_step(rand), self.task.reset(rand), ()
+        first, (qpos, qvel), memory = self.task.first_step(rand), self.task.reset(rand), self.task.begin(rand)
         action = self._no_action[0].expand(*rand.shape[:-1], -1)
         if self.task.num_memory:
-            memory = (self.task.begin(rand),)
-            obs = self.task.observe_with(qpos, qvel, action, *memory)
+            obs = self.task.observe_with(qpos, qvel, action, memory)
         else:
             obs = self.task.observe_at(qpos, qvel, action, first)
-        return first, qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs, *memory
+        kept = (memory,) if self.task.num_memory else ()
+        return first, qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs, *kept
 
     def _show(self) -> None:
         if self.render_mode == "human":

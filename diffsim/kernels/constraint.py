@@ -167,9 +167,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return Ia, Ib, Id, F
 
     @wp.func
-    def contacts_along(
-        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, height: T, step: vec6, part: T
-    ):
+    def contacts_along(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, height: T, step: vec6, part: T):
         """Of the contacts of link k after a part of a step of its twist: step . f and step . H step."""
         found = vec2()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):

@@ -17,7 +17,10 @@ from diffsim.tasks.walker import Walker
 
 TASKS: dict[str, type[Task]] = {
     task.name: task
-    for task in (CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU, Swimmer, Walker, HumanoidImitation, Go1, Go2, G1)
+    for task in (
+        *(CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU, Swimmer, Walker, HumanoidImitation),
+        *(Go1, Go2, G1),
+    )
 }
 # Those of the SHAC paper, which have presets of every accuracy
 SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")

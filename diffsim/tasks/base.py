@@ -118,8 +118,8 @@ class Task:
         return self.observe(qpos, qvel, action)
 
     def begin(self, rand: Tensor) -> Tensor:
-        """The memory (..., num_memory) at the start of an episode from rand (..., num_random)."""
-        return rand[..., : self.num_memory] * 0.0
+        """The memory (..., num_memory) at the start of an episode from rand (..., num_random); none by default."""
+        return rand[..., :0]
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
         """The memory (..., num_memory) after a control step.

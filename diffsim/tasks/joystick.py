@@ -14,6 +14,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from diffsim.sim.integration import Integration
 from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.locomotion import rotate
 
@@ -107,6 +108,14 @@ class Joystick(Task):
     control_dt = 0.02
     episode_length = 1000
 
+    forward = None  # what counts is the command
+
+    @classmethod
+    def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
+        """See Task. Newton's method takes longer with dry friction in every joint."""
+        found = super().integration(accuracy, contact)
+        return found._replace(passes=6) if found.integrator == "mujoco" else found
+
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)
         self.start = (0.0, 0.0, robot.height, 1.0, 0.0, 0.0, 0.0, *robot.home, *(0.0,) * (6 + n))
@@ -144,7 +153,9 @@ class Joystick(Task):
     def begin(self, rand: Tensor) -> Tensor:
         """A command and a phase; no action yet."""
         command, phase = self._draw(rand[..., len(self.start) :]), rand[..., -1:]
-        return torch.cat((command, phase, torch.zeros_like(rand[..., :1]).expand(*rand.shape[:-1], 4 * self._n + 9)), -1)
+        return torch.cat(
+            (command, phase, torch.zeros_like(rand[..., :1]).expand(*rand.shape[:-1], 4 * self._n + 9)), -1
+        )
 
     def _draw(self, rand: Tensor) -> Tensor:
         """A command (..., 3) from rand (..., 7)."""
@@ -178,7 +189,9 @@ class Joystick(Task):
         turn = 2.0 * math.pi * (clock + self._phase)
         moving = command.square().sum(-1, keepdim=True)
         moving = moving / (moving + 0.01)
-        return self._home + moving * self._fold * turn.sin().clamp(min=0.0).square() + command @ self._stride * turn.cos()
+        return (
+            self._home + moving * self._fold * turn.sin().clamp(min=0.0).square() + command @ self._stride * turn.cos()
+        )
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Both velocities, then an upright, level, calm root at its height, the reference's joints, smooth actions."""
@@ -199,27 +212,28 @@ class Joystick(Task):
         return (private[..., 8] > -0.5) | (private[..., 9 + 2 * self._n] < 0.6 * self.robot.height)
 
 
-def sizes(robot: Robot) -> dict[str, int]:
+def sizes(robot: Robot) -> tuple[int, ...]:
+    """actor_dim, obs_dim, num_memory, num_noise, num_random"""
     n = len(robot.joints)
-    return dict(actor_dim=14 + 3 * n, obs_dim=24 + 7 * n, num_memory=13 + 4 * n, num_noise=17 + 2 * n, num_random=21 + 2 * n)
+    return 14 + 3 * n, 24 + 7 * n, 13 + 4 * n, 17 + 2 * n, 21 + 2 * n
 
 
 class Go1(Joystick):
     """12 joints; action: targets of the servos."""
 
     name, asset, robot = "go1", "go1.xml", quadruped(("FR", "FL", "RR", "RL"))
-    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot).values()
+    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot)
 
 
 class Go2(Joystick):
     """12 joints; action: targets of servos on the motors."""
 
     name, asset, robot = "go2", "go2.xml", quadruped(("FL", "FR", "RL", "RR"))
-    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot).values()
+    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot)
 
 
 class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
-    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot).values()
+    actor_dim, obs_dim, num_memory, num_noise, num_random = sizes(robot)
