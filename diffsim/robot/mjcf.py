@@ -226,12 +226,8 @@ class _Reader:
         """(3, joints) of the affine biases of their actuators: force at zero, stiffness and damping."""
         m, sums = self.m, np.zeros((3, self.nlink - 1))
         for a in np.flatnonzero(servos(m)).tolist():
-            gear = m.actuator_gear[a, 0]
-            sums[:, self._link(m.actuator_trnid[a, 0]) - 1] += m.actuator_biasprm[a, :3] * (
-                gear,
-                -(gear**2),
-                -(gear**2),
-            )
+            link, gear = self._gear(a)
+            sums[:, link - 1] += m.actuator_biasprm[a, :3] * (gear, -(gear**2), -(gear**2))
         return sums
 
     def _force_bounds(self) -> Array:

@@ -158,7 +158,7 @@ def _not_finite(m: mujoco.MjModel) -> Iterator[Obstacle]:
 
 def _negative(m: mujoco.MjModel) -> Iterator[Obstacle]:
     signed = {Kind.mjOBJ_JOINT: ("armature", "damping", "stiffness"), Kind.mjOBJ_GEOM: ("friction", "solmix")}
-    signed[Kind.mjOBJ_PAIR] = ("friction",)
+    signed |= {Kind.mjOBJ_PAIR: ("friction",), Kind.mjOBJ_BODY: ("gravcomp",)}
     for kind, field in ((kind, field) for kind, fields in signed.items() for field in fields):
         values = _numbers(m)[kind][field]
         least = values.min(tuple(range(1, values.ndim)))

@@ -151,6 +151,7 @@ REFUSED = [
             '<body><joint name="hip" type="ball" range="0 1" limited="true"/><geom size="0.1"/></body>': "hip",
             '<body><joint name="r" type="free" stiffness="1"/><geom size="0.1"/></body>': "joint 'r': .* no stiffness",
             '<body name="kite" gravcomp="nan"><freejoint/><geom size="0.1"/></body>': "body 'kite': gravcomp is not",
+            '<body name="lead" gravcomp="-1"><freejoint/><geom size="0.1"/></body>': "body 'lead': gravcomp is -1",
             '<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>'
             '<geom size="0.1"/></body>': "joint 'j': actuatorgravcomp within actuatorfrcrange",
             '<body name="one"><freejoint name="one"/><geom size="0.1"/></body>'
