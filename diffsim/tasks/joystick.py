@@ -96,6 +96,11 @@ def humanoid() -> Robot:
     return Robot(tuple(side + name for side, names in parts for name in names), home, 0.755, legs, 0.65, 1.4)
 
 
+def score(square: Tensor, scale: float) -> Tensor:
+    """log(1 + square / scale): a parabola near 0 that does not drown the other terms far away, and has a slope there."""
+    return torch.log1p(square / scale)
+
+
 class Joystick(Task):
     """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates).
 
@@ -198,13 +203,13 @@ class Joystick(Task):
         n = self._n
         command, private = obs[..., 9 + 3 * n : 12 + 3 * n], obs[..., 14 + 3 * n :]
         velocity, angular, gravity, _, _, height, change, error = private.split((3, 3, 3, n, n, 1, n, n), dim=-1)
-        speed = (velocity[..., :2] - command[..., :2]).square().sum(-1)
-        yaw = (angular[..., 2] - command[..., 2]).square()
-        tracking = 0.1 / (0.1 + speed) + 0.5 * 0.1 / (0.1 + yaw) - 0.5 * speed - 0.2 * yaw
-        calm = 0.5 * velocity[..., 2].square() + 0.05 * angular[..., :2].square().sum(-1)
-        level = 2.0 * gravity[..., :2].square().sum(-1) + 20.0 * (height[..., 0] - self.robot.height).square()
-        gait = 0.5 * error.square().sum(-1) + 0.02 * change.square().sum(-1)
-        return 1.0 + tracking - calm - level - gait
+        speed = score((velocity[..., :2] - command[..., :2]).square().sum(-1), 0.03)
+        yaw = score((angular[..., 2] - command[..., 2]).square(), 0.03)
+        calm = 0.5 * score(velocity[..., 2].square(), 0.5) + 0.2 * score(angular[..., :2].square().sum(-1), 4.0)
+        level = 0.4 * score(gravity[..., :2].square().sum(-1), 0.1)
+        level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
+        gait = 0.5 * score(error.square().sum(-1), 1.0) + 0.02 * change.square().sum(-1)
+        return 2.0 - 0.3 * speed - 0.15 * yaw - calm - level - gait
 
     def terminated(self, obs: Tensor) -> Tensor:
         """Tilted by more than 60 degrees, or the root below 60 % of its height."""

@@ -92,15 +92,15 @@ def fit(task: Task, scene: Scene) -> None:
         sizes = {"num_random": task.num_random, "the length of start": len(task._start)}
         for name, size in (sizes | {"the length of spread": len(task._spread) if task._spread.ndim else n}).items():
             _check(task, name, size, n, "nq + nv")
-    rand, action = task._start.new_full((2, task.num_random), 0.5), task._start.new_zeros(2, scene.nu)
-    qpos, qvel = task.reset(rand)
+    rand = task._start.new_full((2, task.num_random), 0.5)
+    qpos, qvel, action = state = *task.reset(rand), task._start.new_zeros(2, scene.nu)
     _check(task, "the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
     if task.num_memory:
         memory = task.begin(rand)
         _check(task, "the width of what begin returns", memory.shape[-1], task.num_memory, "num_memory")
-        obs = task.observe_with(qpos, qvel, action, memory)
+        obs = task.observe_with(*state, memory)
     else:
-        obs = task.observe_at(qpos, qvel, action, task.first_step(rand))
+        obs = task.observe_at(*state, task.first_step(rand)) if task.timed else task.observe(*state)
     _check(task, "the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
     task.obs_dim = getattr(task, "obs_dim", obs.shape[-1])
     _check(task, "obs_dim", task.obs_dim, obs.shape[-1], "what observe returns")
