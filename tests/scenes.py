@@ -21,7 +21,8 @@ from diffsim.tasks import TASKS
 
 Array = NDArray[np.float64]
 
-ROBOTS = [name for name in TASKS if TASKS[name].asset == f"{name}.xml"]  # one task of each
+SOFT = [name for name, task in TASKS.items() if task.contact == "soft"]  # on the ground of the SHAC paper
+ROBOTS = [name for name in SOFT if TASKS[name].asset == f"{name}.xml"]  # one task of each
 # Together these have every feature of a task's robot: a kernel takes seconds to compile.
 DISTINCT = ("half_cheetah", "humanoid", "humanoid_mtu", "swimmer")
 

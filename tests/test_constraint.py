@@ -40,7 +40,7 @@ BASES = "floating", "fixed", "planar", "ball"
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs
 TREES = [pytest.param(base, seed, marks=[SLOW] * (seed > 0)) for base in BASES for seed in range(3)]
 H = 1 / 240  # s, of a substep
-PASSES = 40  # Newton's method has converged by then, but in a few states where it goes to and fro between zones
+PASSES = 40  # Newton's method has converged by then
 STATES = {"satisfied": 0, "quadratic": 1, "linear_neg": 2, "linear_pos": 3, "cone": 4}  # MuJoCo's mjtConstraintState
 
 
@@ -143,7 +143,7 @@ def test_task_steps_are_mujocos(name, rng):
 def test_tree_steps_are_mujocos(base, seed, rng):
     """solref of both forms, solimp, margins, impratio, priorities, frictionless geoms, dry friction on every joint."""
     scene, states = tree_states(base, seed, 32, rng)
-    assert check_step(scene, states, 0.75) == set(STATES.values())
+    assert check_step(scene, states, 0.97) == set(STATES.values())
 
 
 def test_pairs_and_meshes_touch_as_in_mujoco(rng):
@@ -248,6 +248,18 @@ def test_tree_gradient_is_that_of_differences(base, rng):
     check_gradients(scene, states, rng)
     if base in ("floating", "planar"):
         check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (16, len(FACTORS)))})
+
+
+def test_few_passes_have_a_gradient_of_usual_size(rng):
+    """The adjoint is that of the last pass, so it does not grow where Newton's method is on its way."""
+    scene, states = tree_states("floating", 0, 32, rng)
+    w, sizes = weights(scene, rng), []
+    for passes in (2, 4, PASSES):
+        integration = Integration("mujoco", 16, passes=passes, touchdown=False)
+        parts = gradients(scene, states, w, integration=integration, control_dt=16 * H)
+        sizes.append(np.linalg.norm(np.concatenate(parts, axis=1), axis=1))
+    assert step(scene, states, 2)[2].max() > 0.1  # not converged, and by 4 passes neither
+    assert max(size.max() for size in sizes) < 10 * np.median(sizes), [size.max() for size in sizes]
 
 
 @pytest.mark.slow

@@ -42,9 +42,8 @@ def records(env, actions):
 def test_spaces(name):
     env = diffsim.make(name, num_envs=3, seed=0)
     sizes = {"cartpole": (5, 1), "hopper": (11, 3), "half_cheetah": (17, 6), "ant": (37, 8), "humanoid": (76, 21)}
-    sizes = (sizes | {"humanoid_mtu": (53, 152), "swimmer": (8, 2), "walker": (17, 6), "humanoid_imitation": (57, 21)})[
-        name
-    ]
+    sizes |= {"humanoid_mtu": (53, 152), "swimmer": (8, 2), "walker": (17, 6), "humanoid_imitation": (57, 21)}
+    sizes = (sizes | {"go1": (108, 12), "go2": (108, 12), "g1": (227, 29)})[name]
     assert env.single_observation_space.shape == sizes[:1] and env.single_action_space.shape == sizes[1:]
     assert env.observation_space.shape == (3, sizes[0]) and env.action_space.shape == (3, sizes[1])
     assert (env.single_action_space.low == -1).all() and (env.single_action_space.high == 1).all()
@@ -52,7 +51,7 @@ def test_spaces(name):
     obs, info = env.reset(seed=1)
     assert info == {} and obs.shape == (3, sizes[0]) and obs.dtype == torch.float32 and obs.isfinite().all()
     assert obs.numpy() in env.observation_space
-    assert env.episode_length == TASKS[name].episode_length and env.control_dt == 1 / 60
+    assert env.episode_length == TASKS[name].episode_length and env.control_dt == TASKS[name].control_dt
 
 
 def test_episodes_end_restart_and_are_counted():

@@ -97,7 +97,7 @@ def humanoid() -> Robot:
 
 
 def score(square: Tensor, scale: float) -> Tensor:
-    """log(1 + square / scale): a parabola near 0 that does not drown the other terms far away, and has a slope there."""
+    """log(1 + square / scale): a parabola near 0; far away it does not drown the other terms, and has a slope."""
     return torch.log1p(square / scale)
 
 
@@ -124,7 +124,7 @@ class Joystick(Task):
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)
         self.start = (0.0, 0.0, robot.height, 1.0, 0.0, 0.0, 0.0, *robot.home, *(0.0,) * (6 + n))
-        self.spread = (0.0,) * 7 + (0.2,) * n + (1.0,) * 6 + (0.5,) * n
+        self.spread = (0.0,) * 7 + (0.2,) * n + (0.5,) * 6 + (0.5,) * n
         super().__init__(device, dtype)
 
         def tensor(values: object) -> Tensor:
@@ -209,7 +209,7 @@ class Joystick(Task):
         level = 0.4 * score(gravity[..., :2].square().sum(-1), 0.1)
         level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
         gait = 0.5 * score(error.square().sum(-1), 1.0) + 0.02 * change.square().sum(-1)
-        return 2.0 - 0.3 * speed - 0.15 * yaw - calm - level - gait
+        return 4.0 - 0.3 * speed - 0.15 * yaw - calm - level - gait
 
     def terminated(self, obs: Tensor) -> Tensor:
         """Tilted by more than 60 degrees, or the root below 60 % of its height."""

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import gymnasium
 import pytest
-from scenes import parse, pendulum, robot, task_scene, tendon
+from scenes import SOFT, parse, pendulum, robot, task_scene, tendon
 
 from diffsim.__main__ import main
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.report import report
-from diffsim.tasks import TASKS
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
@@ -32,7 +31,7 @@ def test_report_of_a_robot():
         assert line in text
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", SOFT)
 def test_every_task_names_its_constants(name):
     scene = task_scene(name)
     text = report(scene)

@@ -1,0 +1,170 @@
+"""The joystick tasks: what they observe, remember and reward, and that a robot follows its servos as in MuJoCo."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scenes import task_scene
+
+import diffsim
+from diffsim.env import DiffEnv
+from diffsim.tasks import TASKS
+from diffsim.tasks.joystick import Joystick, score
+
+NAMES = "go1", "go2", "g1"
+REAL = torch.float64
+
+
+def task_of(name: str) -> Joystick:
+    task = TASKS[name](dtype=REAL)
+    assert isinstance(task, Joystick)
+    return task
+
+
+def some(task: Joystick, count: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(count, task.num_random, dtype=REAL, generator=generator)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_robots_are_their_files(name: str) -> None:
+    """Joints in order, the keyframe, hips, the length of legs, and feet on the ground."""
+    task, model = task_of(name), task_scene(name).mj_model
+    robot, data = task.robot, mujoco.MjData(model)
+    assert [model.joint(j).name.removesuffix("_joint") for j in range(1, model.njnt)] == list(robot.joints)
+    np.testing.assert_allclose(model.key("home").qpos, [0, 0, robot.height, 1, 0, 0, 0, *robot.home])
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    feet = [g for g in range(1, model.ngeom) if model.geom_contype[g]]
+    lowest = data.geom_xpos[feet, 2].min() - model.geom_size[feet[0], 0]
+    assert abs(lowest) < 0.02
+    for leg in robot.legs:
+        pitch = model.joint(f"{leg.joints[0]}_joint")
+        foot = data.geom_xpos[[g for g in feet if model.geom_bodyid[g] > pitch.bodyid[0]], :][0]
+        hip = data.xanchor[pitch.id]
+        assert abs(hip[2] - foot[2] - robot.length) < 0.1
+        assert np.linalg.norm(hip[:2] - leg.place) < 0.06
+    low, high = model.actuator_ctrlrange.T
+    joints = model.actuator_trnid[:, 0]
+    home = np.array(robot.home)[joints - 1]
+    assert (low < home).all() and (home < high).all()  # the reference can be asked for
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_reference_moves_the_feet_as_commanded(name: str) -> None:
+    """In the middle of a stance each foot goes backward at the command's speed, sideways and in turns, too."""
+    task, model = task_of(name), task_scene(name).mj_model
+    data, step = mujoco.MjData(model), 1e-4
+    for command in ([0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.5]):
+        for leg in task.robot.legs:
+            pitch = model.joint(f"{leg.joints[0]}_joint")
+            foot = next(
+                g for g in range(model.ngeom) if model.geom_contype[g] and model.geom_bodyid[g] > pitch.bodyid[0]
+            )
+            places = []
+            for time in (-step, step):  # the stance's middle is three quarters through the leg's cycle
+                clock = torch.tensor([0.75 - leg.phase + time * task.robot.cycle], dtype=REAL)
+                joints = task.reference(torch.tensor(command, dtype=REAL), clock)
+                data.qpos[:] = np.concatenate(([0, 0, 1, 1, 0, 0, 0], joints))
+                mujoco.mj_kinematics(model, data)
+                places.append(data.geom_xpos[foot].copy())
+            vx, vy, turn = command
+            expected = -np.array((vx - turn * leg.place[1], vy + turn * leg.place[0]))
+            speed = (places[1] - places[0])[:2] / (2 * step)
+            # A quarter of pi: a sine's slope at its steepest beside its mean over half a cycle.
+            assert np.linalg.norm(speed - expected * np.pi / 2) < 0.25 * np.linalg.norm(expected) + 0.02
+
+
+def test_memory_holds_command_clock_actions_and_noise() -> None:
+    task, n = task_of("go2"), 12
+    memory = task.begin(some(task, 500))
+    assert (memory[:, :3].abs() <= task._most).all() and (memory[:, 4:] == 0).all()
+    assert 0.02 < (memory[:, :3] == 0).all(1).double().mean() < 0.25  # some stand
+    noise = torch.full((500, task.num_noise), 0.75, dtype=REAL)
+    noise[::2, 7] = 0.0  # a new command for every second robot
+    noise[:, :3] = 1.0
+    a, b = torch.rand(500, n, dtype=REAL), torch.rand(500, n, dtype=REAL)
+    after = task.remember(task.remember(memory, a, noise), b, noise)
+    assert torch.equal(after[1::2, :3], memory[1::2, :3])
+    torch.testing.assert_close(after[::2, :3], task._most.expand(250, 3))
+    torch.testing.assert_close(after[:, 3], (memory[:, 3] + 2 * 0.02 * task.robot.cycle) % 1.0)
+    assert torch.equal(after[:, 4 : 4 + n], b) and torch.equal(after[:, 4 + n : 4 + 2 * n], a)
+    torch.testing.assert_close(after[:, 4 + 2 * n :], (0.5 * task._noise).expand(500, -1))
+
+
+def test_observation_of_a_turned_robot() -> None:
+    """Velocity and gravity are in the body's frame; noise is the actor's alone."""
+    task, n = task_of("go2"), 12
+    rand = some(task, 3)
+    (qpos, qvel), memory = task.reset(rand), task.begin(rand)
+    half = np.sqrt(0.5)
+    qpos[:, 3:7] = torch.tensor([half, 0, 0, half])  # the body's x is the world's y
+    qvel[:, :3] = torch.tensor([0.0, 2.0, 0.5])
+    memory[:, -9 - 2 * n :] = 0.01
+    obs = task.observe_with(qpos, qvel, torch.zeros(3, n, dtype=REAL), memory)
+    assert obs.shape == (3, task.obs_dim)
+    np.testing.assert_allclose(obs[:, :3] - 0.01, np.tile([2.0, 0, 0.5], (3, 1)), atol=1e-12)
+    np.testing.assert_allclose(obs[:, 6:9] - 0.01, np.tile([0, 0, -1.0], (3, 1)), atol=1e-12)
+    private = obs[:, task.actor_dim :]
+    torch.testing.assert_close(obs[:, : 9 + 2 * n], private[:, : 9 + 2 * n] + 0.01)
+    torch.testing.assert_close(obs[:, 9 + 3 * n : 12 + 3 * n], memory[:, :3])
+    torch.testing.assert_close(private[:, 9 + 2 * n], qpos[:, 2])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reward_is_largest_on_the_reference(name: str) -> None:
+    """Of a robot that goes as commanded, on its reference; each departure costs, and tilting or sinking ends it."""
+    task, n = task_of(name), len(task_of(name).robot.joints)
+    memory = task.begin(some(task, 1))
+    memory[:, :3] = torch.tensor([0.5, 0.2, 0.3])
+    qpos, qvel = task._start[None, : 7 + n].clone(), torch.zeros(1, 6 + n, dtype=REAL)
+    qpos[:, 7:] = task.reference(memory[:, :3], memory[:, 3:4])
+    qvel[:, :2], qvel[:, 5] = memory[:, :2], memory[:, 2]
+    action = torch.zeros(1, n, dtype=REAL)
+
+    def observed(change: str = "", index: int = 0, by: float = 0.0) -> torch.Tensor:
+        parts = {"qpos": qpos.clone(), "qvel": qvel.clone(), "memory": memory.clone()}
+        if change:
+            parts[change][:, index] += by
+        return task.observe_with(parts["qpos"], parts["qvel"], action, parts["memory"])
+
+    best = task.reward(observed(), action)
+    np.testing.assert_allclose(best, 4.0, atol=1e-9)
+    for change, index, by in (
+        *(("qvel", k, 0.3) for k in range(6)),
+        *(("qpos", k, 0.2) for k in (2, 4, 5, 7, 6 + n)),
+        ("memory", 0, 0.3),
+        ("memory", 2, 0.3),
+        ("memory", 4, 0.5),
+    ):
+        assert task.reward(observed(change, index, by), action) < best - 1e-3, (change, index)
+    assert not task.terminated(observed())
+    assert task.terminated(observed("qpos", 2, -0.5 * task.robot.height)) and task.terminated(observed("qpos", 4, 1.5))
+    assert score(torch.tensor(0.0), 1.0) == 0 and score(torch.tensor(3.0), 1.0) == np.log(4.0).astype(np.float32)
+
+
+def test_memory_goes_with_the_episode() -> None:
+    """It is carried from step to step, detached and restored with the state, and begins anew with an episode."""
+    env = diffsim.make("go2", 4, seed=3, horizon=4, dtype=REAL, max_episode_steps=3, threads=1)
+    obs, _ = env.reset(seed=3)
+    first, actions = env.memory.clone(), torch.rand(3, 4, 12, dtype=REAL).requires_grad_()
+    for action in actions[:2].unbind():
+        _, reward, _, _, _ = env.step(action)
+    reward.sum().backward()
+    assert (actions.grad[0].abs() > 0).any()  # the second reward sees the first action
+    saved = env.state_dict()
+    assert env.detach().grad_fn is None and env.memory.grad_fn is None
+    with torch.no_grad():
+        obs, reward, _, truncated, info = env.step(actions[2])
+    assert truncated.all() and (env.memory[:, 4:28] == 0).all() and not torch.equal(env.memory[:, :3], first[:, :3])
+    twin = DiffEnv(env.task, env.scene, 4, horizon=4, dtype=REAL, max_episode_steps=3, threads=1)
+    twin.load_state_dict(saved)
+    twin.detach()
+    with torch.no_grad():
+        _, again, _, _, told = twin.step(actions[2])
+    torch.testing.assert_close(told["final_obs"], info["final_obs"], rtol=0, atol=1e-12)
+    torch.testing.assert_close(again, reward, rtol=0, atol=1e-12)
+    begun = env.begin(torch.tensor([2]), torch.full((1, env.task.num_random), 0.5, dtype=REAL))
+    assert (begun[2, 45:48] == 0).all() and torch.equal(begun[:2], obs[:2])  # a command of zero
