@@ -22,7 +22,7 @@ from diffsim import TASKS, SceneError, load_scene, startup
 from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import find_task
-from diffsim.training import command, evaluate, export_policy, fail, load_policy, make_policy_env
+from diffsim.training import command, evaluate, export_onnx, export_policy, fail, load_policy, make_policy_env
 from diffsim.view import render
 
 POLICIES = files("diffsim") / "policies"
@@ -74,10 +74,16 @@ def check(robot: Positional[Path]) -> None:
 
 
 def export(checkpoint: Positional[Path], output: Positional[Path]) -> None:
-    """Write the policy of a checkpoint alone, in a small file."""
+    """Write the policy of a checkpoint alone: OUTPUT.pt for this package, or OUTPUT.onnx for other programs."""
+    saved = load_policy(checkpoint)
     with render.whole_file(output) as part:
-        export_policy(checkpoint, part)
-    saved, size = load_policy(output), output.stat().st_size / 1e3
+        if output.suffix == ".pt":
+            export_policy(checkpoint, part)
+        elif output.suffix == ".onnx":
+            export_onnx(saved, make_policy_env(saved, 1), part)
+        else:
+            fail(f"cannot write {output}: its name must end in .pt or .onnx")
+    size = output.stat().st_size / 1e3
     print(f"{output}: {saved.args['env']}, {saved.script}.py, iteration {saved.iteration}, {size:.0f} kB")
 
 

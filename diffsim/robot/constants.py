@@ -90,6 +90,13 @@ def servos(m: mujoco.MjModel) -> NDArray[np.bool_]:
     return found
 
 
+def control_range(m: mujoco.MjModel) -> tuple[Array, Array]:
+    """(nu,) lowest and highest control of each actuator, for which actions of -1 and 1 stand."""
+    tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
+    low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
+    return low, np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
+
+
 def disabled_flags(m: mujoco.MjModel) -> set[str]:
     """Names of <flag> that the file disables."""
     return _set_bits(mujoco.mjtDisableBit.__members__, "mjDSBL_", m.opt.disableflags)

@@ -18,6 +18,7 @@ from diffsim.robot.constants import (
     at_rest,
     contact_constants,
     contact_points,
+    control_range,
     disabled_flags,
     floating,
     ground_pairs,
@@ -271,9 +272,7 @@ class _Reader:
     def _actuators(self, springs: Array) -> dict[str, Any]:
         """Columns (nu, ...); without a spring on their link, the constant forces of servos are the motors'."""
         m = self.m
-        tendon, limited = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, m.actuator_ctrllimited != 0
-        low = np.where(limited, m.actuator_ctrlrange[:, 0], np.where(tendon, 0.0, -1.0))
-        high = np.where(limited, m.actuator_ctrlrange[:, 1], 1.0)
+        tendon, (low, high) = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, control_range(m)
         link, scale, hill = np.zeros(m.nu, np.int32), np.zeros(m.nu), np.full((m.nu, 9), np.nan)
         segments: list[Segment] = []
         for a in range(m.nu):

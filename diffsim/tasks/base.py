@@ -41,6 +41,7 @@ class Task:
     num_random: int  # random numbers per reset; own.fit finds it, obs_dim and forward if they are not given
     forward: int | None  # column of qpos [m] that grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
+    obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
     timed: ClassVar[bool] = False  # whether observations depend on the time: see first_step and observe_at

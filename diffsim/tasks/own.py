@@ -104,6 +104,8 @@ def fit(task: Task, scene: Scene) -> None:
     _check(task, "the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
     task.obs_dim = getattr(task, "obs_dim", obs.shape[-1])
     _check(task, "obs_dim", task.obs_dim, obs.shape[-1], "what observe returns")
+    if task.obs_parts:
+        _check(task, "the sum of obs_parts", sum(size for _, size in task.obs_parts), task.obs_dim, "obs_dim")
     if type(task).reward is not Task.reward:  # who only watches needs none
         _check(task, "the shape of two rewards", tuple(task.reward(obs, action).shape), (2,))
 

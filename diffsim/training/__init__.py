@@ -6,7 +6,7 @@ The physics knows nothing of this package.
 from __future__ import annotations
 
 from diffsim.training import distributed
-from diffsim.training.checkpoint import Learner, SavedPolicy, export_policy, load_policy
+from diffsim.training.checkpoint import Learner, SavedPolicy, export_onnx, export_policy, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, command, fail
 from diffsim.training.evaluation import Evaluation, evaluate, evaluate_checkpoint, make_policy_env

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import logging
 import math
 import os
+import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim.env import DiffEnv
+from diffsim.robot.constants import control_range
 from diffsim.tasks import TASKS
 from diffsim.tasks.base import FIRM_IS_GONE
 from diffsim.training.errors import fail
@@ -218,6 +222,41 @@ def export_policy(path: Path, output: Path) -> None:
     state = load(path)
     names = ("format", "script", "args", "iteration", "simulator", "policy")
     _write(output, {name: state[name] for name in names if name in state})
+
+
+def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
+    """Write the policy as ONNX, "observation" (batch, n) -> "action" (batch, nu), clipped to [-1, 1] as env does.
+
+    n is how many columns the policy sees (Task.actor_dim). The metadata say what all the numbers are.
+    """
+    try:
+        import onnx
+        import onnxscript  # noqa: F401  # torch.onnx needs it
+    except ImportError:
+        fail('ONNX needs packages that are not installed: pip install -e ".[onnx]"')
+    task, m, layers, n = env.task, env.scene.mj_model, list(saved.network), env.task.obs_dim
+    match layers:
+        case [ObsNormalizer() as whole, First(columns=n), *others]:
+            layers = [normalizer := ObsNormalizer(n), *others]
+            normalizer.mean, normalizer.std = whole.mean[:n], whole.std[:n]
+    policy = nn.Sequential(*layers, nn.Hardtanh()).eval(), (torch.zeros(2, n),)
+    names: dict[str, Any] = dict(input_names=["observation"], output_names=["action"], verbose=False)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that there is no torchvision
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch, about its own code
+        batch = {0: torch.export.Dim("batch")}
+        program: Any = torch.onnx.export(*policy, dynamo=True, dynamic_shapes=(batch,), **names)
+    model = program.model_proto
+    for node in model.graph.node:
+        del node.metadata_props[:]  # paths of this machine
+    parts = task.obs_parts or (("observation", n),)
+    seen = Counter([name for name, size in parts for _ in range(size)][:n])
+    ranges = zip(range(m.nu), *control_range(m), strict=True)
+    told = dict(task=task.name, script=saved.script, iteration=str(saved.iteration), control_dt=str(env.control_dt))
+    told["obs"] = ", ".join(f"{name}[{size}]" for name, size in seen.items())
+    told["actuators"] = ", ".join(f"{m.actuator(a).name or a}[{low:.9g}:{high:.9g}]" for a, low, high in ranges)
+    onnx.helper.set_model_props(model, told)
+    output.write_bytes(model.SerializeToString())
 
 
 def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:

@@ -75,7 +75,7 @@ class Likeliest(nn.Module):
         parts = x.unflatten(-1, (-1, self.actions, self.components))
         index = parts[..., 0, :, :].argmax(-1, keepdim=True)
         loc = parts[..., 1, :, :] if self.loc is None else self.loc.expand(parts.shape[:-3] + self.loc.shape)
-        return loc.gather(-1, index).squeeze(-1)
+        return loc.gather(x.dim(), index).squeeze(-1)  # not -1, which onnx's reference evaluator gets wrong
 
 
 class First(nn.Module):

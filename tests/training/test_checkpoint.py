@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import operator
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,11 @@ from torch import nn
 
 import diffsim
 import shac
+from diffsim import __main__ as command
+from diffsim.tasks import Go1
 from diffsim.tasks.imitation.clip import Clip
-from diffsim.training import load_policy, parse
+from diffsim.tasks.own import ASSETS
+from diffsim.training import Likeliest, ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import FORMAT, load, restore, save
 
 STATE: dict[str, Any] = {
@@ -233,3 +238,119 @@ def test_weights_of_other_sizes_are_one_line(capsys: pytest.CaptureFixture[str])
     for other in ({"layer": nn.Linear(3, 1).state_dict()}, {}, {"layer": 3}):
         error = refusal(lambda other=other: restore(learner, {"modules": other}), capsys)  # type: ignore[misc]
         assert "the checkpoint does not fit the script as it is now: " in error
+
+
+# ONNX -----------------------------------------------------------------------------------------------------------------
+
+
+class Alone:
+    """A learner that is its policy."""
+
+    def __init__(self, policy: nn.Sequential) -> None:
+        with torch.no_grad():
+            for parameter in policy.parameters():
+                parameter.add_(0.3 * torch.randn_like(parameter))
+        self.policy = policy
+
+
+def export(checkpoint: Path, output: Path) -> tuple[Any, dict[str, str]]:
+    """What `python -m diffsim export` writes, and its metadata."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxscript")
+    command.main(["export", str(checkpoint), str(output)])
+    model = onnx.load(output)
+    onnx.checker.check_model(model, full_check=True)
+    assert str(Path(diffsim.__file__).parent).encode() not in output.read_bytes()  # nothing of this machine
+    return model, {entry.key: entry.value for entry in model.metadata_props}
+
+
+def assert_acts_alike(model: Any, network: nn.Module, obs: torch.Tensor, columns: int) -> None:
+    """On the first columns of obs, for a batch of any size; some actions are clipped."""
+    from onnx.reference import ReferenceEvaluator
+
+    evaluator = ReferenceEvaluator(model)
+    (given,), (found,) = model.graph.input, model.graph.output
+    assert (given.name, found.name) == ("observation", "action")
+    assert [dim.dim_value for dim in given.type.tensor_type.shape.dim] == [0, columns]  # 0: any batch
+    wanted = network(obs).clamp(-1, 1).detach()
+    assert wanted.std(0).min() > 1e-2  # it depends on the observation
+    for rows in (1, len(obs)):
+        (action,) = evaluator.run(["action"], {"observation": obs[:rows, :columns].numpy()})
+        torch.testing.assert_close(torch.from_numpy(action), wanted[:rows], rtol=0, atol=1e-5)
+
+
+def test_the_shipped_ant_as_onnx(tmp_path: Path) -> None:
+    path = Path(str(command.POLICIES / "ant.pt"))
+    model, told = export(path, tmp_path / "policy.onnx")
+    saved = load_policy(path)
+    assert_acts_alike(model, saved.network, torch.randn(50, 37), 37)
+    assert told == {
+        "task": "ant",
+        "script": "sapo",
+        "iteration": str(saved.iteration),
+        "control_dt": str(1 / 60),
+        "obs": "observation[37]",
+        "actuators": ", ".join(f"{part}_{leg}[-1:1]" for leg in range(1, 5) for part in ("hip", "ankle")),
+    }
+
+
+def test_onnx_takes_only_what_the_actor_sees(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    seen, whole = Go1.actor_dim, Go1.obs_dim
+    args = parse(shac.Args, "--env go1 --device cpu --actor-hidden 16".split())
+    actor = shac.Actor(args, whole, 12, seen=seen)
+    actor.normalizer.update(3.0 + 2.0 * torch.randn(100, whole) * torch.rand(whole))
+    kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
+    policy = actor.deterministic()[:-1]  # without tanh: actions leave [-1, 1]
+    save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": kept, "iteration": 7})
+    model, told = export(path, tmp_path / "policy.onnx")
+    obs = 3.0 + 3.0 * torch.randn(20, whole)
+    assert policy(obs).abs().max() > 1.5
+    assert_acts_alike(model, policy, obs, seen)
+    assert [told[name] for name in ("task", "script", "iteration", "control_dt")] == ["go1", "my_shac", "7", "0.02"]
+    assert told["obs"] == (
+        "velocity[3], angular_velocity[3], gravity[3], joints_from_home[12], joint_rates_x0.1[12], last_action[12], "
+        "command[3], clock_sin[1], clock_cos[1]"
+    )
+    scene = diffsim.load_scene(ASSETS / "go1.xml").mj_model
+    for text, a in zip(told["actuators"].split(", "), range(12), strict=True):
+        name, _, limits = text.rstrip("]").partition("[")
+        assert name == scene.actuator(a).name
+        assert list(map(float, limits.split(":"))) == pytest.approx(scene.actuator(a).ctrlrange)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_every_layer_as_onnx(shared: bool, tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    smooth = nn.ELU(), nn.LayerNorm(16), nn.SiLU(), nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 16), nn.Softplus()
+    last = nn.Linear(16, 3 if shared else 6), Likeliest(1, 3, shared), nn.Tanh()
+    learner = Alone(nn.Sequential(ObsNormalizer(5), nn.Linear(5, 16), *smooth, *last))
+    save(path := tmp_path / "checkpoint.pt", "pfpn", learner, STATE)
+    model, told = export(path, tmp_path / "policy.onnx")
+    assert_acts_alike(model, learner.policy, 3 * torch.randn(50, 5), 5)
+    assert told["actuators"] == "slider[-1:1]"
+
+
+def test_what_cannot_be_onnx_is_one_line(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(name: str) -> str:
+        return refusal(lambda: command.main(["export", str(tiny_run / "checkpoint.pt"), str(tmp_path / name)]), capsys)
+
+    assert refused("policy.xml").endswith("policy.xml: its name must end in .pt or .onnx")
+    for package in ("onnx", "onnxscript"):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, package, None)
+            assert refused("policy.onnx").endswith(
+                ': ONNX needs packages that are not installed: pip install -e ".[onnx]"'
+            )
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_of_observations_add_up() -> None:
+    for task in diffsim.TASKS.values():
+        if task.obs_parts:
+            sizes = [size for _, size in task.obs_parts]
+            assert sum(sizes) == task.obs_dim and task.actor_dim in (None, *itertools.accumulate(sizes))
+            assert len({name for name, _ in task.obs_parts}) == len(sizes)
+    assert diffsim.TASKS["g1"].obs_parts[3] == ("joints_from_home", 29)
