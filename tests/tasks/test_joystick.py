@@ -114,6 +114,28 @@ def test_observation_of_a_turned_robot() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
+    task, n = task_of(name), len(TASKS[name].robot.joints)  # type: ignore[attr-defined]
+    names, sizes = zip(*task.obs_parts, strict=True)
+    qpos, qvel = torch.rand(3, 7 + n, dtype=REAL), torch.rand(3, 6 + n, dtype=REAL)
+    qpos[:, 3:7] = torch.tensor([1.0, 0, 0, 0])
+    memory = torch.rand(3, task.num_memory, dtype=REAL)
+    command, clock, last, before, noise = memory.split((3, 1, n, n, 9 + 2 * n), dim=-1)
+    obs = dict(zip(names, task.observe_with(qpos, qvel, last, memory).split(sizes, dim=-1), strict=True))
+    down, joints = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3), qpos[:, 7:] - task._home
+    sensed = dict(zip(names[:5], (qvel[:, :3], qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
+    rest = dict(last_action=last, command=command, height=qpos[:, 2:3], action_change=last - before)
+    rest |= dict(clock_sin=(2 * torch.pi * clock).sin(), clock_cos=(2 * torch.pi * clock).cos())
+    rest |= dict(joints_from_reference=qpos[:, 7:] - task.reference(command, clock))
+    rest |= {f"true_{part}": value for part, value in sensed.items()}
+    rest |= {part: sensed[part] + each for part, each in zip(sensed, noise.split(sizes[:5], dim=-1), strict=True)}
+    assert obs.keys() == rest.keys()
+    for part, value in rest.items():
+        torch.testing.assert_close(obs[part], value)
+    assert names[:5] == ("velocity", "angular_velocity", "gravity", "joints_from_home", "joint_rates_x0.1")
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_reward_is_largest_on_the_reference(name: str) -> None:
     """Of a robot that goes as commanded, on its reference; each departure costs, and tilting or sinking ends it."""
     task, n = task_of(name), len(task_of(name).robot.joints)

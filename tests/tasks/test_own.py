@@ -218,6 +218,7 @@ def test_a_task_starts_at_the_keyframe() -> None:
     "changes, message",
     [
         (dict(obs_dim=9), "obs_dim is 9, must be 10 (what observe returns)"),
+        (dict(obs_parts=(("height", 1), ("joints", 8))), "the sum of obs_parts is 9, must be 10 (obs_dim)"),
         (dict(num_random=9), "num_random is 9, must be 10 (nq + nv)"),
         (dict(start=(0.0,) * 9), "the length of start is 9, must be 10 (nq + nv)"),
         (dict(spread=(0.1,) * 5), "the length of spread is 5, must be 10 (nq + nv)"),
