@@ -19,6 +19,7 @@ from pathlib import Path
 import common
 import mujoco
 import numpy as np
+import tables
 import torch
 from common import ABOUT, Case, load_case, run
 from numpy.typing import NDArray
@@ -152,6 +153,17 @@ def errors(velocities: Array, second: int) -> Array:
     return np.stack((np.linalg.norm(off[..., :2], axis=-1).mean(0), np.abs(off[..., 2]).mean(0)), axis=-1)
 
 
+def training(case: Case) -> dict[str, object]:
+    """Where the policy was trained, for how long, and its last evaluation's return, of what its run says."""
+    progress = case.path.parent / "progress.csv"
+    rows = tables.read_csv(progress) if progress.is_file() else []
+    evaluated = next((row for row in reversed(rows) if row["eval_return"]), None)
+    device = str(case.saved.args.get("device", "")).partition(":")[0]
+    if not rows or evaluated is None:
+        return {"device": device, "return": "", "training s": ""}
+    return {"device": device, "return": float(evaluated["eval_return"]), "training s": float(rows[-1]["seconds"])}
+
+
 def measure(path: Path, args: Args) -> list[dict[str, object]]:
     case, rows = load_case(path, 1, "cpu"), list[dict[str, object]]()
     if not isinstance(case.env.task, Joystick):
@@ -166,7 +178,7 @@ def measure(path: Path, args: Args) -> list[dict[str, object]]:
         row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
         row |= {"error": found[:, 0].mean(), "worst error": found[:, 0].max(), "yaw error": found[:, 1].mean()}
         row |= {"whole": 1 - fallen.mean(), "seconds": args.seconds}
-        rows.append(case.about | row)
+        rows.append(case.about | training(case) | row)
         print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, found[:, 0], strict=True)))
     return rows
 
