@@ -114,12 +114,13 @@ class Joystick(Task):
     episode_length = 1000
 
     forward = None  # what counts is the command
+    touchdown: ClassVar[bool] = True
 
     @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
         """See Task. Newton's method takes longer with dry friction in every joint."""
         found = super().integration(accuracy, contact)
-        return found._replace(passes=6) if found.integrator == "mujoco" else found
+        return found._replace(passes=6, touchdown=cls.touchdown) if found.integrator == "mujoco" else found
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)
@@ -246,4 +247,5 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
+    touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise
     actor_dim, obs_dim, num_memory, num_noise, num_random, obs_parts = sizes(robot)
