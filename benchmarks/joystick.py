@@ -7,7 +7,7 @@ Each command is held for 20 s from the keyframe. The error of an episode is the 
 over a second, from the command, after the first second. In MuJoCo the joints are those of the same names; servos get
 the policy's targets, and a motor the torque that the task's servo would have. Nothing else of the file is changed.
 
-Writes joystick.csv, a row for each policy and world.
+Writes joystick.csv, a row for each policy and world, and with --update-results the table of docs/joystick.md.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 import common
 import mujoco
@@ -23,6 +24,7 @@ import tables
 import torch
 from common import ABOUT, Case, load_case, run
 from numpy.typing import NDArray
+from tables import Row, markdown
 from torch import Tensor
 
 from diffsim.sim.launcher import available_cores
@@ -183,10 +185,35 @@ def measure(path: Path, args: Args) -> list[dict[str, object]]:
     return rows
 
 
+def table(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each task, learner and machine, over seeds: medians, and the worst command of the worst seed."""
+    groups = dict[tuple[str, ...], list[dict[str, str]]]()
+    for row in sorted(rows, key=lambda row: (row["task"], row["checkpoint"])):
+        machine = row["checkpoint"].partition("/")[0]
+        groups.setdefault((row["task"], row["learner"], machine, row["file"]), []).append(row)
+    lines = list[Row]()
+    for (task, learner, machine, file), group in groups.items():
+        calm = [row for row in group if float(row["push"]) == 0]
+        plain = [row for row in calm if float(row["friction"]) == 1]
+        pushed = [float(row["whole"]) for row in group if float(row["push"]) > 0]
+        middle = {name: median(float(row[name]) for row in plain) for name in ("return", "training s", "error")}
+        lines.append(
+            {"task": task, "learner": learner, "machine": machine, "seeds": len(plain)}
+            | {"return": f"{middle['return']:,.0f}", "training (s)": f"{middle['training s']:.0f}", "judged on": file}
+            | {"error (m/s)": f"{middle['error']:.3f}"}
+            | {"worst command": f"{max(float(row['worst error']) for row in plain):.2f}"}
+            | {"yaw (rad/s)": f"{median(float(row['yaw error']) for row in plain):.2f}"}
+            | {"whole": f"{min(float(row['whole']) for row in calm):.0%}"}
+            | {"whole, pushed": f"{min(pushed):.0%}" if pushed else ""}
+        )
+    return lines
+
+
 def main(args: Args) -> None:
     for path in args.measured:
         for row in measure(path, args):
             args.keep("joystick", row, (*ABOUT[:-1], "file", "friction", "push"))
+    args.publish("joystick", markdown(table(args.read("joystick"))), "joystick.md")
 
 
 if __name__ == "__main__":

@@ -96,7 +96,7 @@ def test_a_file_that_changes_is_read_again(tmp_path: Path) -> None:
         ("import sys\nsys.exit(3)\n", "task.py", "task.py, line 2: SystemExit: 3"),
         ("import nowhere\n", "task.py:Any", "task.py, line 1: ModuleNotFoundError: No module named 'nowhere'"),
         (None, "anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant"),
-        (None, "anty", "humanoid_imitation, or give a file such as my_task.py"),
+        (None, "anty", "g1, or give a file such as my_task.py"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_file(
@@ -322,7 +322,8 @@ def test_own_tasks_have_mujocos_contact_and_the_shipped_ones_the_papers() -> Non
         contact = "soft"
 
     find: Callable[..., diffsim.Integration] = lambda kind, *words: kind.integration(*words)  # noqa: E731
-    assert {task.contact for task in TASKS.values()} == {"soft"} and Bare.contact == "mujoco"
+    assert {name for name, task in TASKS.items() if task.contact == "mujoco"} == {"go1", "go2", "g1"}
+    assert Bare.contact == "mujoco"
     assert find(Bare, "default") == find(TASKS["ant"], "default", "mujoco") == diffsim.Integration("mujoco", 4)
     assert find(Bare, "accurate") == diffsim.Integration("mujoco", 16)
     assert find(Slow, "default") == diffsim.Integration("mujoco", 12)
