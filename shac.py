@@ -41,6 +41,7 @@ PER_TASK = {
     "humanoid_imitation": ((256, 128), (128, 128), 2e-3, 5e-4, 0.995, 64, 2000),
 }
 # fmt: on
+BALANCING = {"g1": {"horizon": 16, "initial_log_std": -2.0, "initial_gain": 0.01}}  # it falls before it learns to walk
 
 
 @dataclass
@@ -86,7 +87,9 @@ class Args(ParallelFlags):
     critic_minibatches: Repeats = 4
     """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
-    """initial log standard deviation of the policy's noise, before tanh"""
+    """initial log standard deviation of the policy's noise, before tanh (per task)"""
+    initial_gain: Positive = 1.0
+    """factor of the actor's last layer at the start: a small one begins with actions near zero (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
@@ -94,7 +97,7 @@ class Args(ParallelFlags):
             values = {name: value for name, value in values.items() if name == "iterations"}
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
             values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
-        return values
+        return values | BALANCING.get(self.env, {})
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -122,6 +125,12 @@ class Actor(nn.Module):
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
         network = mlp(seen or obs_dim, args.actor_hidden, action_dim, orthogonal=args.deterministic_policy)
+        if args.initial_gain != 1.0:
+            last = network[-1]
+            assert isinstance(last, nn.Linear)
+            with torch.no_grad():
+                last.weight.mul_(args.initial_gain)
+                last.bias.zero_()
         self.mean = seeing(seen, network)
         log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
         self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)

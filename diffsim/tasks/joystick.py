@@ -115,6 +115,7 @@ class Joystick(Task):
 
     forward = None  # what counts is the command
     touchdown: ClassVar[bool] = True
+    alive: ClassVar[float] = 4.0  # reward of a perfect step
 
     @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
@@ -210,7 +211,7 @@ class Joystick(Task):
         level = 0.4 * score(gravity[..., :2].square().sum(-1), 0.1)
         level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
         gait = 0.5 * score(error.square().sum(-1), 1.0) + 0.02 * change.square().sum(-1)
-        return 4.0 - 0.3 * speed - 0.15 * yaw - calm - level - gait
+        return self.alive - 0.3 * speed - 0.15 * yaw - calm - level - gait
 
     def terminated(self, obs: Tensor) -> Tensor:
         """Tilted by more than 60 degrees, or the root below 60 % of its height."""
@@ -247,5 +248,6 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
+    alive = 2.5
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise
     actor_dim, obs_dim, num_memory, num_noise, num_random, obs_parts = sizes(robot)
