@@ -182,6 +182,8 @@ def _begin(env: DiffEnv, rows: NDArray[np.int64], generators: Sequence[np.random
     rand = np.empty((len(rows), env.task.num_random))
     for row, generator in zip(rand, generators, strict=True):
         generator.random(out=row)
+    if env.task.num_noise and generators:  # of the steps to come
+        env.generator.manual_seed(int(generators[0].integers(2**62)))
     return _array(env.begin(torch.as_tensor(rows, device=env.device), _tensor(env, rand)))
 
 

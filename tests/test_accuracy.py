@@ -78,7 +78,7 @@ def test_presets_that_are_not_there_are_named(monkeypatch):
         diffsim.make("hopper", accuracy="faster")
 
     class Bare(diffsim.tasks.Task):
-        name, substeps = "bare", 8
+        name, substeps, contact = "bare", 8, "soft"
 
     assert Bare.integration("default") == Integration("semi_implicit", 8)
     with pytest.raises(ValueError, match="'bare' has no preset 'fast'"):

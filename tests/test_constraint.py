@@ -165,7 +165,7 @@ def test_pairs_and_meshes_touch_as_in_mujoco(rng):
     check_step(scene, (qpos, 0.3 * qvel, ctrl), 0.9)
 
 
-@pytest.mark.parametrize("mjcf", [FREE_SERVOS, BOUNDED_SERVOS])
+@pytest.mark.parametrize("mjcf", [pytest.param(FREE_SERVOS, marks=SLOW), BOUNDED_SERVOS])
 def test_servos_are_damped_as_by_implicitfast(mjcf, rng):
     """Their dampers are implicit, but where the force is at a bound."""
     scene = parse(mjcf)

@@ -139,7 +139,9 @@ def test_gradient_in_factors_is_that_of_differences(name, integrator, theta, rng
     check_gradients(scene, states, rng, {"factors": factors}, integration=Integration(integrator, 8, theta))
 
 
-@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
+@pytest.mark.parametrize(
+    "integrator, theta", [*(pytest.param(*how, marks=pytest.mark.slow) for how in INTEGRATORS[:2]), INTEGRATORS[2]]
+)
 def test_gradient_of_bounded_servos_is_that_of_differences(integrator, theta, rng):
     """At a bound the force depends on nothing."""
     scene = parse(BOUNDED_SERVOS)
@@ -152,7 +154,7 @@ def test_gradient_of_bounded_servos_is_that_of_differences(integrator, theta, rn
         np.testing.assert_allclose(value[:, 6:], slope[:, 6:], rtol=1e-6, atol=1e-6 * abs(slope).max())
 
 
-@pytest.mark.parametrize("integrator", ["semi_implicit", "mujoco"])
+@pytest.mark.parametrize("integrator", [pytest.param("semi_implicit", marks=pytest.mark.slow), "mujoco"])
 def test_gradient_under_gravity_compensation_is_that_of_differences(integrator, rng):
     """And in the factor of mass."""
     scene, how = parse(COMPENSATED), {"integration": Integration(integrator, 8)}

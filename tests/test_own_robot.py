@@ -61,6 +61,7 @@ def test_the_page_is_short_and_lists_the_example() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(home)
     (run,) = (home / "runs").iterdir()
@@ -95,6 +96,7 @@ def test_the_snippet_runs(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert torch.equal(steps[0][0], steps[1][0]) and torch.equal(steps[0][1], steps[1][1])
 
 
+@pytest.mark.slow
 def test_from_another_directory(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
