@@ -279,6 +279,7 @@ def assert_acts_alike(model: Any, network: nn.Module, obs: torch.Tensor, columns
         torch.testing.assert_close(torch.from_numpy(action), wanted[:rows], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_shipped_ant_as_onnx(tmp_path: Path) -> None:
     path = Path(str(command.POLICIES / "ant.pt"))
     model, told = export(path, tmp_path / "policy.onnx")
