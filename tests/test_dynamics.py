@@ -43,7 +43,11 @@ from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
-TREES = [(base, seed) for base in ("floating", "fixed", "planar", "ball") for seed in range(6)]
+TREES = [
+    pytest.param(base, seed, marks=[pytest.mark.slow] * (seed > 3))  # each compiles a kernel of its own
+    for base in ("floating", "fixed", "planar", "ball")
+    for seed in range(6)
+]
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
 CASES = [(name, *kind) for kind in INTEGRATORS for name in (DISTINCT if kind[0] == "implicit" else ROBOTS)]
 

@@ -99,7 +99,12 @@ def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
 
 
 @pytest.mark.parametrize(
-    "base, seed", [(base, seed) for base in ("floating", "fixed", "planar", "ball") for seed in range(4)]
+    "base, seed",
+    [
+        pytest.param(base, seed, marks=[pytest.mark.slow] * (seed > 1))
+        for base in ("floating", "fixed", "planar", "ball")
+        for seed in range(4)
+    ],
 )
 def test_tree_gradient_is_that_of_differences(base, seed, rng):
     scene = tree_scene(base, seed)
