@@ -239,7 +239,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             P0 = wp.zeros(shape=SLOTS, dtype=vec6)
             B = wp.zeros(shape=SLOTS, dtype=vec6)  # the twist if the rates were the accelerations, see constraint.py
             guess = wp.zeros(shape=SLOTS, dtype=T)  # acceleration of the last pass, and that of the base
-            lam = wp.zeros(shape=SLOTS, dtype=T)  # step of a pass
+            if wp.static(SEARCH):
+                lam = wp.zeros(shape=SLOTS, dtype=T)  # step of a pass
             residual = T(0.0)
 
         for sub in range(substeps):
@@ -426,13 +427,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if wp.static(FLOATING):
                             change = wp.length_sq(turning_up - wdot) + wp.length_sq(speeding_up - vdot)
                             size = size + wp.length_sq(turning_up) + wp.length_sq(speeding_up)
-                            U[0] = join(R[0] * (turning_up - wdot), speeding_up - vdot)
-                        else:
-                            U[0] = vec6()
-                        for i in range(1, n):  # from here on the step's twists
-                            lam[i] = u[i] - guess[i]
-                            U[i] = U[m.parent[at + i]] + S[i] * lam[i]
-                            change = change + lam[i] * lam[i]
+                        for i in range(1, n):
+                            change = change + (u[i] - guess[i]) * (u[i] - guess[i])
                             size = size + u[i] * u[i]
                         if wp.static(THREADS_PER_ENV > 1):
                             change = sums.add(change)
@@ -441,6 +437,12 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if wp.static(SEARCH):
                             part = T(1.0)
                             if solve > 0:
+                                U[0] = vec6()  # from here on twists of the step
+                                if wp.static(FLOATING):
+                                    U[0] = join(R[0] * (turning_up - wdot), speeding_up - vdot)
+                                for i in range(1, n):
+                                    lam[i] = u[i] - guess[i]
+                                    U[i] = U[m.parent[at + i]] + S[i] * lam[i]
                                 part = search(m, law, at, n, R, x, V, B, place, q, qd, guess, lam, U, Ia0, Ib0, Id0)
                         else:  # where a step is no shorter, half of it
                             part = pick(last_change, change, T(0.5), T(1.0))
