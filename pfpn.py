@@ -1,14 +1,12 @@
 """PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301).
 
-A Gaussian policy has one peak. Here each action has particles: normal distributions whose locations and scales are the
-same in all states, and whose weights the network gives. The policy is their mixture, which can have several peaks.
-Particles without weight are moved to those that have it. PPO, SHAC and SAC train this policy, and the policies with
-which the paper compares it.
+A Gaussian policy has one peak. Here each action has particles: normal distributions, the same in all states, whose
+weights the network gives. The policy is their mixture. Particles without weight are moved to those that have it. PPO,
+SHAC and SAC train this policy, and the policies with which the paper compares it.
 
     python pfpn.py --env ant --seed 1                        by PPO; writes runs/ant__pfpn__1__<time>/
     python pfpn.py --env ant --algorithm shac                by the simulator's gradient; --algorithm sac: off-policy
-    python pfpn.py --resume <run>/checkpoint.pt              continue an interrupted run exactly
-    python pfpn.py --evaluate <run>/checkpoint.pt            evaluate its deterministic policy
+    python pfpn.py --resume <run>/checkpoint.pt              continue an interrupted run; --evaluate: evaluate it
 """
 
 from __future__ import annotations
@@ -76,6 +74,8 @@ class Args(ParallelFlags):
     """what trains the policy: rewards alone, the simulator's gradient, or a replay buffer"""
     policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
     """particles; one Gaussian; a mixture whose locations and scales depend on the state too; fixed bins"""
+    std: Literal["state", "own"] = "state"
+    """of the Gaussian: its standard deviation depends on the state, or is a parameter of each action"""
     particles: Count = 35
     """particles (components, bins) of each action"""
     resampling: Literal["weighted", "uniform", "none"] = "weighted"
@@ -85,7 +85,9 @@ class Args(ParallelFlags):
     resampling_noise: NonNegative = 1.0
     """a particle lands within this many standard deviations of the one that it copies"""
     dead: Fraction = 0.05
-    """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
+    """a particle is dead if its weight since the last resampling is below this share of 1 / particles"""
+    dead_by: Literal["mean", "max"] = "mean"
+    """which weight: its mean over the recorded steps, or its largest (Eq. 8)"""
     estimator: Estimator = "straight-through"
     """gradient of a sampled action, with shac and sac: only straight-through is biased (docs/pfpn.md)"""
     density_floor: NonNegative = 0.01
@@ -105,6 +107,8 @@ class Args(ParallelFlags):
     """units of the hidden layers of SHAC's and SAC's critics (per task)"""
     lr: Positive = 3e-4
     """learning rate of the policy; of PPO the initial one, of SHAC too (per task)"""
+    lr_bounds: tuple[Positive, Positive] = (1e-6, 1e-2)
+    """PPO: lowest and highest learning rate; twice the same number fixes it"""
     critic_lr: Positive = 5e-4
     """learning rate of SHAC's and SAC's critics, of SHAC the initial one (per task)"""
     gamma: Fraction = 0.99
@@ -142,6 +146,7 @@ class Args(ParallelFlags):
         pathless = discrete and self.algorithm == "shac" and self.estimator == "implicit"
         for wrong, message in (
             (few, f"--particles must be from 2 to 1,000 with --policy {self.policy}, not {self.particles}"),
+            (self.lr_bounds[0] > self.lr_bounds[1], f"--lr-bounds {self.lr_bounds}: the lowest exceeds the highest"),
             (self.dead == 1, "--dead 1: with equal weights all particles would be dead"),
             (discrete and sac, "--policy discrete has no density, whose entropy --algorithm sac needs"),
             (pathless, "--policy discrete has no implicit gradient: choose --estimator straight-through or mixed"),
@@ -210,7 +215,7 @@ class Head(nn.Module):
     pfpn      the weights (Figure 2)
     discrete  the weights; the components are points, which stay where they are
     gmm       weights, locations and scales
-    gaussian  the location of its only component; with SAC its scale too, as in the other scripts
+    gaussian  the location of its only component, with --std state its scale too
     """
 
     def __init__(self, args: Args, inputs: int, actions: int) -> None:
@@ -220,11 +225,11 @@ class Head(nn.Module):
         self.scale: nn.Linear | None = None
         loc, log_std = spread(*self.shape, self.squashed)
         if self.policy == "gaussian":
-            self.linear = nn.Linear(inputs, actions)
-            if args.algorithm == "sac":
-                self.scale = nn.Linear(inputs, actions)
+            self.linear, first = nn.Linear(inputs, actions), log_std.fill_(-1.0 if args.algorithm == "shac" else 0.0)
+            if args.std == "own":
+                self.log_std = nn.Parameter(first)
             else:
-                self.log_std = nn.Parameter(torch.full(self.shape, -1.0 if args.algorithm == "shac" else 0.0))
+                self.scale = nn.Linear(inputs, actions) if args.algorithm == "sac" else almost_constant(inputs, first)
         elif self.policy == "gmm":
             self.linear = almost_constant(inputs, torch.stack((torch.zeros_like(loc), loc)))
             self.scale = almost_constant(inputs, log_std)
@@ -313,8 +318,8 @@ class Actor(nn.Module):
 def sample(mixture: Mixture, estimator: Estimator = "mixed", floor: float = 0.0) -> tuple[Tensor, Tensor]:
     """u (..., m), Eq. 4 and 5, and the log probability of the chosen components (...).
 
-    Locations and scales have the gradient of the chosen component. The weights have that of the estimator; with "mixed"
-    the caller adds the score function, for which it needs the log probability.
+    Locations and scales have the gradient of the chosen component, the weights the estimator's; with "mixed" the caller
+    adds the score function, for which it needs the log probability.
     """
     noise, std = torch.randn_like(mixture.logits[..., 0]), mixture.log_std.exp()
     if mixture.logits.shape[-1] == 1:  # a Gaussian
@@ -357,16 +362,16 @@ def implicit(mixture: Mixture, u: Tensor, floor: float) -> Tensor:
 
 
 class Resampling(nn.Module):
-    """Keeps the particles' mean weights, and moves those without weight to others (section 3.3). Works in place."""
+    """Keeps the particles' weights, and moves those without weight to others (section 3.3). Works in place."""
 
-    total: Tensor
+    seen: Tensor
     age: Tensor
     moved: Tensor
 
     def __init__(self, args: Args, head: Head) -> None:
         super().__init__()
         self.args, self.active = args, args.policy == "pfpn"  # the other policies have nothing to move
-        self.register_buffer("total", torch.zeros(head.shape))  # of the weights since the last resampling
+        self.register_buffer("seen", torch.zeros(2, *head.shape))  # since the last one: sum and largest of weights
         self.register_buffer("age", torch.zeros((), dtype=torch.int64))  # iterations
         self.register_buffer("moved", torch.zeros(()))  # particles, ever
         if self.active and (wrong := [k for k in args.log_particles if k >= head.shape[0]]):
@@ -375,7 +380,9 @@ class Resampling(nn.Module):
     def record(self, acting: Mixture) -> None:
         """Take the weights (..., m, n) with which the policy acts."""
         if self.active:
-            self.total += acting.logits.detach().softmax(-1).flatten(0, -3).sum(0)
+            weight = acting.logits.detach().softmax(-1).flatten(0, -3)
+            self.seen[0] += weight.sum(0)
+            torch.maximum(self.seen[1], weight.amax(0), out=self.seen[1])
 
     @torch.no_grad()
     def end_iteration(self, head: Head, optimizer: ClippedAdam) -> dict[str, Tensor]:
@@ -385,35 +392,34 @@ class Resampling(nn.Module):
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
         due = self.age % self.args.resampling_interval == 0
-        total = distributed.average(self.total)  # ranks decide alike
-        weight = total / total.sum(-1, keepdim=True)
-        dead = weight < self.args.dead / head.shape[1]  # Eq. 8, of the mean; none where nothing was recorded
+        every = distributed.stack(self.seen)  # ranks decide alike
+        weight = every[:, 0].sum(0) / every[:, 0].sum((0, -1)).unsqueeze(-1)  # where nothing was recorded not a number
+        least, largest = self.args.dead / head.shape[1], torch.maximum(weight, every[:, 1].amax(0))
+        below = {"mean": weight < least, "max": largest < least}  # Eq. 8 has the second
+        dead = below[self.args.dead_by]
         if self.args.resampling != "none":
             chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
             self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))
         found = {
-            "particles/dead": dead.to(weight.dtype).mean(),
+            **{f"particles/dead_{by}": each.to(weight.dtype).mean() for by, each in below.items()},
             "particles/moved": self.moved,
             "particles/active": (-torch.xlogy(weight, weight).sum(-1)).exp().mean(),
             "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
         }
-        loc = torch.tanh(head.loc) if head.squashed else head.loc.clone()
-        for name, values in (("loc", loc), ("weight", weight)):
+        for name, values in (("loc", head.loc.tanh() if head.squashed else head.loc.clone()), ("weight", weight)):
             for k in self.args.log_particles:
                 found |= {f"particles/{name}_{k}_{i}": value for i, value in enumerate(values[k].unbind())}
-        self.total *= ~due
+        self.seen *= ~due
         return found
 
     def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
         """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
 
-        |D| copies share the weight of their target: log(|D| + 1) less in the logits of each. Adam's moments of what is
-        overwritten start at zero.
+        |D| copies share the weight of their target: log(|D| + 1) less in each logit. Adam's moments of them are zeroed.
         """
         m, n = head.shape
         draws = distributed.stack(torch.empty(m, n, n, device=dead.device).exponential_())[0]
-        own = torch.arange(n, device=dead.device).expand(m, n)
-        target = torch.where(dead, (chance.unsqueeze(1) / draws).argmax(-1), own)
+        target = torch.where(dead, (chance.unsqueeze(1) / draws).argmax(-1), torch.arange(n, device=dead.device))
         copies = torch.zeros_like(chance).scatter_add(1, target, dead.to(chance.dtype))
         head.linear.bias.data.view(m, n).sub_(torch.log1p(copies))
         for parameter in (head.linear.weight, head.linear.bias, head.loc, head.log_std):
@@ -440,10 +446,7 @@ class Window(NamedTuple):
 
 
 class Learner:
-    """What the algorithms share. Each adds the two halves of an iteration, interact and learn.
-
-    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
-    """
+    """What the algorithms share. Each adds the two halves of an iteration, interact and learn, as CUDA graphs allow."""
 
     max_grad_norm, betas = 1.0, (0.9, 0.999)
     samples: list[Tensor]  # (H N, ...) of a window
@@ -500,10 +503,7 @@ class Learner:
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """SHAC's Eq. 7 of (H, N) steps, backward in time: the value's targets; minus the value, PPO's advantages.
-
-    A done ends the return as the window's end does. next_value is V(s_{t+1}) before any reset, 0 where terminated.
-    """
+    """SHAC's Eq. 7 (H, N), to a done or the window's end. next_value is V(s_{t+1}) before a reset, 0 if terminated."""
     returns = torch.empty_like(reward)
     following = next_value[-1]
     for t in reversed(range(len(reward))):
@@ -515,7 +515,7 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
 class PPO(Learner):
     """Proximal Policy Optimization, with the constants of ppo_baseline.py."""
 
-    target_kl, lr_bounds, clip_coef, value_coef, bound_coef = 0.008, (1e-6, 1e-2), 0.2, 2.0, 1e-4
+    target_kl, clip_coef, value_coef, bound_coef = 0.008, 0.2, 2.0, 1e-4
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__(args, env)
@@ -559,7 +559,7 @@ class PPO(Learner):
         log_ratio = mixture.log_prob(u) - log_prob
         kl = distributed.average((log_ratio.detach().expm1() - log_ratio.detach()).mean())  # estimated; not below zero
         up, down = (x.to(kl.dtype) for x in (kl < self.target_kl / 2, kl > 2 * self.target_kl))
-        self.optimizer.lr.mul_(1.5 ** (up - down)).clamp_(*self.lr_bounds)
+        self.optimizer.lr.mul_(1.5 ** (up - down)).clamp_(*self.args.lr_bounds)
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - self.clip_coef, 1 + self.clip_coef)
         policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean()

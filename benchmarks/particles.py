@@ -24,7 +24,8 @@ import pfpn  # noqa: E402
 
 PEAKS, NEAR = (-0.25, 0.75), 0.15
 POLICIES = ("pfpn", "gaussian", "gmm", "discrete")
-SETTING = "--env ant --device cpu --horizon 1 --hidden 1 --minibatch-size 256 --epochs 4 --lr 3e-3"
+SETTING = "--env ant --device cpu --horizon 1 --hidden 1 --minibatch-size 256 --epochs 4 --std own "
+SETTING += "--lr 3e-3 --lr-bounds 3e-3 3e-3"
 CASES = {"0": (150, 500), "0.2": (150, 500)}  # entropy's weight: iterations of 256 actions each
 SAMPLES = 20_000  # actions of a trained policy
 CASE = ("policy", "entropy's weight", "iterations")
@@ -59,7 +60,6 @@ def learn(policy: str, entropy: str, seed: int) -> dict[int, Tensor]:
     torch.manual_seed(seed)
     bandit: Any = Bandit()
     learner = pfpn.PPO(args, bandit)
-    learner.lr_bounds = (args.lr, args.lr)
     if policy == "gaussian":
         learner.actor.head.log_std.data.fill_(-1.0)
     drawn = dict[int, Tensor]()

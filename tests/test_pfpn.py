@@ -78,6 +78,22 @@ def test_bins_count_as_the_nearest() -> None:
     assert all(g.isfinite().all() for g in torch.autograd.grad(bins.log_prob(u).sum() + bins.entropy().sum(), logits))
 
 
+@pytest.mark.parametrize("std", ["state", "own"])
+@pytest.mark.parametrize(("algorithm", "first"), [("ppo", 0.0), ("shac", -1.0)])
+def test_the_deviation_of_a_gaussian_depends_on_the_state_or_not(algorithm: str, first: float, std: str) -> None:
+    args = parse(pfpn.Args, f"--device cpu --policy gaussian --algorithm {algorithm} --std {std}".split())
+    own, features = pfpn.Head(args, 4, M), torch.randn(20, 4)
+    before = own(features).log_std.detach().clone()
+    assert (before - first).abs().max() < 0.2
+    mixture = own(features[:1])
+    mixture.log_prob(mixture.loc.detach().squeeze(-1) + 10.0).sum().backward()  # in this state it has to widen
+    with torch.no_grad():
+        for name, parameter in own.named_parameters():
+            parameter += 0.0 if "linear" in name else 1e-3 * parameter.grad
+        change = (own(features).log_std - before).expand(20, M, 1)
+    assert change[0].min() > 0 and (change.std(0).max() < 1e-6) == (std == "own")
+
+
 def test_entropy_is_of_the_weights_or_of_the_gaussian() -> None:
     logits, loc, log_std = parameters(BATCH)
     entropy = pfpn.Mixture(logits, loc, log_std, False).entropy()
@@ -195,7 +211,7 @@ def test_resampling_leaves_the_policy_as_it_is(algorithm: str, resampling: str) 
     metrics = moving.end_iteration(own, optimizer)
     after = own(features)
     assert (after.log_prob(u) - before.log_prob(u)).abs().max() < 1e-10
-    assert metrics["particles/moved"] == 6 and metrics["particles/dead"].item() == pytest.approx(6 / 18)
+    assert metrics["particles/moved"] == 6 and metrics["particles/dead_mean"].item() == pytest.approx(6 / 18)
 
     dead = torch.zeros(M, 6, dtype=torch.bool)
     dead[tuple(zip(*DEAD, strict=True))] = True
@@ -207,7 +223,7 @@ def test_resampling_leaves_the_policy_as_it_is(algorithm: str, resampling: str) 
     assert alone.any() and all(torch.equal(x[alone], was[alone]) for x, was in zip(views, old, strict=True))
     for moment, was in zip(moments, old_moments, strict=True):
         assert not moment[dead].any() and was[dead].any() and torch.equal(moment[~dead], was[~dead])
-    assert not moving.total.any()
+    assert not moving.seen.any()
 
 
 def test_weights_below_the_threshold_bound_the_change() -> None:
@@ -270,8 +286,24 @@ def test_nothing_is_moved(case: str, flags: str, dead: int) -> None:
     before = [x.clone() for x in state]
     metrics = moving.end_iteration(own, optimizer)
     assert all(torch.equal(x, was) for x, was in zip(state, before, strict=True))
-    assert moving.moved == 0 and bool(moving.total.any()) == (case == "not due")
-    assert metrics["particles/dead"].item() == pytest.approx(dead / 18)
+    assert moving.moved == 0 and bool(moving.seen.any()) == (case == "not due")
+    assert [metrics[f"particles/dead_{by}"].item() for by in ("mean", "max")] == pytest.approx([dead / 18] * 2)
+
+
+@pytest.mark.parametrize(("by", "moved"), [("mean", 2), ("max", 1)])
+def test_what_makes_a_particle_dead(by: str, moved: int) -> None:
+    """By its largest weight (Eq. 8) it is alive if it has weight in one of the recorded states, of any window."""
+    own, moving, optimizer, features = head("--dead-by", by, "--resampling-interval", "2")
+    kill(own, [(0, 1), (2, 3)])
+    features[:, 0] = 0.0
+    features[7, 0] = 1.0  # the state where particle 3 of action 2 has weight
+    own.linear.weight.data.view(M, 6, 4)[2, 3, 0] = 1e4
+    for part in (features, features[10:]):
+        moving.record(own(part))
+        metrics = moving.end_iteration(own, optimizer)
+    assert metrics["particles/dead_mean"].item() == pytest.approx(2 / 18)
+    assert metrics["particles/dead_max"].item() == pytest.approx(1 / 18)
+    assert moving.moved == moved
 
 
 # Problems -------------------------------------------------------------------------------------------------------------
@@ -330,18 +362,17 @@ def masses(actor: pfpn.Actor) -> tuple[float, float]:
     return left, right
 
 
-def ppo_bandit(flags: str, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(pfpn.PPO, "lr_bounds", (3e-3, 3e-3))
+def ppo_bandit(flags: str) -> Any:
     torch.manual_seed(1)
-    flags = f"--minibatch-size 256 --epochs 4 --lr 3e-3 --entropy-coef 0 {flags}"
+    flags = f"--minibatch-size 256 --epochs 4 --lr 3e-3 --lr-bounds 3e-3 3e-3 --entropy-coef 0 --std own {flags}"
     return build(flags, lambda _, action: 1 / (distance(action) + 0.1))
 
 
-def test_ppo_bandit_with_two_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ppo_bandit_with_two_peaks() -> None:
     """Figure 11: particles cover both peaks, a Gaussian one of them."""
     found = {}
     for policy in ("pfpn", "gaussian"):
-        learner = ppo_bandit(f"--policy {policy}", monkeypatch)
+        learner = ppo_bandit(f"--policy {policy}")
         if policy == "gaussian":
             learner.actor.head.log_std.data.fill_(-1)
         solve(learner, 120)
@@ -351,9 +382,9 @@ def test_ppo_bandit_with_two_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(found["gaussian"]) > 0.9 and min(found["gaussian"]) < 0.01
 
 
-def test_ppo_bandit_stays_on_both_peaks_with_entropy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ppo_bandit_stays_on_both_peaks_with_entropy() -> None:
     """Without the bonus one of the equal peaks has less than 0.02 by then. Particles have been moved."""
-    learner = solve(ppo_bandit("--hidden 16 --entropy-coef 0.2", monkeypatch), 80)
+    learner = solve(ppo_bandit("--hidden 16 --entropy-coef 0.2"), 80)
     assert min(masses(learner.actor)) > 0.2 and learner.resampling.moved > 0
 
 
@@ -447,7 +478,7 @@ def test_skipped_updates_are_those_of_all_optimizers() -> None:
 
 def test_locations_beyond_the_bounds_are_drawn_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pfpn.PPO, "bound_coef", 1e4)
-    learner = ppo_bandit("", monkeypatch)
+    learner = ppo_bandit("")
     loc = learner.actor.head.loc.data
     loc.copy_(torch.linspace(-2, 2, 35))
     before = loc.clone()
@@ -498,20 +529,17 @@ def test_other_policies_train(flags: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "shac"])
-def test_a_gaussian_is_trained_as_by_the_other_scripts(
-    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gaussian_is_trained_as_by_the_other_scripts(algorithm: str, tmp_path: Path) -> None:
     """The same random numbers give the same weights, up to rounding: the order of sums differs."""
     shared = "--env cartpole --device cpu --quiet --num-envs 16 --horizon 32 --iterations 3 --eval-episodes 1"
     if algorithm == "ppo":
-        shared += " --minibatch-size 100 --epochs 2 --entropy-coef 0.01"
-        theirs = run(ppo_baseline, tmp_path / "theirs", *shared.split(), *"--lr-bounds 3e-4 3e-4".split())
-        monkeypatch.setattr(pfpn.PPO, "lr_bounds", (3e-4, 3e-4))
+        shared += " --minibatch-size 100 --epochs 2 --entropy-coef 0.01 --lr-bounds 3e-4 3e-4"
+        theirs = run(ppo_baseline, tmp_path / "theirs", *shared.split())
     else:
         own = "--critic-iterations 2 --critic-minibatches 4"
         theirs = run(shac, tmp_path / "theirs", *shared.split(), *own.split())
         shared += " --epochs 2 --minibatch-size 128"
-    ours = run(pfpn, tmp_path / "ours", *f"{shared} --algorithm {algorithm} --policy gaussian".split())
+    ours = run(pfpn, tmp_path / "ours", *f"{shared} --algorithm {algorithm} --policy gaussian --std own".split())
     weights = [list(checkpoint["policy"]["weights"].values()) for checkpoint in (ours, theirs)]
     torch.testing.assert_close(*weights, rtol=1e-3, atol=2e-5)
 

@@ -68,6 +68,11 @@ class Clip:
         """(2,) m, by which x and y grow in a round; 0 if it is no loop."""
         return (self.qpos[-1, :2] - self.qpos[0, :2]) * self.loop
 
+    def at(self, control_dt: float) -> Clip:
+        """The motion with a frame every control_dt seconds, of which its duration becomes a whole number."""
+        frames = round((len(self.qpos) - 1) * CONTROL_DT / control_dt) + 1
+        return self if frames == len(self.qpos) else Clip(self.name, _resample(self.qpos, frames), self.loop)
+
     def velocity(self, control_dt: float = CONTROL_DT) -> Tensor:
         """qvel (T, nv) of each frame, the mean of the differences to the frames before and after it."""
         step = tangent(self.qpos[:-1], self.qpos[1:])

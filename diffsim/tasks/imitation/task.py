@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
-from diffsim.tasks.base import Task
+from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.tasks.imitation.kinematics import Kinematics, difference, matrix
 from diffsim.tasks.own import robot
 
-END_EFFECTORS = ("right_hand", "left_hand", "right_foot_inner", "left_foot_inner")  # the middle of each geom
 STRAY = 0.5  # m; the episode ends when the root is further from the reference's
 
 
@@ -30,12 +29,19 @@ class HumanoidImitation(Task):
     """
 
     name = "humanoid_imitation"
-    asset, contact = Humanoid.asset, Humanoid.contact
+    asset = Humanoid.asset
+    contact: ClassVar[Contact] = Humanoid.contact
     substeps, fast, accurate = Humanoid.substeps, Humanoid.fast, Humanoid.accurate
     obs_dim = 57
     num_random = 1
     timed = True
     default_clip: ClassVar[str] = "humanoid_run"
+    ends: ClassVar[tuple[str, ...]] = (
+        "right_hand",
+        "left_hand",
+        "right_foot_inner",
+        "left_foot_inner",
+    )  # geoms' middles
     start, spread = (), ()
 
     def __init__(
@@ -47,14 +53,15 @@ class HumanoidImitation(Task):
         self.clip = read_clip(self.default_clip) if clip is None else clip
         self.clip.check(model)
         self._kinematics = Kinematics(model, device, dtype)
-        geoms = [model.geom(name).id for name in END_EFFECTORS]
+        geoms = [model.geom(name).id for name in self.ends]
         self._bodies = torch.tensor(model.geom_bodyid[geoms] - 1, device=device, dtype=torch.int64)
         self._points = torch.tensor(model.geom_pos[geoms], device=device, dtype=dtype)
         self._trunk = torch.tensor(scene.contact_position[trunk], device=device, dtype=dtype)
         self._radii = torch.tensor(scene.contact_radius[trunk], device=device, dtype=dtype)
 
-        self.period = len(self.clip)
-        self._qpos, self._qvel = self.clip.qpos[: self.period].to(device, dtype), self.clip.velocity(self.control_dt)
+        clip = self.clip.at(self.control_dt)
+        self.period = len(clip)
+        self._qpos, self._qvel = clip.qpos[: self.period].to(device, dtype), clip.velocity(self.control_dt)
         self._qvel = self._qvel[: self.period].to(device, dtype)
         self._advance = self.clip.advance.to(device, dtype)
         at_origin = torch.cat((torch.zeros_like(self._qpos[:, :2]), self._qpos[:, 2:]), dim=-1)

@@ -22,7 +22,7 @@ import pods
 import ppo_baseline
 import shac
 from diffsim import Clip, read_clip
-from diffsim.tasks.imitation.task import END_EFFECTORS, STRAY, HumanoidImitation
+from diffsim.tasks.imitation.task import STRAY, HumanoidImitation
 from diffsim.training import export_policy, load_policy, make_policy_env, parse
 
 REAL = torch.float64
@@ -232,7 +232,7 @@ def test_places_are_mujocos(task: HumanoidImitation, rng: np.random.Generator) -
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        seen.append((np.array([data.geom(name).xpos for name in END_EFFECTORS]), data.subtree_com[0].copy()))
+        seen.append((np.array([data.geom(name).xpos for name in HumanoidImitation.ends]), data.subtree_com[0].copy()))
     ends, centre = (np.square(a - b).sum() for a, b in zip(*seen, strict=True))
     found = task.terms(task.observe_at(off, qvel, NOTHING, step))
     assert [x.item() for x in found[2:]] == pytest.approx([math.exp(-40 * ends), math.exp(-10 * centre)], rel=1e-9)
