@@ -82,7 +82,7 @@ class Args(ParallelFlags):
     """where dead particles go: to living ones in proportion to their mean weight, to any of them, or nowhere"""
     resampling_interval: Count = 20
     """iterations between resamplings"""
-    resampling_noise: NonNegative = 1.0
+    resampling_noise: NonNegative = 0.1
     """a particle lands within this many standard deviations of the one that it copies"""
     dead: Fraction = 0.05
     """a particle is dead if its weight since the last resampling is below this share of 1 / particles"""
