@@ -25,6 +25,7 @@ from torch import Tensor
 sys.path.append(str(ROOT))
 import pfpn  # noqa: E402
 
+PartName = Literal["peaks", "noise"]
 PEAKS, NEAR = (-0.25, 0.75), 0.15
 POLICIES = ("pfpn", "gaussian", "gmm", "discrete")
 SETTING = "--env ant --device cpu --horizon 1 --hidden 1 --minibatch-size 256 --epochs 4 --std own "
@@ -38,7 +39,7 @@ CASE = ("policy", "entropy's weight", "iterations")
 @dataclass
 class Args(CommonFlags):
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5)  # seeds of the bandit
-    parts: tuple[Literal["peaks", "noise"], ...] = ("peaks", "noise")  # what to measure
+    parts: tuple[PartName, ...] = ("peaks", "noise")  # what to measure
 
 
 class Bandit:
@@ -121,15 +122,12 @@ def disturb(args: Args) -> None:
 
 def means(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each noise: means over the seeds."""
-    noises = dict.fromkeys(row["noise"] for row in rows)
-    return [
-        {"noise": noise}
-        | {
-            name: mean(float(row[name]) for row in rows if row["noise"] == noise)
-            for name in ("moved", "total variation")
-        }
-        for noise in noises
-    ]
+    found = list[Row]()
+    for noise in dict.fromkeys(row["noise"] for row in rows):
+        own = [row for row in rows if row["noise"] == noise]
+        moved, change = (mean(float(row[name]) for row in own) for name in ("moved", "total variation"))
+        found.append({"standard deviations": noise, "particles moved": moved, "change of the policy": change})
+    return found
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:

@@ -54,49 +54,50 @@ def cases(args: Args) -> Iterator[Case]:
 
 
 def measured(args: Args) -> Iterator[Row]:
-    """A line for each run, finished or not."""
+    """A line for each run that has been evaluated, finished or not."""
     for case in cases(args):
         rows = read_csv(case.folder / "progress.csv")
-        evaluated = [row for row in rows if row.get("eval_return")]
+        returns = [float(row["return"]) for row in rows if row["return"]]
+        evaluated = [row["eval_return"] for row in rows if row["eval_return"]]
         if not evaluated:
             continue
-        last = rows[-1]
-        row: dict[str, object] = {
-            "figure": case.folder.parent.name,
-            "cell": case.folder.name.rpartition("__")[0],
-            "seed": seed(case.folder),
-            "control steps": int(float(last["control_steps"])),
-            "return": float(evaluated[-1]["eval_return"]),
-            "best return": max(float(row["eval_return"]) for row in evaluated),
-            "return of training": float(last["return"]),
-        }
-        if moved := last.get("particles_moved"):
-            dead = {by: [float(row[f"particles_dead_{by}"]) for row in rows] for by in ("mean", "max")}
-            row |= {f"dead by {by} (%)": 100 * max(values) for by, values in dead.items()}
-            row |= {"moved": int(float(moved))}
+        row: dict[str, object] = {"figure": case.folder.parent.name, "cell": case.folder.name.rpartition("__")[0]}
+        row |= {"seed": seed(case.folder), "control_steps": rows[-1]["control_steps"]}
+        row |= {"eval_return": float(evaluated[-1]), "training": returns[-1], "training_mean": mean(returns)}
+        if moved := rows[-1].get("particles_moved"):
+            dead = {f"dead_by_{by}": max(float(row[f"particles_dead_{by}"]) for row in rows) for by in ("mean", "max")}
+            row |= dead | {"moved": int(float(moved)), "active": float(rows[-1]["particles_active"])}
         yield row
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each cell: means over its seeds, and their deviation where there are several."""
+    """A line for each cell: means over its seeds, of the evaluation their deviation and each one's, too."""
     found: dict[str, list[dict[str, str]]] = {}
     for row in rows:
         found.setdefault(row["cell"], []).append(row)
-    return [
-        {"cell": cell, "seeds": len(own)} | {name: summary(own, name) for name in SHOWN} for cell, own in found.items()
-    ]
+    lines = [line(cell, own) for cell, own in found.items()]
+    columns = dict.fromkeys(name for row in lines for name in row)
+    return [{name: row.get(name, "") for name in columns} for row in lines]
 
 
-SHOWN = ("control steps", "return", "best return", "return of training", "dead by mean (%)", "dead by max (%)", "moved")
+NUMBERS = ("eval_return", "training_mean", "dead_by_mean", "dead_by_max", "moved")
 
 
-def summary(rows: list[dict[str, str]], name: str) -> str:
-    values = [float(row[name]) for row in rows if row.get(name)]
-    if not values:
-        return ""
-    if name == "control steps":
-        return f"{mean(values) / 1e6:.3g} M"
-    return f"{mean(values):.0f}" + (f" ± {pstdev(values):.0f}" if len(values) > 1 and "return" in name else "")
+def line(cell: str, rows: list[dict[str, str]]) -> Row:
+    numbers = {name: [float(row[name]) for row in rows if row.get(name)] for name in NUMBERS}
+    returns, steps = numbers["eval_return"], {row["control_steps"] for row in rows}
+    shown: dict[str, object] = {
+        "case": cell,
+        "seeds": len(rows),
+        "steps": " or ".join(f"{float(count) / 1e6:.2g} M" for count in sorted(steps, key=float)),
+        "return": f"{mean(returns):.0f}" + (f" ± {pstdev(returns):.0f}" if len(returns) > 1 else ""),
+        "each": ", ".join(f"{value:.0f}" for value in returns),
+        "in training": f"{mean(numbers['training_mean']):.0f}",
+    }
+    if numbers["moved"]:
+        shown |= {f"dead by {by}": f"{max(numbers[f'dead_by_{by}']):.0%}" for by in ("mean", "max")}
+        shown |= {"moved": ", ".join(f"{value:.0f}" for value in numbers["moved"])}
+    return shown
 
 
 def main(args: Args) -> None:
@@ -104,8 +105,7 @@ def main(args: Args) -> None:
         runner = Runner(args)
         for case in cases(args):
             runner.train(case)
-    args.merge("pfpn_cells", list(measured(args)), KEY)
-    rows = args.read("pfpn_cells")
+    rows = args.merge("pfpn_cells", list(measured(args)), KEY)
     for name in args.only:
         args.publish(name, markdown(table([row for row in rows if row["figure"] == name])), "pfpn.md")
 
