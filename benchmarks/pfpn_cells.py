@@ -71,7 +71,7 @@ def measured(args: Args) -> Iterator[Row]:
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each cell: means over its seeds, of the evaluation their deviation and each one's, too."""
+    """A line for each cell: means over its seeds, of the evaluation their deviation, too; of the dead the most."""
     found: dict[str, list[dict[str, str]]] = {}
     for row in rows:
         found.setdefault(row["cell"], []).append(row)
@@ -85,18 +85,15 @@ NUMBERS = ("eval_return", "training_mean", "dead_by_mean", "dead_by_max", "moved
 
 def line(cell: str, rows: list[dict[str, str]]) -> Row:
     numbers = {name: [float(row[name]) for row in rows if row.get(name)] for name in NUMBERS}
-    returns, steps = numbers["eval_return"], {row["control_steps"] for row in rows}
+    returns = numbers["eval_return"]
     shown: dict[str, object] = {
         "case": cell,
-        "seeds": len(rows),
-        "steps": " or ".join(f"{float(count) / 1e6:.2g} M" for count in sorted(steps, key=float)),
         "return": f"{mean(returns):.0f}" + (f" ± {pstdev(returns):.0f}" if len(returns) > 1 else ""),
-        "each": ", ".join(f"{value:.0f}" for value in returns),
         "in training": f"{mean(numbers['training_mean']):.0f}",
     }
     if numbers["moved"]:
-        shown |= {f"dead by {by}": f"{max(numbers[f'dead_by_{by}']):.0%}" for by in ("mean", "max")}
-        shown |= {"moved": ", ".join(f"{value:.0f}" for value in numbers["moved"])}
+        dead = (max(numbers[f"dead_by_{by}"]) for by in ("mean", "max"))
+        shown |= {"dead": "/".join(f"{share:.0%}" for share in dead), "moved": f"{mean(numbers['moved']):.0f}"}
     return shown
 
 
