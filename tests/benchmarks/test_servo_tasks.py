@@ -46,7 +46,7 @@ def test_the_reference_has_every_second_frame_of_the_clip(task: servo_tasks.Huma
     torch.testing.assert_close(qpos, task.clip.qpos[: 2 * task.period : 2])
     turn = (task.clip.qpos[4, 7:] - task.clip.qpos[0, 7:]) * 15  # rad/s, over two control steps of 1/30 s
     torch.testing.assert_close(qvel[1, 6:], turn)
-    obs = task.observe_at(qpos, qvel, torch.zeros(task.period, 12), step)
+    obs = task.observe_with(qpos, qvel, torch.zeros(task.period, 12), task.begin(rand))
     assert obs.shape == (task.period, task.obs_dim) == (task.period, qpos.shape[1] + qvel.shape[1] + 2)
     torch.testing.assert_close(task.reward(obs, obs), torch.ones(task.period, dtype=torch.float64))
     assert not task.terminated(obs).any()
@@ -56,7 +56,7 @@ def test_a_dog_that_lies_down_ends_its_episode() -> None:
     task = servo_tasks.Dog(dtype=torch.float64, clip=read_clip(TROT))
     qpos, qvel = task.reset(torch.full((2, 1), 0.5, dtype=torch.float64))
     qpos[1, 2] = 0.15
-    obs = task.observe_at(qpos, qvel, qvel, torch.zeros(2, dtype=torch.int64))
+    obs = task.observe_with(qpos, qvel, qvel, torch.zeros(2, 1, dtype=torch.float64))
     assert task.terminated(obs).tolist() == [False, True]
 
 

@@ -37,12 +37,8 @@ class HumanoidImitation(Task):
     obs_dim = 57
     num_random = num_memory = 1
     default_clip: ClassVar[str] = "humanoid_run"
-    ends: ClassVar[tuple[str, ...]] = (
-        "right_hand",
-        "left_hand",
-        "right_foot_inner",
-        "left_foot_inner",
-    )  # geoms' middles
+    # The middles of these geoms
+    ends: ClassVar[tuple[str, ...]] = ("right_hand", "left_hand", "right_foot_inner", "left_foot_inner")
     start, spread = (), ()
 
     def __init__(
