@@ -37,6 +37,7 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.planning import REAL, nearest_feedback
+from diffsim.planning.samples import log_mixture, log_weights
 from diffsim.training import checkpoint, command, fail, load_policy, parse_penalty
 
 GPS = json.loads((ROOT / "benchmarks" / "cases.json").read_text())["gps"]
@@ -51,6 +52,7 @@ KEPT = (  # columns of progress.csv
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
 PERTURBED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
+WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
 DRAWN = [*VARIANTS, "full", "adaptive", "feedback", "feedback-short", "feedback-long"]
 COLOURS = [*(f"C{i}" for i in range(10)), "k"]
@@ -83,6 +85,7 @@ def environment(path: Path, **options: Any) -> diffsim.DiffEnv:
     """One environment, as that in which a checkpoint's policy was trained."""
     args = checkpoint.load(path)["args"]
     options |= {name: args[name] for name in ("integrator", "substeps", "theta")}
+    options["control_dt"] = args.get("control_dt")  # gps.py alone
     return diffsim.make(args["env"], 1, horizon=1, penalty=parse_penalty(args["penalty"]), **options)
 
 
@@ -101,7 +104,7 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
         states.append((env.qpos, env.qvel))
     qpos, qvel = (torch.cat(parts).numpy() for parts in zip(*states, strict=True))
     with path.open("wb") as file:
-        np.savez(file, qpos=qpos, qvel=qvel, action=torch.cat(actions).numpy())
+        np.savez(file, qpos=qpos, qvel=qvel, action=torch.cat(actions).numpy(), control_dt=env.control_dt)
     print(f"{env.task.name}, {steps} control steps: {path}")
 
 
@@ -125,6 +128,8 @@ def train(directory: Path, flags: Sequence[str], count: int) -> str:
         return f"{directory.name}: exit code {code}, see {log.name}"
     if case in PERTURBED:
         write_csv(directory / "generalisation.csv", generalisation(load_search(path), count))
+    if case.startswith("paper"):
+        write_csv(directory / "weights.csv", weights(load_search(path)))
     return f"{directory.name}: done"
 
 
@@ -204,6 +209,28 @@ def generalisation(search: gps.Search, count: int) -> list[Row]:
 
 
 # Table and pictures ---------------------------------------------------------------------------------------------------
+
+
+def weights(search: gps.Search) -> list[Row]:
+    """What importance sampling rests on, at some steps t: how theta* weighs the samples of S.
+
+    Mean log weights (nats) of the guides' samples and of its own newest, effective samples, the guides' share of the
+    weight; and up to t, per step, on the guides' samples: log pi - log q_guide (nats), the distance of the actions from
+    the policy's mean and the guides' deviation, in deviations of the policy's noise.
+    """
+    S, policy, rows = search.S.samples, search.network, []
+    log_pi, guides = policy.log_prob(policy.theta, S.obs, S.u), search.S.initial
+    log_w, guided = log_weights(log_pi, S.log_mixture), S.source < guides
+    own, weight = (S.source == search.S.best).nonzero().flatten()[-search.args.samples :], log_w.softmax(0)
+    gap = log_pi.cumsum(1) - log_mixture(S.log_q[:, :guides])
+    away = ((S.u - policy.mean(policy.theta, S.obs)) / policy.sigma).square().mean(-1)
+    wide = (search.guides[0].L.norm(dim=-1) / policy.sigma).square().mean(-1)
+    for t in (t for t in WEIGHED if t <= search.args.horizon):
+        row = dict(step=t, guides=log_w[guided, t - 1].mean(), own=log_w[own, t - 1].mean())
+        row |= dict(effective=1 / weight[:, t - 1].square().sum(), share=weight[guided, t - 1].sum())
+        row |= dict(gap=gap[guided, t - 1].mean() / t, away=away[guided, :t].mean().sqrt(), wide=wide[:t].mean().sqrt())
+        rows.append({name: torch.as_tensor(value).item() for name, value in row.items()})
+    return rows
 
 
 def number(text: str) -> float:

@@ -19,7 +19,7 @@ TINY = (
 @pytest.mark.parametrize("case", list(gps_variants.CASES))
 def test_variants(case: str, tmp_path: Path) -> None:
     modules = run(gps_variants, tmp_path, *TINY, "--case", case)["modules"]
-    search, S, guided = modules["learner"], modules["S"], case == "unregularized"
+    search, S, guided = modules["learner"], modules["S"], case in ("unregularized", "effective")
     assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
     assert (search["w_r"] == 0) == (case == "unregularized")
     assert (len(S["samples"][0][:, 0].unique(dim=0)) > 3) == (case == "restart")
