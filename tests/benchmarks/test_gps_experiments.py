@@ -67,6 +67,28 @@ def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
 
 
+def test_weights_at_some_steps(runs: Path) -> None:
+    """By products of densities, which a few steps allow; the guide as a policy would weigh its samples alike."""
+    search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
+    rows, S, policy = experiments.weights(search), search.S.samples, search.network
+    assert [row["step"] for row in rows] == [1, 2, 5, 10]
+    mean = policy.mean(policy.theta, S.obs)
+    away = (S.u - mean) / policy.sigma
+    step = (-0.5 * away.square() - math.log(math.sqrt(2 * math.pi))).sum(-1) - policy.sigma.log().sum()
+    density = torch.stack([search.S.log_density(g, S) for g in search.S.generators])
+    used, guided, own = S.source.unique(), S.source == 0, (S.source == search.S.best).nonzero().flatten()[-4:]
+    for row in rows:
+        t = int(row["step"])
+        weight = step[:, :t].sum(1).exp() / density[used, :, t - 1].exp().mean(0)
+        share = weight / weight.sum()
+        expected = dict(guides=weight[guided].log().mean(), own=weight[own].log().mean(), share=share[guided].sum())
+        expected |= dict(effective=1 / share.square().sum(), away=away[guided, :t].square().mean().sqrt())
+        expected["gap"] = (step[:, :t].sum(1) - density[0, :, t - 1])[guided].mean() / t
+        expected["wide"] = (search.guides[0].L[:t, 0, 0] / policy.sigma).square().mean().sqrt()
+        for name, value in expected.items():
+            assert row[name] == pytest.approx(value.item(), rel=1e-6), name
+
+
 def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str]) -> None:
     options = "--env hopper --cases full adaptive --seeds 1 2 --runs there".split()
     experiments.main([*options, "--list", "--", "--horizon", "160"])
