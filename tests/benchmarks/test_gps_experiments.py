@@ -115,7 +115,7 @@ def test_the_list_holds_the_runs_that_the_page_shows() -> None:
     assert "200" in one["swimmer__feedback__1"] and "100" in two["swimmer__feedback__2"]
     assert other["swimmer__feedback__7"] == one["swimmer__feedback__1"]
     files = {path.stem for path in (experiments.ROOT / "benchmarks" / "plans").glob("*.npz")}
-    assert files == {*experiments.PLANS, "swimmer_500", "humanoid_500"}
+    assert files == {*experiments.PLANS, "swimmer_500", "humanoid_500", "walker_switch_300"}
     for flags in experiments.PLANS.values():
         gps.parse(gps.Args, flags.split())
     for env, case, *flags in {(*name.split("__")[:2], *flags) for name, flags in jobs.items()}:  # seeds share them
