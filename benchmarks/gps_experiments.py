@@ -4,6 +4,7 @@
     python benchmarks/gps_experiments.py --env hopper --cases full adaptive --seeds 1 2 --train-only    a part of them
     python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
     python benchmarks/gps_experiments.py --list           a command for each plan, and for each run, to run side by side
+    python benchmarks/gps_experiments.py --env hopper walker --temperatures      guides at several temperatures
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
 
 Cases, plans and the suite of docs/gps.md are in cases.json; what follows "--" goes to gps.py. Writes gps_runs.csv
@@ -39,6 +40,7 @@ import gps
 from diffsim.planning import REAL, nearest_feedback
 from diffsim.planning.samples import log_mixture, log_weights
 from diffsim.training import checkpoint, command, fail, load_policy, parse_penalty
+from diffsim.training.evaluation import make_env
 
 GPS = json.loads((ROOT / "benchmarks" / "cases.json").read_text())["gps"]
 CASES: dict[str, str] = GPS["cases"]  # what a run is called, and its flags
@@ -52,6 +54,8 @@ KEPT = (  # columns of progress.csv
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
 PERTURBED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
+SPREADS = (1.0, 3.0, 10.0, 30.0, 0.0)  # the last one is of eta = 1
+TEMPERATURE = "env", "spread"
 WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
 DRAWN = [*VARIANTS, "full", "adaptive", "feedback", "feedback-short", "feedback-long"]
@@ -72,6 +76,7 @@ class Args(CommonFlags):
     count: int = 20  # perturbed starts and pushes of each size
     runs: Path = ROOT / "runs" / "gps"  # directory of the runs: {runs}/{env}__{case}__{seed}
     train_only: bool = False  # only train: several such commands may run side by side
+    temperatures: bool = False  # only sample guides of the case `paper` at several temperatures
     list: bool = False  # only print a command for each plan and each run
     record: Path | None = None  # write the trajectory of --actor's deterministic policy here; nothing else is done
     actor: Path | None = None  # checkpoint of any script that --record follows
@@ -233,6 +238,26 @@ def weights(search: gps.Search) -> list[Row]:
     return rows
 
 
+def temperatures(env: str, count: int) -> Iterator[Row]:
+    """Guides of the case `paper` by the temperature eta of exp(reward / eta), and how their trajectories end.
+
+    `wide` is the guides' deviation in those of the policy's noise; a trajectory is kept within a quarter of the plan.
+    """
+    (flags,) = jobs(Args(env=(env,), cases=("paper",), seeds=(1,))).values()
+    words = ["--env", env, *CASES["paper"].split(), *flags, "--device", "cpu", "--threads", "1"]
+    args = gps.parse(gps.Args, words)
+    search = gps.Search(args, make_env(args, 1))
+    plan = search.plan("level", lambda _: None)
+    search.network.sigma, best = (args.noise * plan.u[0].std(0)).clamp(min=1e-3), -plan.cost.item()
+    for args.spread in SPREADS:
+        (guide,) = search.guides = search.guide(search.system, plan, lambda _: None)
+        returns = search.follow([guide], count).returns
+        wide = (guide.L.norm(dim=-1) / search.network.sigma).square().mean().sqrt().item()
+        numbers = dict(mean=returns.mean().item(), median=returns.median().item())
+        kept = (returns >= best - 0.25 * abs(best)).double().mean().item()
+        yield dict(env=env, spread=args.spread, eta=guide.eta.item(), wide=wide, plan=best, **numbers, kept=kept)
+
+
 def number(text: str) -> float:
     return float(text or "nan")
 
@@ -246,7 +271,7 @@ def grouped(rows: Iterable[dict[str, str]], *keys: str) -> Runs:
 
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
-    found: dict[str, list[Row]] = {"gps_runs": [], "gps_generalisation": []}
+    found: dict[str, list[Row]] = {"gps_runs": [], "gps_generalisation": [], "gps_weights": []}
     older = set[str]()
     for directory in sorted(path for path in args.runs.glob("*__*__*") if (path / "progress.csv").is_file()):
         run = dict(zip(RUN, directory.name.split("__"), strict=True))
@@ -254,8 +279,10 @@ def collect(args: Args) -> None:
         for row in read_csv(directory / "progress.csv"):
             kept = {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT}
             found["gps_runs"].append(run | dict(horizon=horizon) | kept)
-        found["gps_generalisation"] += [run | row for row in read_csv(directory / "generalisation.csv")]
-        older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(directory / "generalisation.csv")}
+        for name in ("generalisation", "weights"):
+            path = directory / f"{name}.csv"
+            found[f"gps_{name}"] += [run | row for row in read_csv(path)]
+            older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(path)}
     for name, rows in found.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
         rows += [row for row in args.read(name) if tuple(row[key] for key in RUN) not in here]
@@ -298,6 +325,16 @@ def table(runs: Runs) -> list[Row]:
     return [summarise(env, case, seeds) for (env, case), seeds in cases.items()]
 
 
+def shown(runs: Runs) -> list[Row]:
+    """Of each run, at some steps: mean log weight of the guides' samples, and effective samples."""
+    result = list[Row]()
+    for name, rows in runs.items():
+        at = {f"t = {float(row['step']):.0f}": (number(row["guides"]), number(row["effective"])) for row in rows}
+        cells = {t: f"{nats:.0f} / {effective:.0f}" for t, (nats, effective) in at.items()}
+        result.append(dict(zip(RUN, name, strict=True)) | cells)
+    return result
+
+
 def variants(runs: Runs, env: str) -> Panel:
     """Mean cost of the proposals: thin, each run; bold, their median; grey, the guiding samples."""
     lines = list[Line]()
@@ -333,6 +370,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.list:
         print("\n".join(commands(args)))
         return
+    if args.temperatures:
+        args.merge("gps_temperatures", [row for env in args.env for row in temperatures(env, args.count)], TEMPERATURE)
+        return
     if not args.draw_only:
         args.runs.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(args.jobs) as pool:
@@ -343,6 +383,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     collect(args)
     runs = grouped(args.read("gps_runs"), *RUN)
     args.publish("gps runs", markdown(table(runs)), "gps.md")
+    args.publish("gps weights", markdown(shown(grouped(args.read("gps_weights"), *RUN))), "gps.md")
+    args.publish("gps temperatures", markdown(args.read("gps_temperatures")), "gps.md")
     plot(args.picture("gps_variants"), [[variants(runs, env) for env in SUITE if any(env == key[0] for key in runs)]])
     groups = grouped(args.read("gps_generalisation"), "env", "variant", "kind")
     grid = [
