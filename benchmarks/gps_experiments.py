@@ -125,7 +125,9 @@ def train(directory: Path, flags: Sequence[str], count: int) -> str:
         state = checkpoint.load(path)
         if state["iteration"] >= state["args"]["iterations"]:
             return f"{directory.name}: done before"
-        start = ["--resume", str(path)]
+        start, flags = ["--resume", str(path)], list(flags)
+        if "--demonstration" in flags:  # which the checkpoint has followed
+            del flags[(place := flags.index("--demonstration")) : place + 2]
     line = [sys.executable, str(ROOT / script), *start, "--run-dir", str(directory), "--threads", "1", *flags]
     with (directory.parent / f"{directory.name}.log").open("a") as log:
         code = subprocess.run(line, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT).returncode

@@ -128,6 +128,16 @@ def test_a_finished_run_is_kept(runs: Path) -> None:
     assert (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns == before
 
 
+def test_an_interrupted_run_goes_on(runs: Path, tmp_path: Path) -> None:
+    """Though its plan came from a file, which the checkpoint does not name."""
+    directory = tmp_path / "cartpole__nonguided__1"
+    first = ["--demonstration", str(runs / "cartpole__full__1" / "plan.npz"), *SMALL[2:], "--iterations", "2"]
+    flags = [*first, *experiments.CASES["nonguided"].split()]
+    run(gps_variants, directory, "--env", "cartpole", *flags, "--stop-after", "1")
+    assert experiments.train(directory, flags, 4) == "cartpole__nonguided__1: done"
+    assert len(read_csv(directory / "progress.csv")) == 3
+
+
 def test_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """What the policy of another script does, without a reset: a demonstration for gps.py."""
     run(bptt, tmp_path, *"--env cartpole --num-envs 2 --iterations 1 --eval-episodes 1 --substeps 2 --quiet".split())
