@@ -54,6 +54,7 @@ KEPT = (  # columns of progress.csv
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
 PERTURBED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
+SHOWN = (1, 10, 50, 500)  # of them in the page
 SPREADS = (1.0, 3.0, 10.0, 30.0, 0.0)  # the last one is of eta = 1
 TEMPERATURE = "env", "spread"
 WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
@@ -298,12 +299,11 @@ def final_return(rows: list[dict[str, str]]) -> float:
 
 
 def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
-    """One row of a case: means over its seeds, and each seed's end. In the band: at least the guides' mean - 2 std."""
+    """One row of a case: means over its seeds, and each seed's end."""
     final = [final_return(rows) for rows in seeds]
-    low = [number(rows[0]["gps_guides"]) - 2 * number(rows[0]["gps_guides_std"]) for rows in seeds]
 
-    def average(column: str, place: int = 0) -> float:
-        return mean(number(rows[place].get(column, "")) for rows in seeds)
+    def average(column: str) -> float:
+        return mean(number(rows[0].get(column, "")) for rows in seeds)
 
     iterations = sorted({int(rows[-1]["iteration"]) for rows in seeds})
     return {
@@ -313,9 +313,7 @@ def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
         "guides": f"{average('gps_guides'):.1f}",
         "pretrained": f"{average('gps_objective'):.0f}",
         "end, each seed": ", ".join("-" if math.isnan(value) else f"{value:.1f}" for value in final),
-        "in band": f"{sum(a >= b for a, b in zip(final, low, strict=True))}/{len(seeds)}",
         "iterations": "-".join(map(str, iterations[:: len(iterations) - 1 or 1])),
-        "seconds": f"{average('seconds', -1):.0f}",
     }
 
 
@@ -331,9 +329,23 @@ def shown(runs: Runs) -> list[Row]:
     """Of each run, at some steps: mean log weight of the guides' samples, and effective samples."""
     result = list[Row]()
     for name, rows in runs.items():
-        at = {f"t = {float(row['step']):.0f}": (number(row["guides"]), number(row["effective"])) for row in rows}
+        at = {
+            f"t = {float(row['step']):.0f}": (number(row["guides"]), number(row["effective"]))
+            for row in rows
+            if int(float(row["step"])) in SHOWN
+        }
         cells = {t: f"{nats:.0f} / {effective:.0f}" for t, (nats, effective) in at.items()}
         result.append(dict(zip(RUN, name, strict=True)) | cells)
+    return result
+
+
+def spreads(runs: Runs) -> list[Row]:
+    """Of each task, by the spread of its guides: their median return, and the share that keeps the plan's."""
+    result = list[Row]()
+    for (env,), rows in runs.items():
+        cells = {f"spread {row['spread']}" if row["spread"] != "0" else "η = 1": row for row in rows}
+        shown = {name: f"{number(row['median']):.0f} ({number(row['kept']):.0%})" for name, row in cells.items()}
+        result.append(dict(task=env, plan=f"{number(rows[0]['plan']):.0f}") | shown)
     return result
 
 
@@ -386,7 +398,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     runs = grouped(args.read("gps_runs"), *RUN)
     args.publish("gps runs", markdown(table(runs)), "gps.md")
     args.publish("gps weights", markdown(shown(grouped(args.read("gps_weights"), *RUN))), "gps.md")
-    args.publish("gps temperatures", markdown(args.read("gps_temperatures")), "gps.md")
+    args.publish("gps temperatures", markdown(spreads(grouped(args.read("gps_temperatures"), "env"))), "gps.md")
     plot(args.picture("gps_variants"), [[variants(runs, env) for env in SUITE if any(env == key[0] for key in runs)]])
     groups = grouped(args.read("gps_generalisation"), "env", "variant", "kind")
     grid = [
