@@ -59,8 +59,8 @@ SPREADS = (1.0, 3.0, 10.0, 30.0, 0.0)  # the last one is of eta = 1
 TEMPERATURE = "env", "spread"
 WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
-DRAWN = [*VARIANTS, "full", "adaptive", "feedback", "feedback-short", "feedback-long"]
-COLOURS = [*(f"C{i}" for i in range(10)), "k"]
+DRAWN = [*VARIANTS, "full", "paper", "adaptive", "feedback", "feedback-short", "feedback-long"]
+COLOURS = [*(f"C{i}" for i in range(10)), "k", "m", "y"]
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 Row = dict[str, Any]
 Runs = dict[tuple[str, ...], list[dict[str, str]]]
