@@ -93,7 +93,7 @@ def make(
     else:
         raise ValueError(f"task {kind.name!r} tracks no clip; {HumanoidImitation.name} does")
     if control_dt is not None and control_dt != task.control_dt:
-        if task.timed:
+        if task.num_memory:  # its times count in control steps
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
     scene = load_scene(robot(task))

@@ -94,7 +94,7 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
     experiments.main([*options, "--list", "--", "--horizon", "160"])
     lines = capsys.readouterr().out.splitlines()
     part = "--env hopper --cases adaptive --seeds 2 --runs there --train-only -- --horizon 160"
-    assert len(lines) == 5 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
+    assert len(lines) == 6 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
     assert lines[0].startswith("python gps.py --env hopper") and lines[0].endswith("--run-dir runs/plans/hopper_500")
     assert experiments.CASES["adaptive"].startswith("--variant full --perturb 0 --adaptive")
 
