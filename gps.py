@@ -139,8 +139,8 @@ class Args(Flags):
         super().check()
         if distributed.size() > 1:
             fail("trains in one process; start it without torchrun")
-        if find_task(self.env).timed:
-            fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
+        if find_task(self.env).num_memory:
+            fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if self.env == "cartpole" and self.reward == "target":
             fail("--reward target needs a robot that walks or swims; cartpole has --reward native")
         if not self.terrain:

@@ -130,8 +130,8 @@ class Args(ParallelFlags):
             fail(f"--rollout-lengths {self.rollout_lengths[0]} {self.rollout_lengths[1]} are the wrong way round")
         if self.buffer_size < (rows := self.num_envs * (1 + self.sample_enhance)):
             fail(f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a control step")
-        if self.sample_enhance and find_task(self.env).timed:
-            fail(f"--sample-enhance takes Jacobians of states that do not hold the time, on which {self.env} depends")
+        if self.sample_enhance and find_task(self.env).num_memory:
+            fail(f"--sample-enhance takes Jacobians of states that do not hold the past, on which {self.env} depends")
         if self.sample_enhance and self.randomise:
             fail("--sample-enhance takes Jacobians of one robot: leave out --randomise")
 

@@ -91,8 +91,8 @@ class Args(Flags):
         task = find_task(self.env)
         if distributed.size() > 1:
             fail("one process alone: sequences are not shared among ranks")
-        if task.timed:
-            fail(f"{self.env} depends on the time, which planned states do not hold: choose another task")
+        if task.num_memory:
+            fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if self.early_termination and task.falls():
             fail(f"{self.env} ends episodes early, and all sequences have one length: give --no-early-termination")
         if task.episode_length % self.horizon:

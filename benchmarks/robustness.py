@@ -75,7 +75,7 @@ class State(NamedTuple):
     qpos: Tensor  # (n, nq)
     qvel: Tensor  # (n, nv)
     action: Tensor  # (n, nu) the last one, which some tasks observe
-    step: Tensor  # (n,) int64 control step of the task's own time
+    memory: Tensor  # (n, num_memory) of the task
 
 
 class Walkers:
@@ -101,12 +101,13 @@ class Walkers:
     def walk(self, seconds: float, force: Tensor | None = None, pushed: int = 0) -> Iterator[tuple[State, Tensor]]:
         """The state after each control step, and who has fallen by then (n,); force (n, 3) acts in the first steps."""
         state, fallen = self.start, torch.zeros(len(self.start.qpos), dtype=torch.bool, device=self.sim.device)
-        obs = self.task.observe_at(*state)
+        obs, middle = self.task.observe_with(*state), state.qpos.new_full((len(state.qpos), self.task.num_noise), 0.5)
         for step in range(self.steps(seconds)):
             self.sim.forces[:, self.body, :3] = force if force is not None and step < pushed else 0.0
             action = self.policy(obs).clamp(-1.0, 1.0)
-            state = State(*self.sim.step(state.qpos, state.qvel, action), action, state.step + 1)
-            obs = self.task.observe_at(*state)
+            memory = self.task.remember(state.memory, action, middle)  # sensors without noise, the same command
+            state = State(*self.sim.step(state.qpos, state.qvel, action), action, memory)
+            obs = self.task.observe_with(*state)
             fallen = fallen | self.task.terminated(obs) | self.sim.nonfinite
             yield state, fallen
 
@@ -124,7 +125,7 @@ def starts(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> State
     """The states of the robots that still walk after a time, drawn for each, within WALK."""
     env.reset(seed=SEED)
     no_action = torch.zeros(env.num_envs, env.scene.nu, dtype=env.dtype, device=env.device)
-    walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action, env.first_step))
+    walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action, env.memory))
     first, last = map(walkers.steps, WALK)
     at = torch.randint(first, last + 1, (env.num_envs,), generator=torch.Generator().manual_seed(SEED)).to(env.device)
     found, standing = State(*(part.clone() for part in walkers.start)), torch.zeros_like(at, dtype=torch.bool)

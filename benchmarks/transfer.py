@@ -161,8 +161,8 @@ def load(path: Path, args: Args) -> Case:
     name = case.env.task.name
     if "muscle" in case.env.scene.features:
         fail(f"{case.path} was trained on {name}, whose muscles are not simulated in MuJoCo here")
-    if case.env.task.timed:
-        fail(f"{case.path} was trained on {name}, which tracks a motion in time: choose a policy of another task")
+    if case.env.task.num_memory:
+        fail(f"{case.path} was trained on {name}, whose policy depends on the past: choose one of another task")
     return case
 
 

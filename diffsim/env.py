@@ -62,7 +62,6 @@ class DiffEnv(VectorEnv):
     Attributes:
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.
         episode_step: (N,) int64 control steps since each environment's start.
-        first_step: (N,) int64 at which step of a timed task each episode started; 0 of others.
         memory: (N, num_memory) what the task keeps from step to step.
         generator: the torch.Generator of the start states.
     """
@@ -117,7 +116,6 @@ class DiffEnv(VectorEnv):
 
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=self.dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
-        self.first_step = torch.zeros_like(self.episode_step)
         self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
         self.memory = torch.zeros(num_envs, task.num_memory, dtype=self.dtype, device=self.device)
@@ -168,10 +166,8 @@ class DiffEnv(VectorEnv):
         _, reward, terminated, truncated, info = self.advance(action)
         if self._time == self.horizon:
             self._draw_starts()
-        row, (first, *starts) = info["_final_obs"].unsqueeze(1), (start[self._time] for start in self._starts)
+        row, starts = info["_final_obs"].unsqueeze(1), (start[self._time] for start in self._starts)
         self._put(torch.where(row, start, end) for start, end in zip(starts, self._state(), strict=True))
-        if self.task.timed:
-            self.first_step.copy_(torch.where(info["_final_obs"], first, self.first_step))
         self._time += 1
         self.episode_step.masked_fill_(info["_final_obs"], 0)
         self._episode_return.masked_fill_(info["_final_obs"], 0.0)
@@ -197,7 +193,7 @@ class DiffEnv(VectorEnv):
         if self.task.num_memory:
             noise = self._uniform(self.num_envs, self.task.num_noise)
             self.memory = self.task.remember(self.memory, action, noise)
-        self._obs = obs = self.observe(self.qpos, self.qvel, action, elapsed=1)
+        self._obs = obs = self.observe(self.qpos, self.qvel, action)
         reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)
         with torch.no_grad():
             self.episode_step += 1
@@ -224,8 +220,7 @@ class DiffEnv(VectorEnv):
         Returns:
             obs (N, obs_dim) of all environments.
         """
-        first, *starts = self._start_states(rand, rows)
-        self.first_step.index_copy_(0, rows, first)
+        starts = self._start_states(rand, rows)
         self._put(whole.index_copy(0, rows, part) for whole, part in zip(self._state(), starts, strict=True))
         self.episode_step.index_fill_(0, rows, 0)
         self._episode_return.index_fill_(0, rows, 0.0)
@@ -323,15 +318,11 @@ class DiffEnv(VectorEnv):
         self._obs = self.observe(qpos, qvel, self._no_action)
         return self._obs
 
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor, elapsed: int = 0) -> Tensor:
-        """What the task observes (N, obs_dim) of states on the episodes' clocks, `elapsed` control steps from now."""
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        """What the task observes (N, obs_dim) of states, with its memory."""
         if self._elevation is not None:
             qpos = self._elevation.lower(qpos)
-        if self.task.num_memory:
-            return self.task.observe_with(qpos, qvel, action, self.memory)
-        if not self.task.timed:
-            return self.task.observe(qpos, qvel, action)
-        return self.task.observe_at(qpos, qvel, action, self.first_step + self.episode_step + elapsed)
+        return self.task.observe_with(qpos, qvel, action, self.memory)
 
     def state_dict(self) -> dict[str, Any]:
         """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
@@ -343,7 +334,6 @@ class DiffEnv(VectorEnv):
             "episode_step": self.episode_step.clone(),
             "episode_return": self._episode_return.clone(),
             "generator": self.generator.get_state(),
-            **({"first_step": self.first_step.clone()} if self.task.timed else {}),
             **({"memory": self.memory.detach().clone()} if self.task.num_memory else {}),
         }
 
@@ -366,7 +356,6 @@ class DiffEnv(VectorEnv):
         self.qpos, self.qvel = state["qpos"].to(self.device), state["qvel"].to(self.device)
         self._obs = state["obs"].to(self.device)
         self.episode_step.copy_(state["episode_step"])
-        self.first_step.copy_(state.get("first_step", self.first_step))
         self.memory = state.get("memory", self.memory).to(self.device)
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
@@ -377,9 +366,7 @@ class DiffEnv(VectorEnv):
         self._episode_return.zero_()
         self._recorded = 0  # differentiable steps since the window began
         self.sim.rewind()
-        first, *state = (start[0] for start in self._draw(1))
-        self._put(state)
-        self.first_step.copy_(first)
+        self._put(start[0] for start in self._draw(1))
         self._draw_starts()
         self._show()
 
@@ -395,17 +382,13 @@ class DiffEnv(VectorEnv):
 
     @torch.no_grad()
     def _start_states(self, rand: Tensor, rows: Tensor | None = None) -> tuple[Tensor, ...]:
-        """The first step (...), qpos, qvel, obs and memory, if any (..., each) of rand (..., num_random)."""
+        """qpos, qvel, obs and memory, if any (..., each) of rand (..., num_random)."""
         if not self.stochastic_init:
             rand = torch.full_like(rand, 0.5)
-        first, (qpos, qvel), memory = self.task.first_step(rand), self.task.reset(rand), self.task.begin(rand)
-        action = self._no_action[0].expand(*rand.shape[:-1], -1)
-        if self.task.num_memory:
-            obs = self.task.observe_with(qpos, qvel, action, memory)
-        else:
-            obs = self.task.observe_at(qpos, qvel, action, first)
+        (qpos, qvel), memory = self.task.reset(rand), self.task.begin(rand)
+        obs = self.task.observe_with(qpos, qvel, self._no_action[0].expand(*rand.shape[:-1], -1), memory)
         kept = (memory,) if self.task.num_memory else ()
-        return first, qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs, *kept
+        return qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs, *kept
 
     def _show(self) -> None:
         if self.render_mode == "human":

@@ -282,7 +282,7 @@ def test_gradcheck_through_policy_reward_and_three_control_steps(name, rng):
         # gradcheck holds on to its first graph while it makes others, so each has an environment of its own.
         env = DiffEnv(task, scene, 2, seed=0, horizon=3, dtype=torch.float64, early_termination=False)
         # Of a motion to track the reward is zero far from it.
-        obs, total = env.detach() if task.timed else env.set_state(qpos, qvel), 0.0
+        obs, total = env.detach() if task.num_memory else env.set_state(qpos, qvel), 0.0
         for _ in range(3):
             obs, reward, _, _, _ = env.step(torch.tanh(obs @ features @ policy @ mixture))
             total = total + reward.sum()

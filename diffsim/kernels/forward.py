@@ -63,37 +63,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         write(out, e, column, pick(T(0.0), broken, read(start, e, column), value))
 
     @wp.func
-    def slope_along(
-        m: Model,
-        law: Law,
-        at: int,
-        n: int,
-        R: mat3s,
-        x: vec3s,
-        V: vec6s,
-        B: vec6s,
-        height: T,
-        q: t.array,
-        qd: t.array,
-        guess: t.array,
-        step: t.array,
-        twist: vec6s,
-        part: T,
-    ):
-        """step . f and step . H step of all constraints after a part of a step."""
-        found = vec2()
-        for i in range(n):
-            k = at + i
-            if wp.static(CONTACT):
-                found = found + constraint.contacts_along(m, law, k, R[i], x[i], V[i], B[i], height, twist[i], part)
-            if i > 0:
-                held = constraint.joint_constraint(m, law, k, q[i], qd[i], guess[i] + part * step[i], T(0.0))
-                found = found + T(m.carried[k]) * step[i] * vec2(held[0], held[1] * step[i])
-        if wp.static(THREADS_PER_ENV > 1):
-            found = vec2(sums.add(found[0]), sums.add(found[1]))
-        return found
-
-    @wp.func
     def search(
         m: Model,
         law: Law,
@@ -128,27 +97,39 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 inertia = inertia + T(m.carried[k]) * T(m.armature[k]) * step[i] * step[i]
         if wp.static(THREADS_PER_ENV > 1):
             inertia = sums.add(inertia)
-        start = slope_along(m, law, at, n, R, x, V, B, height, q, qd, guess, step, twist, T(0.0))
-        steepest = inertia + start[1]
-        near = T(SLOPE) * steepest
+        start = vec2()
         low = T(0.0)
         high = T(1.0)
-        at_low = -steepest
+        at_low = T(0.0)
         at_high = T(0.0)
-        part = T(1.0)
+        part = T(0.0)
         beyond = T(1.0)
-        for _ in range(SEARCHES):
+        for trial in range(1 + SEARCHES):  # the first is where the step begins
             if block.any_of(beyond):
-                now = slope_along(m, law, at, n, R, x, V, B, height, q, qd, guess, step, twist, part)
-                slope = inertia * (part - T(1.0)) - start[1] + start[0] - now[0]
-                beyond = pick(near, slope, T(1.0), T(0.0))
-                low = pick(near, slope, low, part)
-                at_low = pick(near, slope, at_low, slope)
-                high = pick(near, slope, part, high)
-                at_high = pick(near, slope, slope, at_high)
-                width = wp.max(at_high - at_low, T(1e-30))
-                part = low + (high - low) * wp.min(wp.max(-at_low, T(0.0)) / width, T(1.0))
-                beyond = pick(low, T(1.0), T(1.0), T(0.0))
+                now = vec2()  # s.f and s.Hs of all constraints after this part of the step
+                for i in range(n):
+                    k = at + i
+                    if wp.static(CONTACT):
+                        now = now + constraint.contacts_along(m, law, k, R[i], x[i], V[i], B[i], height, twist[i], part)
+                    if i > 0:
+                        held = constraint.joint_constraint(m, law, k, q[i], qd[i], guess[i] + part * step[i], T(0.0))
+                        now = now + T(m.carried[k]) * step[i] * vec2(held[0], held[1] * step[i])
+                if wp.static(THREADS_PER_ENV > 1):
+                    now = vec2(sums.add(now[0]), sums.add(now[1]))
+                if trial == 0:
+                    start = now
+                    at_low = -(inertia + start[1])
+                    part = T(1.0)
+                else:
+                    slope = inertia * (part - T(1.0)) - start[1] + start[0] - now[0]
+                    near = T(SLOPE) * (inertia + start[1])
+                    low = pick(near, slope, low, part)
+                    at_low = pick(near, slope, at_low, slope)
+                    high = pick(near, slope, part, high)
+                    at_high = pick(near, slope, slope, at_high)
+                    width = wp.max(at_high - at_low, T(1e-30))
+                    part = low + (high - low) * wp.min(wp.max(-at_low, T(0.0)) / width, T(1.0))
+                    beyond = pick(low, T(1.0), T(1.0), T(0.0))
         return part
 
     @wp.kernel(module="unique", module_options=module_options(spec))

@@ -44,7 +44,6 @@ class Task:
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
-    timed: ClassVar[bool] = False  # whether observations depend on the time: see first_step and observe_at
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: ClassVar[float] = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
@@ -110,14 +109,6 @@ class Task:
         """
         raise NotImplementedError
 
-    def first_step(self, rand: Tensor) -> Tensor:
-        """At which control step (...) int64 of the task's own time an episode from rand (..., num_random) starts."""
-        return torch.zeros(rand.shape[:-1], dtype=torch.int64, device=rand.device)
-
-    def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
-        """`observe` at a control step (...) int64, which is `first_step` at the start of an episode."""
-        return self.observe(qpos, qvel, action)
-
     def begin(self, rand: Tensor) -> Tensor:
         """The memory (..., num_memory) at the start of an episode from rand (..., num_random); none by default."""
         return rand[..., :0]
@@ -133,7 +124,7 @@ class Task:
         return memory
 
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
-        """`observe` of a task with a memory (..., num_memory)."""
+        """`observe`, with the memory (..., num_memory) after the step."""
         return self.observe(qpos, qvel, action)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:

@@ -95,12 +95,9 @@ def fit(task: Task, scene: Scene) -> None:
     rand = task._start.new_full((2, task.num_random), 0.5)
     qpos, qvel, action = state = *task.reset(rand), task._start.new_zeros(2, scene.nu)
     _check(task, "the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
-    if task.num_memory:
-        memory = task.begin(rand)
-        _check(task, "the width of what begin returns", memory.shape[-1], task.num_memory, "num_memory")
-        obs = task.observe_with(*state, memory)
-    else:
-        obs = task.observe_at(*state, task.first_step(rand)) if task.timed else task.observe(*state)
+    memory = task.begin(rand)
+    _check(task, "the width of what begin returns", memory.shape[-1], task.num_memory, "num_memory")
+    obs = task.observe_with(*state, memory)
     _check(task, "the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
     task.obs_dim = getattr(task, "obs_dim", obs.shape[-1])
     _check(task, "obs_dim", task.obs_dim, obs.shape[-1], "what observe returns")

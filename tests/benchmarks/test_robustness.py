@@ -102,7 +102,7 @@ def test_a_cube_meets_the_mass_behind_the_trunk() -> None:
     """Neither cart nor bob resists a push on the other one: the rod between them is upright."""
     scene = scene_of(CART)
     qvel = torch.tensor([[4.0, 0.0], [-1.0, 0.0]])
-    state = robustness.State(torch.zeros(2, 2), qvel, torch.zeros(2, 0), torch.zeros(2, dtype=torch.int64))
+    state = robustness.State(torch.zeros(2, 2), qvel, torch.zeros(2, 0), torch.zeros(2, 0))
     hit = robustness.target(scene, state, 1)
     np.testing.assert_allclose(hit.mass, 3.0, rtol=1e-5)
     np.testing.assert_allclose(hit.velocity, [4.0, -1.0])
@@ -115,22 +115,22 @@ def test_a_cube_meets_the_mass_behind_the_trunk() -> None:
 class Clock(Puck):
     """Observes the time, which starts anywhere within 100 control steps, and falls at 190."""
 
-    num_random, timed = 1, True
+    num_random = num_memory = 1
 
-    def first_step(self, rand: Tensor) -> Tensor:
-        return (100 * rand[..., 0]).long()
+    def begin(self, rand: Tensor) -> Tensor:
+        return (100 * rand).floor()
 
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        raise ValueError
+    def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
+        return memory + 1
 
-    def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
-        return torch.stack((step, qvel[..., 0]), -1)
+    def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
+        return torch.cat((memory, qvel[..., :1]), -1)
 
     def terminated(self, obs: Tensor) -> Tensor:
         return obs[..., 0] == 190
 
 
-def test_a_timed_task_keeps_its_clock() -> None:
+def test_a_task_keeps_its_memory() -> None:
     """Robots start at the phases of an evaluation, and are pushed at those that they have reached."""
     env, seen = DiffEnv(Clock(), scene_of(PUCK), 7, integration=Integration(substeps=4)), list[Tensor]()
 
@@ -142,12 +142,13 @@ def test_a_timed_task_keeps_its_clock() -> None:
     state = robustness.starts(env, policy, 1)
     assert torch.equal(torch.stack(seen), first + torch.arange(240)[:, None])
     reached = first + torch.randint(120, 241, (7,), generator=torch.Generator().manual_seed(SEED))
-    assert torch.equal(state.step, reached[reached < 190]) and 0 < len(state.step) < 7
+    steps = state.memory[:, 0].long()
+    assert torch.equal(steps, reached[reached < 190]) and 0 < len(steps) < 7
     walkers = robustness.Walkers(env, policy, 1, state)
     for _ in range(2):  # a push after the other
         seen.clear()
         walkers.endure(0.1, torch.zeros(3), 1)
-        assert torch.equal(torch.stack(seen), state.step + torch.arange(6)[:, None])
+        assert torch.equal(torch.stack(seen), steps + torch.arange(6)[:, None])
 
 
 def test_the_command_writes_pushes_and_curves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

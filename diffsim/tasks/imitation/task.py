@@ -22,6 +22,8 @@ STRAY = 0.5  # m; the episode ends when the root is further from the reference's
 class HumanoidImitation(Task):
     """The robot of the humanoid task. The reference is at frame `step` of the clip, which goes round if it is a loop.
 
+    Memory: the control step of the clip's time.
+
     Args:
         clip: what to track; default the shipped one.
 
@@ -33,8 +35,7 @@ class HumanoidImitation(Task):
     asset, contact = Humanoid.asset, Humanoid.contact
     substeps, fast, accurate = Humanoid.substeps, Humanoid.fast, Humanoid.accurate
     obs_dim = 57
-    num_random = 1
-    timed = True
+    num_random = num_memory = 1
     default_clip: ClassVar[str] = "humanoid_run"
     start, spread = (), ()
 
@@ -62,7 +63,8 @@ class HumanoidImitation(Task):
         self._sizes = (4, self._qpos.shape[1] - 7, self._qvel.shape[1] - 3, 3 * len(geoms), 3)
 
     def first_step(self, rand: Tensor) -> Tensor:
-        """Reference state initialisation (DeepMimic, 6.1): any frame alike; the first one if rand is 0.5."""
+        """The frame (...) int64 at which an episode from rand (..., 1) starts: any alike, the first one if rand is 0.5
+        (DeepMimic, 6.1: reference state initialisation)."""
         count = self.period if self.clip.loop else self.period - 1
         return ((rand[..., 0] + 0.5).remainder(1.0) * count).long().clamp(max=count - 1)
 
@@ -72,14 +74,21 @@ class HumanoidImitation(Task):
         return self._qpos[step], self._qvel[step]
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        raise ValueError(f"an observation of task {self.name!r} depends on the time: use observe_at")
+        raise ValueError(f"an observation of task {self.name!r} depends on the time: use observe_with")
 
-    def observe_at(self, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
+    def begin(self, rand: Tensor) -> Tensor:
+        return self.first_step(rand).to(rand.dtype).unsqueeze(-1)
+
+    def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
+        return memory + 1.0
+
+    def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
         """Height, quaternion wxyz, joints; qvel; x and y from the reference's; sine and cosine of the phase.
 
         The distance from the reference decides on reward and end, so a value function needs it. Where in the world the
         robot is, it does not.
         """
+        step = memory[..., 0].long()
         frame, rounds = step % self.period, step // self.period
         lag = qpos[..., :2] - (self._qpos[frame, :2] + rounds.unsqueeze(-1) * self._advance)
         phase = frame.to(qpos.dtype).unsqueeze(-1) * (2 * math.pi / self.period)

@@ -62,6 +62,10 @@ def on_reference(task: HumanoidImitation, step: Tensor) -> tuple[Tensor, Tensor]
     return qpos, clip.velocity()[step % period]
 
 
+def observe(task: HumanoidImitation, qpos: Tensor, qvel: Tensor, action: Tensor, step: Tensor) -> Tensor:
+    return task.observe_with(qpos, qvel, action, step.to(qpos).unsqueeze(-1))
+
+
 # Clips ----------------------------------------------------------------------------------------------------------------
 
 
@@ -176,7 +180,7 @@ def test_what_is_no_clip_is_refused(tmp_path: Path) -> None:
 
 def test_the_reward_is_one_on_the_reference(task: HumanoidImitation) -> None:
     step = torch.arange(5 * len(task.clip))
-    obs = task.observe_at(*on_reference(task, step), NOTHING, step)
+    obs = observe(task, *on_reference(task, step), NOTHING, step)
     assert obs.shape == (len(step), task.obs_dim)
     torch.testing.assert_close(task.reward(obs, NOTHING), torch.ones(len(step), dtype=REAL), rtol=0, atol=1e-12)
     assert not task.terminated(obs).any()
@@ -195,7 +199,7 @@ def test_each_term_falls_as_its_equation(task: HumanoidImitation) -> None:
             qpos[k] += value
         for k, value in qvel_off.items():
             qvel[k] += value
-        return torch.stack(task.terms(task.observe_at(qpos, qvel, NOTHING, step)))
+        return torch.stack(task.terms(observe(task, qpos, qvel, NOTHING, step)))
 
     def expected(**logs: float) -> Tensor:
         return (ones * torch.tensor([logs.get(name, 0.0) for name in "pvec"], dtype=REAL)).exp()
@@ -215,10 +219,10 @@ def test_each_term_falls_as_its_equation(task: HumanoidImitation) -> None:
     qpos[3:7] = torch.stack((w * c - u[2] * s, u[0] * c + u[1] * s, u[1] * c - u[0] * s, u[2] * c + w * s))
     for sign in (1, -1):
         qpos[3:7] *= sign
-        found = torch.stack(task.terms(task.observe_at(qpos, qvel, NOTHING, step)))
+        found = torch.stack(task.terms(observe(task, qpos, qvel, NOTHING, step)))
         torch.testing.assert_close(found[:2], expected(p=-2 * 0.2**2)[:2])
     weighted = torch.tensor([0.65, 0.1, 0.15, 0.1], dtype=REAL) @ found
-    torch.testing.assert_close(task.reward(task.observe_at(qpos, qvel, NOTHING, step), NOTHING), weighted)
+    torch.testing.assert_close(task.reward(observe(task, qpos, qvel, NOTHING, step), NOTHING), weighted)
 
 
 def test_places_are_mujocos(task: HumanoidImitation, rng: np.random.Generator) -> None:
@@ -234,7 +238,7 @@ def test_places_are_mujocos(task: HumanoidImitation, rng: np.random.Generator) -
         mujoco.mj_comPos(model, data)
         seen.append((np.array([data.geom(name).xpos for name in END_EFFECTORS]), data.subtree_com[0].copy()))
     ends, centre = (np.square(a - b).sum() for a, b in zip(*seen, strict=True))
-    found = task.terms(task.observe_at(off, qvel, NOTHING, step))
+    found = task.terms(observe(task, off, qvel, NOTHING, step))
     assert [x.item() for x in found[2:]] == pytest.approx([math.exp(-40 * ends), math.exp(-10 * centre)], rel=1e-9)
 
 
@@ -244,7 +248,7 @@ def test_gradients_are_exact(task: HumanoidImitation, rng: np.random.Generator) 
     qpos, qvel = ((x + torch.tensor(0.03 * rng.normal(size=x.shape))).requires_grad_() for x in states)
 
     def terms(qpos: Tensor, qvel: Tensor) -> tuple[Tensor, ...]:
-        obs = task.observe_at(qpos, qvel, NOTHING, step)
+        obs = observe(task, qpos, qvel, NOTHING, step)
         return *task.terms(obs), task.reward(obs, NOTHING)
 
     assert torch.autograd.gradcheck(terms, (qpos, qvel))
@@ -271,24 +275,24 @@ def test_the_phase_is_kept_in_single_precision() -> None:
     clip = Clip("long", torch.tensor(stroll(100, 60, True)), loop=True)
     task, step = HumanoidImitation(clip=clip), torch.arange(12_000)
     qpos, qvel = (x.float() for x in on_reference(task, step))
-    obs = task.observe_at(qpos, qvel, NOTHING.float(), step)
+    obs = observe(task, qpos, qvel, NOTHING.float(), step)
     assert torch.equal(task.frame(obs), step % 6000)
     assert task.reward(obs, NOTHING).min() > 1 - 1e-4
 
 
 def test_the_environment_keeps_the_clock() -> None:
     env = diffsim.make("humanoid_imitation", 7, seed=0, horizon=4)
-    task, step = env.task, env.first_step.clone()
+    task, step = env.task, env.memory[:, 0].clone()
     assert isinstance(task, HumanoidImitation) and len(set(step.tolist())) > 3
-    assert torch.equal(task.frame(env.reset(seed=0)[0]), env.first_step) and torch.equal(step, env.first_step)
+    assert torch.equal(task.frame(env.reset(seed=0)[0]), step.long()) and torch.equal(step, env.memory[:, 0])
     generator, ends = torch.Generator().manual_seed(0), 0
     for _ in range(60):
-        before = env.first_step + env.episode_step
+        before = env.memory[:, 0].long()
         with torch.no_grad():
             obs, reward, terminated, _, info = env.step(torch.randn(7, NU, generator=generator))
         assert torch.equal(task.frame(info["final_obs"]), (before + 1) % task.period)
-        assert torch.equal(task.frame(obs), (env.first_step + env.episode_step) % task.period)
-        assert torch.equal(env.first_step[~terminated] + env.episode_step[~terminated], before[~terminated] + 1)
+        assert torch.equal(task.frame(obs), env.memory[:, 0].long() % task.period)
+        assert torch.equal(env.memory[~terminated, 0].long(), before[~terminated] + 1)
         torch.testing.assert_close(task.reward(obs, obs)[terminated], torch.ones(int(terminated.sum())))
         ends += int(terminated.sum())
     assert ends > 8
@@ -300,11 +304,11 @@ def test_the_environment_keeps_the_clock() -> None:
             actions = torch.randn(7, NU, generator=generator)
             assert torch.equal(env.step(actions)[0], other.step(actions)[0])
     env.reset(options={"reset_mask": torch.arange(7) == 2})
-    assert env.episode_step[2] == 0 and task.frame(env._obs)[2] == env.first_step[2]
+    assert env.episode_step[2] == 0 and task.frame(env._obs)[2] == env.memory[2, 0]
     assert torch.equal(env.set_state(env.qpos, env.qvel), env._obs)
     calm = diffsim.make("humanoid_imitation", 2, stochastic_init=False)
-    assert calm.first_step.tolist() == [0, 0]
-    assert "first_step" not in diffsim.make("cartpole", 1).state_dict()
+    assert calm.memory.tolist() == [[0], [0]]
+    assert "memory" not in diffsim.make("cartpole", 1).state_dict()
 
 
 def test_the_end(task: HumanoidImitation) -> None:
@@ -317,7 +321,7 @@ def test_the_end(task: HumanoidImitation) -> None:
         if height is not None:
             qpos[2] = height
             qpos[3:7] = torch.tensor([math.cos(pitch / 2), 0, math.sin(pitch / 2), 0])
-        return bool(task.terminated(task.observe_at(qpos, qvel, NOTHING, step)))
+        return bool(task.terminated(observe(task, qpos, qvel, NOTHING, step)))
 
     assert not ends(x=STRAY - 0.01) and ends(x=STRAY + 0.01) and ends(x=0.4, y=0.4) and ends(z=STRAY + 0.01)
     low = Clip("low", task.clip.qpos.clone(), loop=True)
@@ -330,14 +334,14 @@ def test_the_end(task: HumanoidImitation) -> None:
 def test_a_motion_that_does_not_loop_ends() -> None:
     clip = Clip("once", torch.tensor(stroll(2, 60, True)[:61]), loop=False)
     task, step = HumanoidImitation(dtype=REAL, clip=clip), torch.arange(61)
-    obs = task.observe_at(*on_reference(task, step), NOTHING, step)
+    obs = observe(task, *on_reference(task, step), NOTHING, step)
     assert task.terminated(obs).tolist() == [False] * 60 + [True]
     assert task.first_step(torch.rand(2000, 1, dtype=REAL)).unique().tolist() == list(range(60))
     env = diffsim.make(  # without early termination, too; it does not go round
         "humanoid_imitation", 2, clip=clip, early_termination=False, horizon=4
     )
     for _ in range(60):
-        left = 60 - env.first_step - env.episode_step
+        left = 60 - env.memory[:, 0]
         with torch.no_grad():
             _, _, terminated, truncated, _ = env.step(torch.zeros(2, NU))
         assert torch.equal(terminated, left == 1) and not truncated.any()
@@ -383,5 +387,5 @@ def test_planners_refuse_what_depends_on_the_time(
 ) -> None:
     line = refusal(lambda: parse(script.Args, ["--env", "humanoid_imitation", *flags.split()]), capsys)
     assert "depend" in line and "humanoid_imitation" in line
-    with pytest.raises(ValueError, match="depends on the time: use observe_at"):
+    with pytest.raises(ValueError, match="depends on the time: use observe_with"):
         HumanoidImitation().observe(torch.zeros(1, NQ), torch.zeros(1, NV), torch.zeros(1, NU))
