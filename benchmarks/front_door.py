@@ -32,7 +32,7 @@ draw, drawn = Renderer.draw, []
 def timed(*arguments):
     frame = draw(*arguments)
     if not drawn:
-        drawn.append(print("first frame", time.monotonic(), flush=True))
+        drawn.append(print("first frame", time.monotonic(), time.process_time(), flush=True))
     return frame
 Renderer.draw = timed
 runpy.run_module("diffsim", run_name="__main__")
@@ -56,8 +56,10 @@ def measure(torch: str, folder: Path) -> list[Row]:
         cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
         for line in out.splitlines():
             if line.startswith("first frame"):
-                rows.append({"part": f"{part}: first frame", "own": own, "seconds": float(line.split()[2]) - start})
-        rows.append({"part": part, "own": own, "seconds": end - start, "cpu seconds": cpu})
+                clock, used_cpu = map(float, line.split()[2:])
+                first = {"part": f"{part}: first frame", "own": own, "seconds": clock - start, "cpu seconds": used_cpu}
+                rows.append(first | {"load": os.getloadavg()[0]})
+        rows.append({"part": part, "own": own, "seconds": end - start, "cpu seconds": cpu, "load": os.getloadavg()[0]})
         print(rows[-1], flush=True)
 
     subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT], check=True)
@@ -74,7 +76,14 @@ def measure(torch: str, folder: Path) -> list[Row]:
         address = driven.stdout.readline().split()[0]
         with urlopen(f"{address}/stream") as stream:
             stream.read(2000)
-        rows.append({"part": "drive ant: first picture", "own": True, "seconds": time.monotonic() - start})
+        rows.append(
+            {
+                "part": "drive ant: first picture",
+                "own": True,
+                "seconds": time.monotonic() - start,
+                "load": os.getloadavg()[0],
+            }
+        )
         driven.terminate()
     return rows
 
