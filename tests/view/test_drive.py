@@ -227,7 +227,6 @@ def test_a_browser_drives(tmp_path: Path) -> None:
         assert page.wait(f"track[3] > {start} + 0.5 && track[3]") < start + 5
         assert other.wait(f"track[3] > {start} + 0.5")
         other.key("ArrowDown", True)  # against the first: both are heard
-        page.call("Page.bringToFront")
         time.sleep(2)
         rest = page.evaluate("track[3]")
         time.sleep(2)
