@@ -29,7 +29,7 @@ from diffsim.planning.dynamics import REAL
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.lbfgs import maximise
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
-from diffsim.planning.samples import Samples, SampleSet, log_weights, phi
+from diffsim.planning.samples import Samples, SampleSet, log_weights, phi, sparse
 from diffsim.planning.system import System
 from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import find_task
@@ -68,6 +68,8 @@ class Args(Flags):
     """iterations K of the policy search"""
     horizon: Repeats = 500
     """control steps T of a trajectory (per task)"""
+    control_dt: Positive = 1 / 60
+    """seconds of a control step, which the --substeps divide"""
     reward: Literal["native", "target"] = "native"
     """the task's own reward, or the paper's: squared errors of velocity and height (per task)"""
     action_cost: Positive = 1e-3
@@ -94,8 +96,8 @@ class Args(Flags):
     """further iLQR iterations of the best"""
     tracking: NonNegative = 5e-4
     """weight of the squared deviation from the example in the initial guiding distributions (Section 6; per task)"""
-    spread: Positive = 3.0
-    """standard deviation of the guiding actions relative to the policy's: the temperature of exp(reward) (per task)"""
+    spread: NonNegative = 3.0
+    """the guides' standard deviation relative to the policy's (0: as of exp(reward), the paper's; per task)"""
     guiding_samples: Repeats = 40
     """trajectories drawn from the guiding distributions"""
     terrain: tuple[str, ...] = ("level",)
@@ -301,7 +303,7 @@ class Search:
         mixture, reward, top = S.log_mixture, S.reward / self.scale, S.returns.argmax()
 
         def objective(theta: Tensor) -> Tensor:
-            return phi(policy.log_prob(theta, S.obs, S.u), mixture, reward, self.w_r)
+            return sparse(lambda log_pi: phi(log_pi, mixture, reward, self.w_r), policy, theta, S)
 
         starts = policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)
         ends = [maximise(objective, theta, iterations) for theta in starts]
@@ -356,13 +358,11 @@ class Search:
             raise FloatingPointError(f"the value estimates are {values}: no active sample has a finite density")
         log_w = log_weights(log_pi[0], mixture)
         weights, guided = torch.softmax(log_w, 0), S.source < self.S.initial
-        return values[0] > values[1], {
-            "gps/estimate": values[0],
-            "gps/best_estimate": values[1],
-            "gps/ess": (1.0 / weights.square().sum(0)).mean().item(),
-            "gps/guide_share": (weights[guided].sum() / weights.sum()).item(),
-            "gps/guide_nats": -log_w[guided, -1].mean().item() if self.S.initial else math.nan,
-        }
+        nats = -log_w[guided, -1].mean().item() if self.S.initial else math.nan
+        metrics = {"gps/estimate": values[0], "gps/best_estimate": values[1], "gps/guide_nats": nats}
+        metrics["gps/ess"] = (1.0 / weights.square().sum(0)).mean().item()
+        metrics["gps/guide_share"] = (weights[guided].sum() / weights.sum()).item()
+        return values[0] > values[1], metrics
 
     def metrics(self, samples: Samples) -> dict[str, float]:
         objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}

@@ -4,6 +4,7 @@
     python benchmarks/gps_experiments.py --env hopper --cases full adaptive --seeds 1 2 --train-only    a part of them
     python benchmarks/gps_experiments.py --draw-only      only draw and tabulate what there is
     python benchmarks/gps_experiments.py --list           a command for each plan, and for each run, to run side by side
+    python benchmarks/gps_experiments.py --env hopper walker --temperatures      guides at several temperatures
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
 
 Cases, plans and the suite of docs/gps.md are in cases.json; what follows "--" goes to gps.py. Writes gps_runs.csv
@@ -37,7 +38,9 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.planning import REAL, nearest_feedback
+from diffsim.planning.samples import log_mixture, log_weights
 from diffsim.training import checkpoint, command, fail, load_policy, parse_penalty
+from diffsim.training.evaluation import make_env
 
 GPS = json.loads((ROOT / "benchmarks" / "cases.json").read_text())["gps"]
 CASES: dict[str, str] = GPS["cases"]  # what a run is called, and its flags
@@ -51,9 +54,13 @@ KEPT = (  # columns of progress.csv
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
 ).split()
 PERTURBED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
+SHOWN = (1, 10, 50, 500)  # of them in the page
+SPREADS = (1.0, 3.0, 10.0, 30.0, 0.0)  # the last one is of eta = 1
+TEMPERATURE = "env", "spread"
+WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
 STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
-DRAWN = [*VARIANTS, "full", "adaptive", "feedback", "feedback-short", "feedback-long"]
-COLOURS = [*(f"C{i}" for i in range(10)), "k"]
+DRAWN = [*VARIANTS, "full", "paper", "adaptive", "feedback", "feedback-short", "feedback-long"]
+COLOURS = [*(f"C{i}" for i in range(10)), "k", "m", "y"]
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 Row = dict[str, Any]
 Runs = dict[tuple[str, ...], list[dict[str, str]]]
@@ -70,6 +77,7 @@ class Args(CommonFlags):
     count: int = 20  # perturbed starts and pushes of each size
     runs: Path = ROOT / "runs" / "gps"  # directory of the runs: {runs}/{env}__{case}__{seed}
     train_only: bool = False  # only train: several such commands may run side by side
+    temperatures: bool = False  # only sample guides of the case `paper` at several temperatures
     list: bool = False  # only print a command for each plan and each run
     record: Path | None = None  # write the trajectory of --actor's deterministic policy here; nothing else is done
     actor: Path | None = None  # checkpoint of any script that --record follows
@@ -83,6 +91,7 @@ def environment(path: Path, **options: Any) -> diffsim.DiffEnv:
     """One environment, as that in which a checkpoint's policy was trained."""
     args = checkpoint.load(path)["args"]
     options |= {name: args[name] for name in ("integrator", "substeps", "theta")}
+    options["control_dt"] = args.get("control_dt")  # gps.py alone
     return diffsim.make(args["env"], 1, horizon=1, penalty=parse_penalty(args["penalty"]), **options)
 
 
@@ -101,7 +110,7 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
         states.append((env.qpos, env.qvel))
     qpos, qvel = (torch.cat(parts).numpy() for parts in zip(*states, strict=True))
     with path.open("wb") as file:
-        np.savez(file, qpos=qpos, qvel=qvel, action=torch.cat(actions).numpy())
+        np.savez(file, qpos=qpos, qvel=qvel, action=torch.cat(actions).numpy(), control_dt=env.control_dt)
     print(f"{env.task.name}, {steps} control steps: {path}")
 
 
@@ -117,7 +126,9 @@ def train(directory: Path, flags: Sequence[str], count: int) -> str:
         state = checkpoint.load(path)
         if state["iteration"] >= state["args"]["iterations"]:
             return f"{directory.name}: done before"
-        start = ["--resume", str(path)]
+        start, flags = ["--resume", str(path)], list(flags)
+        if "--demonstration" in flags:  # which the checkpoint has followed
+            del flags[(place := flags.index("--demonstration")) : place + 2]
     line = [sys.executable, str(ROOT / script), *start, "--run-dir", str(directory), "--threads", "1", *flags]
     with (directory.parent / f"{directory.name}.log").open("a") as log:
         code = subprocess.run(line, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT).returncode
@@ -125,6 +136,8 @@ def train(directory: Path, flags: Sequence[str], count: int) -> str:
         return f"{directory.name}: exit code {code}, see {log.name}"
     if case in PERTURBED:
         write_csv(directory / "generalisation.csv", generalisation(load_search(path), count))
+    if case.startswith("paper"):
+        write_csv(directory / "weights.csv", weights(load_search(path)))
     return f"{directory.name}: done"
 
 
@@ -206,6 +219,48 @@ def generalisation(search: gps.Search, count: int) -> list[Row]:
 # Table and pictures ---------------------------------------------------------------------------------------------------
 
 
+def weights(search: gps.Search) -> list[Row]:
+    """What importance sampling rests on, at some steps t: how theta* weighs the samples of S.
+
+    Mean log weights (nats) of the guides' samples and of its own newest, effective samples, the guides' share of the
+    weight; and up to t, per step, on the guides' samples: log pi - log q_guide (nats), the distance of the actions from
+    the policy's mean and the guides' deviation, in deviations of the policy's noise.
+    """
+    S, policy, rows = search.S.samples, search.network, []
+    log_pi, guides = policy.log_prob(policy.theta, S.obs, S.u), search.S.initial
+    log_w, guided = log_weights(log_pi, S.log_mixture), S.source < guides
+    own, weight = (S.source == search.S.best).nonzero().flatten()[-search.args.samples :], log_w.softmax(0)
+    gap = log_pi.cumsum(1) - log_mixture(S.log_q[:, :guides])
+    away = ((S.u - policy.mean(policy.theta, S.obs)) / policy.sigma).square().mean(-1)
+    wide = (search.guides[0].L.norm(dim=-1) / policy.sigma).square().mean(-1)
+    for t in (t for t in WEIGHED if t <= search.args.horizon):
+        row = dict(step=t, guides=log_w[guided, t - 1].mean(), own=log_w[own, t - 1].mean())
+        row |= dict(effective=1 / weight[:, t - 1].square().sum(), share=weight[guided, t - 1].sum())
+        row |= dict(gap=gap[guided, t - 1].mean() / t, away=away[guided, :t].mean().sqrt(), wide=wide[:t].mean().sqrt())
+        rows.append({name: torch.as_tensor(value).item() for name, value in row.items()})
+    return rows
+
+
+def temperatures(env: str, count: int) -> Iterator[Row]:
+    """Guides of the case `paper` by the temperature eta of exp(reward / eta), and how their trajectories end.
+
+    `wide` is the guides' deviation in those of the policy's noise; a trajectory is kept within a quarter of the plan.
+    """
+    (flags,) = jobs(Args(env=(env,), cases=("paper",), seeds=(1,))).values()
+    words = ["--env", env, *CASES["paper"].split(), *flags, "--device", "cpu", "--threads", "1"]
+    args = gps.parse(gps.Args, words)
+    search = gps.Search(args, make_env(args, 1))
+    plan = search.plan("level", lambda _: None)
+    search.network.sigma, best = (args.noise * plan.u[0].std(0)).clamp(min=1e-3), -plan.cost.item()
+    for args.spread in SPREADS:
+        (guide,) = search.guides = search.guide(search.system, plan, lambda _: None)
+        returns = search.follow([guide], count).returns
+        wide = (guide.L.norm(dim=-1) / search.network.sigma).square().mean().sqrt().item()
+        numbers = dict(mean=returns.mean().item(), median=returns.median().item())
+        kept = (returns >= best - 0.25 * abs(best)).double().mean().item()
+        yield dict(env=env, spread=args.spread, eta=guide.eta.item(), wide=wide, plan=best, **numbers, kept=kept)
+
+
 def number(text: str) -> float:
     return float(text or "nan")
 
@@ -219,7 +274,7 @@ def grouped(rows: Iterable[dict[str, str]], *keys: str) -> Runs:
 
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
-    found: dict[str, list[Row]] = {"gps_runs": [], "gps_generalisation": []}
+    found: dict[str, list[Row]] = {"gps_runs": [], "gps_generalisation": [], "gps_weights": []}
     older = set[str]()
     for directory in sorted(path for path in args.runs.glob("*__*__*") if (path / "progress.csv").is_file()):
         run = dict(zip(RUN, directory.name.split("__"), strict=True))
@@ -227,8 +282,10 @@ def collect(args: Args) -> None:
         for row in read_csv(directory / "progress.csv"):
             kept = {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT}
             found["gps_runs"].append(run | dict(horizon=horizon) | kept)
-        found["gps_generalisation"] += [run | row for row in read_csv(directory / "generalisation.csv")]
-        older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(directory / "generalisation.csv")}
+        for name in ("generalisation", "weights"):
+            path = directory / f"{name}.csv"
+            found[f"gps_{name}"] += [run | row for row in read_csv(path)]
+            older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(path)}
     for name, rows in found.items():
         here = {tuple(row[key] for key in RUN) for row in rows}
         rows += [row for row in args.read(name) if tuple(row[key] for key in RUN) not in here]
@@ -242,12 +299,11 @@ def final_return(rows: list[dict[str, str]]) -> float:
 
 
 def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
-    """One row of a case: means over its seeds, and each seed's end. In the band: at least the guides' mean - 2 std."""
+    """One row of a case: means over its seeds, and each seed's end."""
     final = [final_return(rows) for rows in seeds]
-    low = [number(rows[0]["gps_guides"]) - 2 * number(rows[0]["gps_guides_std"]) for rows in seeds]
 
-    def average(column: str, place: int = 0) -> float:
-        return mean(number(rows[place].get(column, "")) for rows in seeds)
+    def average(column: str) -> float:
+        return mean(number(rows[0].get(column, "")) for rows in seeds)
 
     iterations = sorted({int(rows[-1]["iteration"]) for rows in seeds})
     return {
@@ -257,9 +313,7 @@ def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
         "guides": f"{average('gps_guides'):.1f}",
         "pretrained": f"{average('gps_objective'):.0f}",
         "end, each seed": ", ".join("-" if math.isnan(value) else f"{value:.1f}" for value in final),
-        "in band": f"{sum(a >= b for a, b in zip(final, low, strict=True))}/{len(seeds)}",
         "iterations": "-".join(map(str, iterations[:: len(iterations) - 1 or 1])),
-        "seconds": f"{average('seconds', -1):.0f}",
     }
 
 
@@ -269,6 +323,30 @@ def table(runs: Runs) -> list[Row]:
     for (env, case, _), rows in runs.items():
         cases.setdefault((env, case), []).append(rows)
     return [summarise(env, case, seeds) for (env, case), seeds in cases.items()]
+
+
+def shown(runs: Runs) -> list[Row]:
+    """Of each run, at some steps: mean log weight of the guides' samples, and effective samples."""
+    result = list[Row]()
+    for name, rows in runs.items():
+        at = {
+            f"t = {float(row['step']):.0f}": (number(row["guides"]), number(row["effective"]))
+            for row in rows
+            if int(float(row["step"])) in SHOWN
+        }
+        cells = {t: f"{nats:.0f} / {effective:.0f}" for t, (nats, effective) in at.items()}
+        result.append(dict(zip(RUN, name, strict=True)) | cells)
+    return result
+
+
+def spreads(runs: Runs) -> list[Row]:
+    """Of each task, by the spread of its guides: their median return, and the share that keeps the plan's."""
+    result = list[Row]()
+    for (env,), rows in runs.items():
+        cells = {f"spread {row['spread']}" if row["spread"] != "0" else "η = 1": row for row in rows}
+        shown = {name: f"{number(row['median']):.0f} ({number(row['kept']):.0%})" for name, row in cells.items()}
+        result.append(dict(task=env, plan=f"{number(rows[0]['plan']):.0f}") | shown)
+    return result
 
 
 def variants(runs: Runs, env: str) -> Panel:
@@ -306,6 +384,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.list:
         print("\n".join(commands(args)))
         return
+    if args.temperatures:
+        args.merge("gps_temperatures", [row for env in args.env for row in temperatures(env, args.count)], TEMPERATURE)
+        return
     if not args.draw_only:
         args.runs.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(args.jobs) as pool:
@@ -316,6 +397,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     collect(args)
     runs = grouped(args.read("gps_runs"), *RUN)
     args.publish("gps runs", markdown(table(runs)), "gps.md")
+    args.publish("gps weights", markdown(shown(grouped(args.read("gps_weights"), *RUN))), "gps.md")
+    args.publish("gps temperatures", markdown(spreads(grouped(args.read("gps_temperatures"), "env"))), "gps.md")
     plot(args.picture("gps_variants"), [[variants(runs, env) for env in SUITE if any(env == key[0] for key in runs)]])
     groups = grouped(args.read("gps_generalisation"), "env", "variant", "kind")
     grid = [

@@ -1,4 +1,4 @@
-"""The six variants with which Figure 2 of guided policy search compares it: gps.py with some of its lines changed.
+"""The variants with which the paper of guided policy search compares it: gps.py with some of its lines changed.
 
     python benchmarks/gps_variants.py --case dagger --env hopper --demonstration benchmarks/plans/hopper_500.npz
 
@@ -16,11 +16,14 @@ import torch
 from tables import ROOT
 from torch import Tensor
 
-from diffsim.planning.samples import Samples
+from diffsim.planning.lbfgs import maximise
+from diffsim.planning.samples import Samples, log_weights, phi, sparse
 from diffsim.training import command, evaluate_checkpoint, parse
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
+
+LEAST = 5.0  # effective samples: half of what the policy draws
 
 
 class NonGuided(gps.Search):
@@ -84,9 +87,26 @@ class DAgger(NonGuided):
         return self.metrics(new)
 
 
-Name = Literal["unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
+class Effective(gps.Search):
+    """Tang and Abbeel 2010: in place of the regulariser a bound on the effective samples of each step."""
+
+    def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
+        policy, mixture, top, iterations = self.network, S.log_mixture, S.returns.argmax(), self.args.lbfgs_iterations
+
+        def value(log_pi: Tensor) -> Tensor:
+            effective = 1 / log_weights(log_pi, mixture).softmax(0).square().sum(0)
+            missing = (LEAST - effective).clamp(min=0)
+            return phi(log_pi, mixture, S.reward / self.scale, 0.0) - missing.square().sum()
+
+        starts = policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)
+        ends = [maximise(lambda theta: sparse(value, policy, theta, S), theta, iterations) for theta in starts]
+        start = int(ends[1][1] > ends[0][1])
+        return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
+
+
+Name = Literal["unregularized", "effective", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
 CASES: dict[Name, type[gps.Search]] = {"unregularized": gps.Search, "nonguided": NonGuided, "restart": Restart}
-CASES |= {"single-example": SingleExample, "policy-gradient": PolicyGradient, "dagger": DAgger}
+CASES |= {"effective": Effective, "single-example": SingleExample, "policy-gradient": PolicyGradient, "dagger": DAgger}
 
 
 @dataclass
@@ -94,7 +114,7 @@ class VariantArgs(gps.Args):
     """Which variant."""
 
     case: Name = "nonguided"
-    """the variant of Figure 2"""
+    """the variant of Figure 2, or of its footnote on effective samples"""
 
     def task_defaults(self) -> dict[str, Any]:
         bounds = {"regularizer_bounds": (0.0, 0.0)} if self.case == "unregularized" else {}

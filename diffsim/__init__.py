@@ -56,6 +56,7 @@ def make(
     dtype: torch.dtype = torch.float32,
     clip: Clip | Path | str | None = None,
     terrain: ArrayLike | None = None,
+    control_dt: float | None = None,
     **others: Any,
 ) -> DiffEnv:
     """Build the tensor environment of a task.
@@ -74,6 +75,7 @@ def make(
         terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
             of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
             observes, rewards and ends by are then those over the ground below the root.
+        control_dt: seconds of a control step in place of the task's; the substeps divide it.
         clip: the motion that humanoid_imitation tracks, or its .npz file, see read_clip; default the shipped run.
         **others: stochastic_init, early_termination, max_episode_steps, render_mode: see DiffEnv; threads, factors,
             forces: see sim.Options.
@@ -90,6 +92,10 @@ def make(
         task = kind(device, dtype, clip if isinstance(clip, Clip) else read_clip(clip))
     else:
         raise ValueError(f"task {kind.name!r} tracks no clip; {HumanoidImitation.name} does")
+    if control_dt is not None and control_dt != task.control_dt:
+        if task.num_memory:  # its times count in control steps
+            raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
+        task.control_dt = control_dt
     scene = load_scene(robot(task))
     integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes, touchdown)
     if penalty and integration.integrator == "mujoco":

@@ -98,10 +98,10 @@ class DiffEnv(VectorEnv):
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         if max_episode_steps is not None:
             self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
+        self.sim = Simulator(scene, num_envs, control_dt=task.control_dt, horizon=horizon, **asked._asdict())
         self.metadata = self.metadata | {"render_fps": round(1 / task.control_dt)}
         self._screen = Screen(scene, render_mode, 1 / task.control_dt) if render_mode else None
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
-        self.sim = Simulator(scene, num_envs, control_dt=task.control_dt, horizon=horizon, **asked._asdict())
         self._elevation = None if scene.terrain is None else Elevation(scene, self.device, self.dtype)
         real = np.float32 if self.dtype == torch.float32 else np.float64
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.obs_dim,), real)

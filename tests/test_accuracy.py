@@ -176,7 +176,8 @@ def extreme(scene, qpos, qvel, kind):
 KINDS = ("stiff", "slippery", "sticky", "light", "heavy", "fast", "spinning", "buried", "falling", "far")
 
 
-EXTREMES = [("hopper", "semi_implicit"), ("hopper", "extrapolated"), *(("ant", kind) for kind in INTEGRATORS)]
+EXTREMES = [("hopper", "semi_implicit"), ("hopper", "extrapolated"), ("ant", "semi_implicit"), ("ant", "mujoco")]
+EXTREMES += [pytest.param("ant", kind, marks=pytest.mark.slow) for kind in INTEGRATORS if ("ant", kind) not in EXTREMES]
 
 
 @pytest.mark.parametrize("name, integrator", EXTREMES)

@@ -61,9 +61,9 @@ def step(scene, states, dtype, integration, weights=None, **options):
     "name, integration, options",
     [
         ("ant", SEMI, {}),
-        ("hopper", EXTRAPOLATED, {"forces": True}),
+        pytest.param("hopper", EXTRAPOLATED, {"forces": True}, marks=pytest.mark.slow),
         pytest.param("fish", SEMI, {}, marks=pytest.mark.slow),
-        ("half_cheetah", IMPLICIT, {}),
+        pytest.param("half_cheetah", IMPLICIT, {}, marks=pytest.mark.slow),
         pytest.param("hill", SEMI, {"factors": True}, marks=pytest.mark.slow),
         ("hopper on hills", SEMI, {}),
         pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 
 import gymnasium
@@ -430,6 +431,22 @@ def test_float64():
     with torch.no_grad():
         obs, reward, *_ = env.step(torch.zeros(2, 1, dtype=torch.float64))
     assert obs.dtype == reward.dtype == torch.float64
+
+
+def test_control_steps_of_another_length():
+    """One of three times the length and as many more substeps is three of the task's own."""
+    ends = []
+    for count, substeps in ((6, 4), (2, 12)):
+        env = diffsim.make("cartpole", 2, dtype=torch.float64, substeps=substeps, control_dt=0.1 / count, seed=0)
+        with torch.no_grad():
+            for _ in range(count):
+                env.step(torch.full((2, 1), 0.3, dtype=torch.float64))
+        ends.append(env.qpos.clone())
+    torch.testing.assert_close(ends[0], ends[1])
+    assert env.control_dt == 0.05 and env.metadata["render_fps"] == 20
+    for name, wrong in (("cartpole", 0.0), ("cartpole", math.nan), ("cartpole", "a"), ("humanoid_imitation", 0.01)):
+        with pytest.raises(ValueError, match=r"control_dt is|control steps of 0.01667 s, not 0.01"):
+            diffsim.make(name, 1, control_dt=wrong)
 
 
 def test_finer_substeps_converge():

@@ -14,17 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import assert_refuses, assert_same, read_progress, run
+from learners import assert_refuses, assert_same, read_progress, refusal, run
 from torch import Tensor
 
 import diffsim
 import gps
 from diffsim.planning import LinearGaussian, gaussian_log_prob, load_demonstration, save_demonstration
 from diffsim.planning.lbfgs import maximise
-from diffsim.planning.samples import log_mixture, log_weights, phi
+from diffsim.planning.samples import log_mixture, log_weights, phi, sparse
 from diffsim.planning.terrains import named_terrains
-from diffsim.training import evaluate, load_policy
+from diffsim.training import evaluate, load_policy, make_policy_env
 from diffsim.training.checkpoint import load, restore
+from diffsim.training.evaluation import make_env
 from diffsim.view import render
 
 SMALL = (
@@ -84,6 +85,11 @@ def test_gradient_of_phi_is_that_of_appendix_a(w_r: float, rng: np.random.Genera
     errors = c.unsqueeze(-1) * (u - mean.detach()) / policy.sigma**2
     (appendix,) = torch.autograd.grad((errors * mean).sum(), leaf)
     assert (gradient - appendix).norm() / appendix.norm() < 1e-10
+
+    S = gps.Samples(obs, obs, u, reward, reward, reward[:, 0], log_q)
+    value = sparse(lambda log_pi: phi(log_pi, mixture, reward, w_r), policy, leaf, S)
+    torch.testing.assert_close(value.detach(), objective(theta), rtol=1e-14, atol=0)
+    torch.testing.assert_close(torch.autograd.grad(value, leaf)[0], gradient, rtol=1e-10, atol=1e-13)
 
     direction, eps = normal(rng, len(theta)), 1e-5
     direction /= direction.norm()
@@ -462,6 +468,20 @@ def test_seeds_and_adaptive_guides(tmp_path: Path) -> None:
     assert sum(len(generator) > 1 for generator in one["S"]["generators"]) == 4
 
 
+def test_control_steps_of_another_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They are the search's, the plan's, the evaluation's, and those of whatever plays the policy."""
+    path = tmp_path / "run" / "checkpoint.pt"
+    run(gps, path.parent, *TINY, *"--control-dt 0.05 --substeps 12 --spread 0 --perturb 0".split())
+    saved = load_policy(path)
+    env, state = make_policy_env(saved, 1), load(path, "gps")
+    search = gps.Search(gps.Args(**state["args"]), make_env(gps.Args(**state["args"]), 1))
+    restore(search, state)
+    assert env.control_dt == search.system.control_dt == gps.evaluate(search).control_dt == 0.05
+    assert search.guides[0].eta == 1.0 and np.load(path.parent / "plan.npz")["control_dt"] == 0.05
+    plan = ["--demonstration", str(path.parent / "plan.npz")]
+    assert "has control steps of 0.05 s, not of 0.01667 s" in refusal(lambda: gps.main([*TINY, *plan]), capsys)
+
+
 def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
     path, qpos = tmp_path / "demo.npz", np.linspace((0.3, 3.0), (0.5, 2.8), 9)
     np.savez(path, qpos=qpos, qvel=np.zeros((9, 2)), action=np.full((8, 1), 0.1))
@@ -579,6 +599,10 @@ def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None
         ("--env cartpole --active 20", "--active must be at least 50, not 20"),
         ("--env cartpole --guides 17 --guiding-samples 20", "--restarts must be at least 17, not 16"),
         ("--env cartpole --noise 0", "--noise must be positive, not 0.0"),
+        ("--env cartpole --control-dt 0", "--control-dt must be positive, not 0.0"),
+        ("--env cartpole --control-dt nan", "--control-dt must be finite, not nan"),
+        ("--env cartpole --spread -1", "--spread must be at least 0, not -1.0"),
+        ("--resume {trained}/checkpoint.pt --control-dt 0.02", "has --control-dt 0.016666666666666666, not 0.02"),
         ("--env cartpole --tracking -1", "--tracking must be at least 0, not -1.0"),
         ("--env cartpole --regularizer-bounds 1 0.1", "--regularizer-bounds must be two numbers in order"),
         ("--env cartpole --reward target", "cartpole has --reward native"),

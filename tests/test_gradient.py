@@ -35,6 +35,7 @@ from diffsim.tasks import TASKS
 
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
 CASES = [(name, *kind) for kind in INTEGRATORS for name in (DISTINCT if kind[0] == "implicit" else ROBOTS)]
+LARGE = "humanoid", "humanoid_mtu", "swimmer"  # whose implicit kernels no other test needs
 HILL = ("hill", "semi_implicit", 0.0)  # its muscles do not meet the integrator
 ONE = Integration(substeps=1)
 STEPS = {"factors": 1e-5, "forces": 1e-2}  # of differences
@@ -90,7 +91,10 @@ def check_gradients(scene, states, rng, optional=None, **simulator):
             assert error.max() < 1e-6, f"gradient with respect to {name}"
 
 
-@pytest.mark.parametrize("name, integrator, theta", CASES)
+@pytest.mark.parametrize(
+    "name, integrator, theta",
+    [pytest.param(*case, marks=[pytest.mark.slow] * (case[0] in LARGE and case[1] == "implicit")) for case in CASES],
+)
 def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
     scene = task_scene(name)
     states = acting_states(scene, 8, rng)
@@ -101,7 +105,7 @@ def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
 @pytest.mark.parametrize(
     "base, seed",
     [
-        pytest.param(base, seed, marks=[pytest.mark.slow] * (seed > 1))
+        pytest.param(base, seed, marks=[pytest.mark.slow] * (seed > 1 or base in ("fixed", "planar")))
         for base in ("floating", "fixed", "planar", "ball")
         for seed in range(4)
     ],
@@ -113,7 +117,7 @@ def test_tree_gradient_is_that_of_differences(base, seed, rng):
     check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, integration=Integration(substeps=16))
 
 
-@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
+@pytest.mark.parametrize("integrator, theta", [pytest.param(*INTEGRATORS[0], marks=pytest.mark.slow), *INTEGRATORS[1:]])
 def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
     """Quaternions of any length and sign, and one turn of nothing, where the spring's rotation vector is zero."""
     scene = parse(SHOULDER)
@@ -134,7 +138,7 @@ def test_muscle_gradient_is_that_of_differences(model, rng):
     [
         *(("linear", *kind) for kind in INTEGRATORS),
         *(("hopper", *kind) for kind in INTEGRATORS),
-        HILL,
+        pytest.param(*HILL, marks=pytest.mark.slow),
     ],
 )
 def test_gradient_in_factors_is_that_of_differences(name, integrator, theta, rng):
@@ -182,7 +186,7 @@ def test_quaternion_of_any_length(rng):
     check_gradients(scene, (longer, qvel, ctrl), rng)
 
 
-@pytest.mark.parametrize("name", ["hopper", "ant", "humanoid_mtu"])
+@pytest.mark.parametrize("name", ["hopper", "ant", pytest.param("humanoid_mtu", marks=pytest.mark.slow)])
 def test_float32_gradient_is_that_of_float64(name, rng):
     scene, simulator = task_scene(name), {"integration": TASKS[name].integration("default")}
     states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 15, rng)]

@@ -96,7 +96,8 @@ def maximum_entropy_controllers(
 
     Args:
         cost: of which the plan's trajectories are optima.
-        sigma, spread: eta is such that no motor's median standard deviation over time is beyond spread sigma (nu,).
+        sigma, spread: eta is such that no motor's median standard deviation over time is beyond spread sigma (nu,); 1,
+            the paper's, for spread 0.
     """
     f_z = step_jacobian(system, plan.x, plan.u)
     quadratic = cost.quadratic(plan.x, plan.u, f_z)
@@ -107,6 +108,6 @@ def maximum_entropy_controllers(
         gains = backward_pass(f_z, *quadratic, mu)
     covariance = torch.linalg.inv(gains.Q_uu + 1e-9 * torch.eye(system.nu, dtype=REAL, device=mu.device))
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt().median(1).values  # (R, nu)
-    eta = (spread * sigma / std).amin(-1).square()
+    eta = (spread * sigma / std).amin(-1).square() if spread else torch.ones_like(mu)
     L = torch.linalg.cholesky(eta.view(-1, 1, 1, 1) * symmetric(covariance))
     return [LinearGaussian(*tensors) for tensors in zip(plan.x, plan.u, gains.K, L, eta, mu, strict=True)]

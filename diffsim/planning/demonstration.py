@@ -17,6 +17,7 @@ from diffsim.planning.cost import Tracking
 from diffsim.planning.dynamics import REAL, Dynamics
 from diffsim.planning.ilqr import backward_pass, follow, step_jacobian
 
+PERIOD = 1 / 60  # s: the control step of a file that does not tell it
 MOST = 10**9  # bytes of an array; 500 steps of the humanoid have 10**5
 
 
@@ -26,7 +27,7 @@ def load_demonstration(
     """A trajectory of an .npz of qpos, qvel and action in [-1, 1], one row a control step.
 
     A file of several trajectories has a first dimension for them, and their terrains' names in `terrain`. One without
-    these names is of level ground.
+    these names is of level ground, one without `control_dt` of PERIOD.
 
     Args:
         terrain: which trajectory; if there is none of it, the first.
@@ -36,18 +37,21 @@ def load_demonstration(
         States (steps + 1, nx) and actions (steps, nu).
 
     Raises:
-        ValueError: no such file, not of this robot, shorter than steps, or not finite real numbers.
+        ValueError: no such file, not of this robot or control step, shorter than steps, or not finite real numbers.
     """
     if not path.is_file():
         raise ValueError(f"no such trajectory: {path}")
     try:
         with zipfile.ZipFile(path) as archive:
             arrays = {name: _read(archive, name, "fiu") for name in ("qpos", "qvel", "action")}
-            several = "terrain.npy" in archive.namelist()
+            several, timed = (f"{name}.npy" in archive.namelist() for name in ("terrain", "control_dt"))
+            control_dt = _read(archive, "control_dt", "f").item() if timed else PERIOD
             names = _read(archive, "terrain", "U").tolist() if several else ["level"]
     except Exception as error:  # zipfile and numpy raise whatever broken bytes lead them to
         why = " ".join(str(error).split())
         raise ValueError(f"{path} is not an .npz with qpos, qvel and action: {why}") from error
+    if not math.isclose(control_dt, system.control_dt, rel_tol=1e-6):
+        raise ValueError(f"{path} has control steps of {control_dt:.4g} s, not of {system.control_dt:.4g} s")
     parts = []
     for name, width, rows in (("qpos", system.nq, 1), ("qvel", system.nv, 1), ("action", system.nu, 0)):
         shape, array = arrays[name].shape, arrays[name] if arrays[name].ndim == 3 else arrays[name][None]
@@ -82,10 +86,11 @@ def save_demonstration(
     x, u = (torch.stack(parts).cpu() for parts in zip(*trajectories, strict=True))
     qpos, qvel, action = x[..., : system.nq].numpy(), x[..., system.nq :].numpy(), u.tanh().numpy()
     path.parent.mkdir(parents=True, exist_ok=True)
-    if (names := list(terrains)) == ["level"]:
-        np.savez_compressed(path, qpos=qpos[0], qvel=qvel[0], action=action[0])
+    names, period = list(terrains), np.float64(system.control_dt)
+    if names == ["level"]:
+        np.savez_compressed(path, qpos=qpos[0], qvel=qvel[0], action=action[0], control_dt=period)
     else:
-        np.savez_compressed(path, qpos=qpos, qvel=qvel, action=action, terrain=names)
+        np.savez_compressed(path, qpos=qpos, qvel=qvel, action=action, terrain=names, control_dt=period)
 
 
 def follow_demonstration(system: Dynamics, x: Tensor, u: Tensor, weight: float) -> tuple[Tensor, Tensor]:

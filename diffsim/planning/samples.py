@@ -6,7 +6,7 @@ Densities are those of prefixes of trajectories, as logarithms (Levine and Koltu
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -119,6 +119,19 @@ def log_mixture(log_q: Tensor) -> Tensor:
 def log_weights(log_pi: Tensor, log_mix: Tensor) -> Tensor:
     """(m, T) log pi(zeta_1:t) / q(zeta_1:t) from per-step log pi (m, T)."""
     return log_pi.cumsum(1) - log_mix
+
+
+def sparse(value: Callable[[Tensor], Tensor], policy: Policy, theta: Tensor, S: Samples) -> Tensor:
+    """A function () of log pi_theta (m, T), with its gradient in theta by Appendix A's sum over steps.
+
+    Steps that count for less than rounding are left out: most, as few samples have a weight that is not negligible.
+    """
+    log_pi = policy.log_prob(theta.detach(), S.obs, S.u).requires_grad_()
+    result = value(log_pi)
+    (slope,) = torch.autograd.grad(result, log_pi)
+    rows = slope.abs() > 1e-20 * slope.abs().max()
+    linear = (slope[rows] * policy.log_prob(theta, S.obs[rows], S.u[rows])).sum()
+    return result.detach() + linear - linear.detach()
 
 
 def phi(log_pi: Tensor, log_mix: Tensor, reward: Tensor, w_r: float) -> Tensor:

@@ -45,7 +45,7 @@ class Task:
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
     episode_length: ClassVar[int] = 1000  # control steps
-    control_dt: ClassVar[float] = 1 / 60  # s
+    control_dt: float = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
     start: tuple[float, ...] = ()  # by default the robot's keyframe "home", its first one, or qpos0; at rest
     spread: tuple[float, ...] | float = 0.0

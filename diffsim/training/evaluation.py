@@ -168,6 +168,7 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 
 def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **options: Any) -> DiffEnv:
     """The task as the flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
+    options = {"control_dt": getattr(args, "control_dt", None)} | options  # a flag of gps.py alone
     try:
         return diffsim.make(
             args.env,
@@ -195,7 +196,7 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
     """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
     names = {field.name for field in dataclasses.fields(Flags)} & saved.args.keys()
     args = Flags(**{name: saved.args[name] for name in names} | {"device": "cpu", "threads": 0} | changes)
-    env = make_env(args, num_envs, forces=forces)
+    env = make_env(args, num_envs, forces=forces, control_dt=saved.args.get("control_dt"))
     fitting(saved.network, env)
     return env
 

@@ -67,12 +67,34 @@ def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
 
 
+def test_weights_at_some_steps(runs: Path) -> None:
+    """By products of densities, which a few steps allow; the guide as a policy would weigh its samples alike."""
+    search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
+    rows, S, policy = experiments.weights(search), search.S.samples, search.network
+    assert [row["step"] for row in rows] == [1, 2, 5, 10]
+    mean = policy.mean(policy.theta, S.obs)
+    away = (S.u - mean) / policy.sigma
+    step = (-0.5 * away.square() - math.log(math.sqrt(2 * math.pi))).sum(-1) - policy.sigma.log().sum()
+    density = torch.stack([search.S.log_density(g, S) for g in search.S.generators])
+    used, guided, own = S.source.unique(), S.source == 0, (S.source == search.S.best).nonzero().flatten()[-4:]
+    for row in rows:
+        t = int(row["step"])
+        weight = step[:, :t].sum(1).exp() / density[used, :, t - 1].exp().mean(0)
+        share = weight / weight.sum()
+        expected = dict(guides=weight[guided].log().mean(), own=weight[own].log().mean(), share=share[guided].sum())
+        expected |= dict(effective=1 / share.square().sum(), away=away[guided, :t].square().mean().sqrt())
+        expected["gap"] = (step[:, :t].sum(1) - density[0, :, t - 1])[guided].mean() / t
+        expected["wide"] = (search.guides[0].L[:t, 0, 0] / policy.sigma).square().mean().sqrt()
+        for name, value in expected.items():
+            assert row[name] == pytest.approx(value.item(), rel=1e-6), name
+
+
 def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str]) -> None:
     options = "--env hopper --cases full adaptive --seeds 1 2 --runs there".split()
     experiments.main([*options, "--list", "--", "--horizon", "160"])
     lines = capsys.readouterr().out.splitlines()
     part = "--env hopper --cases adaptive --seeds 2 --runs there --train-only -- --horizon 160"
-    assert len(lines) == 5 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
+    assert len(lines) == 6 and lines[-1] == f"python benchmarks/gps_experiments.py {part}"
     assert lines[0].startswith("python gps.py --env hopper") and lines[0].endswith("--run-dir runs/plans/hopper_500")
     assert experiments.CASES["adaptive"].startswith("--variant full --perturb 0 --adaptive")
 
@@ -93,7 +115,7 @@ def test_the_list_holds_the_runs_that_the_page_shows() -> None:
     assert "200" in one["swimmer__feedback__1"] and "100" in two["swimmer__feedback__2"]
     assert other["swimmer__feedback__7"] == one["swimmer__feedback__1"]
     files = {path.stem for path in (experiments.ROOT / "benchmarks" / "plans").glob("*.npz")}
-    assert files == {*experiments.PLANS, "swimmer_500", "humanoid_500"}
+    assert files == {*experiments.PLANS, "swimmer_500", "humanoid_500", "walker_switch_300"}
     for flags in experiments.PLANS.values():
         gps.parse(gps.Args, flags.split())
     for env, case, *flags in {(*name.split("__")[:2], *flags) for name, flags in jobs.items()}:  # seeds share them
@@ -104,6 +126,16 @@ def test_a_finished_run_is_kept(runs: Path) -> None:
     before = (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns
     assert experiments.train(runs / "cartpole__full__1", [], 4) == "cartpole__full__1: done before"
     assert (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns == before
+
+
+def test_an_interrupted_run_goes_on(runs: Path, tmp_path: Path) -> None:
+    """Though its plan came from a file, which the checkpoint does not name."""
+    directory = tmp_path / "cartpole__nonguided__1"
+    first = ["--demonstration", str(runs / "cartpole__full__1" / "plan.npz"), *SMALL[2:], "--iterations", "2"]
+    flags = [*first, *experiments.CASES["nonguided"].split()]
+    run(gps_variants, directory, "--env", "cartpole", *flags, "--stop-after", "1")
+    assert experiments.train(directory, flags, 4) == "cartpole__nonguided__1: done"
+    assert len(read_csv(directory / "progress.csv")) == 3
 
 
 def test_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

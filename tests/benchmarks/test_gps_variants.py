@@ -9,6 +9,9 @@ import pytest
 import torch
 from learners import assert_same, run
 
+import diffsim
+from diffsim.planning.samples import log_weights
+
 TINY = (
     "--env cartpole --horizon 8 --restarts 3 --screening 4 --ilqr-iterations 3 --pretraining 5 --hidden 8 "
     "--guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 2 --lbfgs-iterations 5 --eval-episodes 1 "
@@ -19,7 +22,7 @@ TINY = (
 @pytest.mark.parametrize("case", list(gps_variants.CASES))
 def test_variants(case: str, tmp_path: Path) -> None:
     modules = run(gps_variants, tmp_path, *TINY, "--case", case)["modules"]
-    search, S, guided = modules["learner"], modules["S"], case == "unregularized"
+    search, S, guided = modules["learner"], modules["S"], case in ("unregularized", "effective")
     assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
     assert (search["w_r"] == 0) == (case == "unregularized")
     assert (len(S["samples"][0][:, 0].unique(dim=0)) > 3) == (case == "restart")
@@ -27,6 +30,20 @@ def test_variants(case: str, tmp_path: Path) -> None:
     assert case != "dagger" or len(search["lessons"][0]) == 8 + 2 * 4
     moved = not torch.equal(modules["network"]["theta"], S["generators"][S["best"]][0])
     assert moved == (case in ("policy-gradient", "dagger"))
+
+
+def test_a_bound_on_effective_samples(tmp_path: Path) -> None:
+    """The proposal keeps it at every step, where that of the search without the regulariser does not."""
+    least = []
+    for case in ("unregularized", "effective"):
+        flags = [*TINY, "--case", case, *"--lbfgs-iterations 40 --pretraining 40 --noise 0.3 --device cpu".split()]
+        args = gps_variants.parse(gps_variants.VariantArgs, flags)
+        search = gps_variants.CASES[args.case](args, diffsim.make("cartpole", 1))
+        search.prepare(lambda _: None, tmp_path / f"{case}.npz")
+        S = search.S.samples
+        log_pi = search.network.log_prob(search.optimise(S)[0], S.obs, S.u)
+        least.append((1 / log_weights(log_pi, S.log_mixture).softmax(0).square().sum(0)).min().item())
+    assert least[0] < 4.0 < 4.9 < least[1]
 
 
 def test_resume(tmp_path: Path) -> None:

@@ -34,6 +34,10 @@ def test_the_maximum_entropy_controller(rng: np.random.Generator) -> None:
     ratio = torch.stack(stds).median(0).values / sigma
     assert ratio.max() == pytest.approx(1.0, rel=1e-6) and controller.mu == 0  # one eta, of the tightest motor
 
+    (wide,) = maximum_entropy_controllers(system, system.cost, plan, sigma, 0.0)
+    assert wide.eta == 1.0  # the temperature of exp(-cost)
+    torch.testing.assert_close(wide.L * controller.eta.sqrt(), controller.L)
+
     noise = normal(rng, 40_000, 2, 2)
     short = controller._replace(x=controller.x[:3], u=controller.u[:2], K=controller.K[:2], L=controller.L[:2])
     x, u, _ = short.sample(system, noise)

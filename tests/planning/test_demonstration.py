@@ -11,7 +11,8 @@ import pytest
 import torch
 from systems import normal, task_system
 
-from diffsim.planning import follow_demonstration, load_demonstration, save_demonstration
+import diffsim
+from diffsim.planning import System, follow_demonstration, load_demonstration, save_demonstration
 
 
 def write(path: Path, steps: int, **changes: np.ndarray) -> Path:
@@ -42,7 +43,7 @@ def test_several_terrains_in_one_file(tmp_path: Path, rng: np.random.Generator) 
         torch.testing.assert_close(x, ways[0][0][: count + 1])
         torch.testing.assert_close(u, ways[0][1][:count])
     save_demonstration(system, ways[1:2], path)
-    assert sorted(np.load(path)) == ["action", "qpos", "qvel"] and np.load(path)["qpos"].shape == (7, 2)
+    assert sorted(np.load(path)) == ["action", "control_dt", "qpos", "qvel"] and np.load(path)["qpos"].shape == (7, 2)
     torch.testing.assert_close(load_demonstration(system, path, 5)[0], ways[1][0][:6])
     assert len(load_demonstration(system, path, 6, "step:5", 3)[1]) == 3
     two = {"terrain": np.array(["level", "step:5"])}
@@ -57,12 +58,30 @@ def test_several_terrains_in_one_file(tmp_path: Path, rng: np.random.Generator) 
         ({"qvel": np.zeros((20, 3))}, r"qvel has shape \(20, 3\), must be at least \(10, 2\)"),
         ({"qpos": np.full((20, 2), np.nan)}, "qpos holds numbers that are not finite"),
         ({"qpos": np.full((20, 2), 1j)}, r"qpos has shape \(20, 2\) of complex128, must be .* of real numbers"),
+        ({"control_dt": np.array(0.02)}, "has control steps of 0.02 s, not of 0.01667 s"),
+        ({"control_dt": np.array([0.02, 0.02])}, "is not an .npz with qpos, qvel and action"),
         ({"action": np.array(["a"], dtype=object)}, "is not an .npz with qpos, qvel and action"),
     ],
 )
 def test_refusals(changes: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 9, **changes), 9)
+
+
+def test_a_plan_is_of_its_own_control_step(tmp_path: Path) -> None:
+    """Which the file tells; one that does not, of before there was a choice, has 1/60 s."""
+    slow, usual, path = (
+        System(diffsim.make("cartpole", 1, control_dt=0.05)),
+        task_system("cartpole"),
+        tmp_path / "a.npz",
+    )
+    way = torch.ones(10, 4).double(), torch.zeros(9, 1).double()
+    save_demonstration(slow, [way], path)
+    assert torch.equal(load_demonstration(slow, path, 9)[0], way[0])
+    with pytest.raises(ValueError, match=r"has control steps of 0.05 s, not of 0.01667 s"):
+        load_demonstration(usual, path, 9)
+    with pytest.raises(ValueError, match=r"has control steps of 0.01667 s, not of 0.05 s"):
+        load_demonstration(slow, write(path, 9), 9)
 
 
 def test_a_header_that_asks_for_terabytes_is_refused_before_memory_is_taken(
