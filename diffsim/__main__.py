@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import runpy
 import shutil
 import sys
 import warnings
@@ -26,6 +27,8 @@ from diffsim.training import command, evaluate, export_onnx, export_policy, fail
 from diffsim.view import render
 
 POLICIES = files("diffsim") / "policies"
+PACKAGE = Path(str(files("diffsim")))
+LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo_baseline", "sac_baseline", "mbpo", "pfpn", "gps")
 DEMO_EPISODES = 8  # the one of median return is filmed
 DEMO_SECONDS = 4.0  # of it
 
@@ -34,10 +37,17 @@ DEMO_SECONDS = 4.0  # of it
 def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
     argv = sys.argv[1:] if argv is None else argv
-    commands: dict[str, Callable[..., object]] = {"demo": demo, "check": check, "export": export}
+    commands: dict[str, Callable[..., object]] = {
+        each.__name__: each for each in (demo, drive, train, new, view, check, export)
+    }
+    match [*argv]:  # a script heeds its own flags and errors
+        case ["view", *flags]:
+            return run_script("view", flags)
+        case ["train", learner, *flags] if not learner.startswith("-"):
+            return run_script(known(learner), flags)
     try:
         if argv:
-            tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="python -m diffsim", description=__doc__)
+            tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="diffsim", description=__doc__)
         else:
             print(report())
     except BrokenPipeError:
@@ -48,18 +58,71 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None:
     """Film a policy that comes with the package, as .mp4 or .gif; needs no display."""
-    find_task(task)  # an unknown one ends the command
-    policy = POLICIES / f"{task}.pt"
-    if not policy.is_file():
-        there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
-        fail(f"no policy of {task} comes with this version; there are: {', '.join(there) or 'none'}")
+    policy = shipped(find_task(task).name)
     render.check_video(output)
     render.check_opengl()
     torch.set_num_threads(1)
-    saved = load_policy(Path(str(policy)))
-    evaluation = evaluate(make_policy_env(saved, DEMO_EPISODES), saved.network)
-    print(f"{task}, {saved.script}.py, iteration {saved.iteration}, {DEMO_EPISODES} episodes: {evaluation}")
-    print(f"video: {evaluation.save_video(output, DEMO_SECONDS)}")
+    saved = load_policy(policy)
+    with startup.quick_kernels():
+        env = make_policy_env(saved, DEMO_EPISODES)
+        env.episode_length = min(env.episode_length, round(DEMO_SECONDS / env.control_dt))
+        evaluation = evaluate(env, saved.network)
+    which = f"{saved.script}.py, iteration {saved.iteration}"
+    print(f"{task}, {which}, the first {DEMO_SECONDS:g} s of {DEMO_EPISODES} episodes: {evaluation}")
+    print(f"video: {evaluation.save_video(output)}")
+
+
+def shipped(task: str) -> Path:
+    """The policy of a task that comes with the package."""
+    there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
+    if task not in there:
+        fail(f"no policy of {task} comes with this version; there are: {', '.join(there) or 'none'}")
+    return Path(str(POLICIES / f"{task}.pt"))
+
+
+def drive(
+    robot: Positional[str] = "go2", checkpoint: Path | None = None, host: str = "127.0.0.1", port: int = 8080
+) -> None:
+    """Drive a robot from a page of your browser, with keys, a gamepad and the mouse; needs no display.
+
+    Args:
+        robot: a task whose policy comes with the package, or that of the checkpoint.
+        checkpoint: of any script.
+        host: where the page is served: 0.0.0.0 lets other machines drive, too.
+        port: of the page; 0 takes a free one.
+    """
+    from diffsim.view.drive import KEYS, serve
+
+    task = find_task(robot)
+    if not issubclass(task, kinds := tuple(KEYS)):
+        able = [name for name, each in TASKS.items() if issubclass(each, kinds)]
+        fail(f"{robot} cannot be driven: choose from {', '.join(able)}")
+    saved = load_policy(checkpoint or shipped(task.name))
+    if (trained := find_task(saved.args["env"])) is not task:
+        fail(f"{checkpoint} is a checkpoint of {trained.name}, not of {robot}")
+    torch.set_num_threads(1)
+    caption = f"{saved.script}.py, iteration {saved.iteration}"
+    with startup.quick_kernels():
+        serve(make_policy_env(saved, 1, forces=True), saved.network, caption, host, port)
+
+
+def train(learner: Positional[str]) -> None:
+    """Train with a learner of the package: diffsim train shac --env ant, and --help for its flags."""
+    run_script(known(learner), [])
+
+
+def view() -> None:
+    """Show a run as video, page, window or plot: diffsim view runs/<run> --web ant.html, and --help for its flags."""
+
+
+def new(learner: Positional[str], script: Positional[Path]) -> None:
+    """Copy the one file of a learner, to edit: diffsim new shac my_shac.py; then python my_shac.py --env ant."""
+    source = find_script(known(learner))
+    if script.exists() or script.suffix != ".py":
+        fail(f"{script} exists already" if script.exists() else f"{script}: a script ends in .py")
+    with render.whole_file(script) as part:
+        shutil.copyfile(source, part)
+    print(f"{script}: a copy of {source.name}; python {script} --env ant trains with it")
 
 
 def check(robot: Positional[Path]) -> None:
@@ -85,6 +148,21 @@ def export(checkpoint: Positional[Path], output: Positional[Path]) -> None:
             fail(f"cannot write {output}: its name must end in .pt or .onnx")
     size = output.stat().st_size / 1e3
     print(f"{output}: {saved.args['env']}, {saved.script}.py, iteration {saved.iteration}, {size:.0f} kB")
+
+
+def known(learner: str) -> str:
+    return learner if learner in LEARNERS else fail(f"unknown learner {learner!r}: choose from {', '.join(LEARNERS)}")
+
+
+def find_script(name: str) -> Path:
+    """A script of the repository: the wheel has them in the package, a clone beside it."""
+    inside = PACKAGE / "learners"
+    return (inside if inside.is_dir() else PACKAGE.parent) / f"{name}.py"
+
+
+def run_script(name: str, flags: Sequence[str]) -> None:
+    sys.argv[1:] = flags
+    runpy.run_path(str(find_script(name)), run_name="__main__")
 
 
 # The report -----------------------------------------------------------------------------------------------------------
@@ -116,7 +194,7 @@ def describe_machine() -> dict[str, str]:
     except RuntimeError:
         drawing = "none"
     return {
-        "diffsim": f"{_version('diffsim')}, {files('diffsim')}",
+        "diffsim": f"{_version('diffsim-rl')}, {files('diffsim')}",
         "versions": ", ".join([f"python {platform.python_version()}", *(f"{p} {_version(p)}" for p in packages)]),
         "devices": "; ".join([f"cpu, {available_cores()} cores", *devices]),
         "kernels": _kernel_cache(),

@@ -122,6 +122,30 @@ def test_a_demonstration_of_an_exported_policy(
     assert "cartpole" in command.describe_tasks()[1] and command.describe_tasks()[1].endswith("yes")
 
 
+def test_a_learner_trains_and_its_copy_is_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the package, as a wheel has it, and from beside it, as a clone."""
+    flags = "--env cartpole --device cpu --iterations 1 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet --run-dir"
+    command.main(["train", "shac", *flags.split(), str(tmp_path / "run")])
+    assert load_policy(tmp_path / "run" / "checkpoint.pt").script == "shac"
+    command.main(["new", "shac", str(tmp_path / "learners" / "my_shac.py")])
+    assert (tmp_path / "learners" / "my_shac.py").read_bytes() == (ROOT / "shac.py").read_bytes()
+    monkeypatch.setattr(command, "PACKAGE", tmp_path)
+    monkeypatch.setattr(command, "LEARNERS", ("my_shac",))
+    with pytest.raises(SystemExit) as exit:
+        command.main(["train", "my_shac", "--env", "nothing"])
+    assert exit.value.code == 2
+    command.main(["train", "my_shac", *flags.split(), str(tmp_path / "mine")])
+    assert load_policy(tmp_path / "mine" / "checkpoint.pt").script == "my_shac"
+
+
+def test_quick_kernels_are_of_their_time_alone() -> None:
+    before = wp.config.optimization_level, wp.config.use_precompiled_headers
+    with pytest.raises(KeyError), startup.quick_kernels():
+        assert (wp.config.optimization_level, wp.config.use_precompiled_headers) == (0, False)
+        raise KeyError
+    assert before == (wp.config.optimization_level, wp.config.use_precompiled_headers)
+
+
 def test_an_export_is_the_policy_alone(trained: Path, tmp_path: Path) -> None:
     small = tmp_path / "small.pt"
     command.main(["export", str(trained), str(small)])
@@ -139,6 +163,10 @@ def test_an_export_is_the_policy_alone(trained: Path, tmp_path: Path) -> None:
     [
         ("demo nothing", "unknown task 'nothing': choose from cartpole, hopper"),
         ("demo hopper", "no policy of hopper comes with this version; there are: none"),
+        ("train nothing --env ant", "unknown learner 'nothing': choose from shac, sapo"),
+        ("new view {tmp}/a.py", "unknown learner 'view': choose from shac, sapo"),
+        ("new shac {trained}", "{trained} exists already"),
+        ("new shac {tmp}/mine", "{tmp}/mine: a script ends in .py"),
         ("export {tmp}/nothing.pt {tmp}/new/out.pt", "no such checkpoint: {tmp}/nothing.pt"),
         ("export {trained} {trained}/out.pt", "File exists"),
         ("export {trained} /dev/null", "cannot write /dev/null: it is no regular file"),
@@ -158,7 +186,7 @@ def test_mistakes_are_one_line(
         command.main(arguments.format(tmp=tmp_path, trained=trained).split())
     error = capsys.readouterr().err
     assert exit.value.code == 2 and error.startswith("diffsim: ") and error.count("\n") == 1
-    assert message.format(tmp=tmp_path) in error
+    assert message.format(tmp=tmp_path, trained=trained) in error
 
 
 @pytest.mark.parametrize("program", [["-m", "diffsim"], ["shac.py", "--help"]])

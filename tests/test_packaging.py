@@ -11,6 +11,8 @@ from zipfile import ZipFile
 
 import pytest
 
+from diffsim.__main__ import LEARNERS
+
 pytest.importorskip("setuptools", minversion="77", reason="pyproject's license needs setuptools 77")
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,6 +50,9 @@ def test_the_wheel_holds_the_package_and_the_licenses(repository: list[str], sou
     with ZipFile(build("wheel", source)) as wheel:
         names = set(wheel.namelist())
     package = {name for name in repository if name.startswith("diffsim/")}
+    scripts = {name for name in repository if name.endswith(".py") and "/" not in name}
+    assert {f"{name}.py" for name in LEARNERS} | {"view.py"} == scripts
+    package |= {f"diffsim/learners/{name}" for name in scripts}
     assert {name for name in names if ".dist-info/" not in name} == package
     assert {f"diffsim/{name}" for name in ("py.typed", "assets/web.html", "assets/NOTICE", "policies/ant.pt")} <= names
     licenses = {name.partition(".dist-info/licenses/")[2] for name in names} - {""}

@@ -205,13 +205,13 @@ def load_policy(path: Path) -> SavedPolicy:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
             network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
             kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
-            if task := TASKS.get(state["args"]["env"]):
-                network(torch.empty(1, task.obs_dim))
         weights = state["policy"]["weights"]
         if any(w.layout != torch.strided or w.is_meta or not w.is_floating_point() for w in weights.values()):
             raise TypeError
         # A searched policy is in float64.
         network.load_state_dict({name: w.to(kinds[name]) for name, w in weights.items()}, assign=True)
+        if task := TASKS.get(state["args"]["env"]):
+            network(torch.zeros(1, task.obs_dim))  # on the device meta this would take seconds, of torch's imports
     except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers or its task")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))

@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import os
+import re
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -44,22 +45,26 @@ def write_page(
     path = Path(path)
     if path.suffix != ".html":
         raise ValueError(f"a page ends in .html, not {path.suffix!r}")
-    motion = json.dumps(describe(scene, qpos, control_dt, ctrl)).replace("<", "\\u003c")
-    page = (files("diffsim") / "assets" / "web.html").read_text(encoding="utf-8")
-    for name, text in (("$title", html.escape(title)), ("$caption", html.escape(caption)), ("$motion", motion)):
-        page = page.replace(name, text)
+    page = fill_page(describe(scene, qpos, control_dt, ctrl), title, caption)
     with whole_file(path) as part:
         part.write_text(page, encoding="utf-8")
     return path
+
+
+def fill_page(motion: dict[str, Any], title: str, caption: str) -> str:
+    """The page that shows what `describe` found."""
+    page = (files("diffsim") / "assets" / "web.html").read_text(encoding="utf-8")
+    parts = {"title": html.escape(title), "caption": html.escape(caption)}
+    parts["motion"] = json.dumps(motion).replace("<", "\\u003c")
+    return re.sub(r"\$(title|caption|motion)\b", lambda name: parts[name[1]], page)
 
 
 def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike | None = None) -> dict[str, Any]:
     """What the page draws: shapes once, and of every frame the pose of each body and the activation of each muscle."""
     model, qpos = scene.mj_model, np.asarray(qpos, dtype=np.float64)
     stride = 1 + len(qpos) * model.nbody * 28 // MAX_BYTES
-    poses, track = _poses(model, qpos[::stride])
     relaxed = np.full((len(qpos), model.nu), -1.0)
-    tendons, activation = activations(model, (relaxed if ctrl is None else np.asarray(ctrl))[::stride])
+    ctrl = (relaxed if ctrl is None else np.asarray(ctrl))[::stride]
     planes, painted = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, model.geom_matid >= 0
     rgba = model.geom_rgba.copy()
     rgba[painted] = model.mat_rgba[model.geom_matid[painted]]
@@ -73,12 +78,21 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
         geoms.append(_shape("box", 0, size, centre, quat, GROUND))
     return {
         "dt": stride * control_dt,
-        "frames": len(poses),
+        "frames": len(ctrl),
         "bodies": model.nbody,
         "floor": float(model.geom_pos[planes][0, 2]) if planes.any() and scene.terrain is None else None,
         "geoms": geoms,
-        "muscles": [_muscle(model, tendon) for tendon in tendons],
+        "muscles": [_muscle(model, tendon) for tendon in activations(model, ctrl)[0]],
         "camera": orbit(model),
+        **frames(model, qpos[::stride], ctrl),
+    }
+
+
+def frames(model: mujoco.MjModel, qpos: NDArray[np.float64], ctrl: NDArray[Any]) -> dict[str, str]:
+    """What moves, of configurations qpos (T, nq) with ctrl (T, nu): numbers in the page's order, as base64."""
+    poses, track = _poses(model, qpos)
+    activation = activations(model, ctrl)[1]
+    return {
         "poses": _base64(poses.astype("<f4")),
         "track": _base64(track.astype("<f4")),
         "activation": _base64((activation * 255).round().astype(np.uint8)),

@@ -1,0 +1,235 @@
+"""Drive a robot from a browser: its policy acts in this simulator, live, as keys, gamepads and the mouse command.
+
+Python's own web server shows the page of view/web.py. Each picture comes to it as an event of a stream, and what its
+user asks for goes back as a POST. Several pages show one robot; their commands add up.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import itertools
+import json
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffsim.env import DiffEnv
+from diffsim.robot.scene import Array
+from diffsim.tasks.joystick import Joystick
+from diffsim.tasks.locomotion import Locomotion
+from diffsim.view import web
+from diffsim.view.screen import GRAVITY, MAX_PULL
+
+KEYS = {  # of the tasks that can be driven
+    Joystick: "arrows or gamepad: walk, turn · Q, E: sideways · shift + drag: pull · enter: start anew",
+    Locomotion: "left, right or gamepad: turn · shift + drag: pull · enter: start anew",
+}
+TURN = 0.3  # rad/s by which a key turns the way of a robot that otherwise runs straight on; at 1 rad/s the ant falls
+STIFFNESS = 20.0  # N/kg per m of the mouse's pull, up to MAX_PULL
+SILENCE = 10.0  # s after which a page that takes no more pictures is given up
+LONGEST = 1000  # bytes of what a page asks for
+
+
+class Wish(NamedTuple):
+    """What a page's user asks for."""
+
+    move: tuple[float, ...] = (0.0, 0.0, 0.0)  # forward, left, turn to the left, each in [-1, 1] of the most
+    pull: tuple[float, ...] = ()  # a body's number, and the point (3,) to which it is pulled, if any
+    restarts: int = 0  # how often a new episode was asked for
+
+
+def parse(said: dict[str, Any], bodies: int) -> Wish:
+    """Raises ValueError, TypeError, OverflowError or KeyError if it is no wish."""
+    wish = Wish(tuple(map(float, said["move"])), tuple(map(float, said["pull"] or ())), int(said["restarts"]))
+    if len(wish.move) != 3 or not all(map(math.isfinite, (*wish.move, *wish.pull))):
+        raise ValueError("a move has three finite numbers")
+    if wish.pull and (len(wish.pull) != 4 or wish.pull[0] not in range(1, bodies)):
+        raise ValueError("a pull has a body and a point")
+    return wish
+
+
+class Pilot:
+    """A policy that acts on one environment, made with forces, as it is commanded.
+
+    A policy of Joystick gets the command that it was trained for. One of Locomotion, which runs along x, gets the state
+    as it looks from a frame that a command turns.
+    """
+
+    def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> None:
+        self.env, self._policy = env, policy
+        env.episode_length = 2**62  # until the robot falls
+        self._mass, self._places = float(env.scene.mj_model.body_mass.sum()), np.zeros((env.scene.nbody, 3))
+        self.restart()
+
+    def restart(self) -> None:
+        self.env.reset()
+        self._heading, self._action = 0.0, torch.zeros(1, self.env.scene.nu)
+
+    @torch.no_grad()
+    def step(self, wishes: Sequence[Wish]) -> dict[str, str]:
+        """A control step; what it changes in the picture, see web.frames."""
+        env, move = self.env, np.sum([wish.move for wish in wishes], axis=0).clip(-1.0, 1.0)
+        env.sim.forces = torch.as_tensor(self._forces(wishes), dtype=env.dtype)[None]
+        self._action = self._policy(self._see(move)).clamp(-1.0, 1.0)
+        _, _, terminated, truncated, _ = env.step(self._action)
+        shown = web.frames(env.scene.mj_model, env.qpos.double().numpy(), self._action.numpy())
+        self._places = np.frombuffer(base64.b64decode(shown["poses"]), "<f4").reshape(-1, 7)[:, :3]
+        if bool(terminated | truncated):
+            self._heading, self._action = 0.0, torch.zeros_like(self._action)
+        return shown
+
+    def _see(self, move: Array) -> Tensor:
+        env, task = self.env, self.env.task
+        if isinstance(task, Joystick):
+            command = torch.as_tensor(move * task.robot.command, dtype=env.dtype)[None]
+            env.memory = torch.cat((command, env.memory[:, 3:]), dim=1)
+            return env.observe(env.qpos, env.qvel, self._action)
+        self._heading += TURN * float(move[2]) * env.control_dt
+        return task.observe(*turned(-self._heading, env.qpos, env.qvel), self._action)
+
+    def _forces(self, wishes: Sequence[Wish]) -> Array:
+        """(nbody, 6) of all pulls, as Simulator.forces has them."""
+        forces = np.zeros((len(self._places), 6))
+        for body, *point in (wish.pull for wish in wishes if wish.pull):
+            way = point - self._places[int(body)]
+            strength = min(STIFFNESS, MAX_PULL * GRAVITY / max(float(np.linalg.norm(way)), 1e-9))
+            forces[int(body), :3] += self._mass * strength * way
+        return forces
+
+
+def turned(angle: float, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
+    """A state of a robot with a free root, turned about the world's z axis by an angle [rad]."""
+    c, s, a, b = math.cos(angle), math.sin(angle), math.cos(angle / 2), math.sin(angle / 2)
+    plane = torch.tensor([[c, s], [-s, c]], dtype=qpos.dtype)
+    w, x, y, z = qpos[:, 3:7].unbind(1)
+    quat = torch.stack((a * w - b * z, a * x - b * y, a * y + b * x, a * z + b * w), dim=1)
+    return (
+        torch.cat((qpos[:, :2] @ plane, qpos[:, 2:3], quat, qpos[:, 7:]), dim=1),
+        torch.cat((qvel[:, :2] @ plane, qvel[:, 2:]), dim=1),
+    )
+
+
+class Stage:
+    """What pages and the simulation share: the wishes of each, and the latest picture."""
+
+    def __init__(self) -> None:
+        self.changed, self.wishes = threading.Condition(), dict[int, Wish]()
+        self._picture, self._number, self._clients = "", 0, itertools.count(1)
+
+    def show(self, picture: dict[str, str]) -> None:
+        with self.changed:
+            self._picture, self._number = json.dumps(picture), self._number + 1
+            self.changed.notify_all()
+
+    def watch(self) -> Generator[str, None, None]:
+        """The client's number, then each picture, but for those that come while it is busy with another."""
+        client, seen = next(self._clients), self._number
+        with self.changed:
+            self.wishes[client] = Wish()
+            self.changed.notify_all()
+        try:
+            yield json.dumps({"client": client})
+            while True:
+                with self.changed:
+                    while self._number == seen:
+                        self.changed.wait()
+                    seen, picture = self._number, self._picture
+                yield picture
+        finally:
+            with self.changed:
+                del self.wishes[client]
+
+
+class Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exc_info()[1], OSError):  # of a page that is closed
+            super().handle_error(request, client_address)
+
+
+class Handler(BaseHTTPRequestHandler):
+    timeout = SILENCE
+
+    def __init__(self, stage: Stage, page: str, bodies: int, *connection: Any) -> None:
+        self._stage, self._page, self._bodies = stage, page.encode(), bodies
+        super().__init__(*connection)
+
+    def do_GET(self) -> None:
+        if self.path == "/":
+            self._answer("text/html; charset=utf-8", self._page)
+        elif self.path == "/stream":
+            self._answer("text/event-stream")
+            with closing(self._stage.watch()) as pictures:
+                for picture in pictures:
+                    self.wfile.write(f"data: {picture}\n\n".encode())
+        else:
+            self.send_error(404)
+
+    def do_POST(self) -> None:
+        origin = self.headers.get("Origin")
+        if origin and origin.partition("://")[2] != self.headers.get("Host"):
+            return self.send_error(403, "only the page itself may ask")
+        try:
+            said = json.loads(self.rfile.read(min(int(self.headers.get("Content-Length", 0)), LONGEST)))
+            client, wish = said["client"], parse(said, self._bodies)
+        except (KeyError, OverflowError, RecursionError, TypeError, ValueError):
+            return self.send_error(400)
+        with self._stage.changed:
+            if client in [*self._stage.wishes]:  # still
+                self._stage.wishes[client] = wish
+        self._answer("text/plain")
+
+    def _answer(self, kind: str, content: bytes = b"") -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def serve(env: DiffEnv, policy: Callable[[Tensor], Tensor], caption: str, host: str, port: int) -> None:
+    """Show a page where a robot can be driven, until Ctrl-C. While no page is open, the robot waits.
+
+    Raises:
+        OSError: nothing can listen at host and port, in one line.
+    """
+    stage, scene, name, restarts, due = Stage(), env.scene, env.task.name, 0, 0.0
+    motion = web.describe(scene, np.repeat(env.qpos.numpy(), 2, 0), env.control_dt)
+    motion["live"] = next(text for kind, text in KEYS.items() if isinstance(env.task, kind))
+    try:
+        page = web.fill_page(motion, name, caption)
+        server = Server((host, port), functools.partial(Handler, stage, page, scene.nbody))
+    except (OSError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise OSError(f"cannot listen on {host}:{port}: {why}; choose another --host or --port") from error
+    with server, suppress(KeyboardInterrupt):
+        pilot = Pilot(env, policy)
+        pilot.step([Wish()])  # compiles
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        print(f"http://{host}:{server.server_port} drives {name}; Ctrl-C ends it", flush=True)
+        while True:  # pictures, each at its time
+            with stage.changed:
+                while not stage.wishes:
+                    stage.changed.wait()
+                wishes = [*stage.wishes.values()]
+            if (asked := sum(wish.restarts for wish in wishes)) > restarts:
+                pilot.restart()
+            restarts = asked
+            stage.show(pilot.step(wishes))
+            now = time.perf_counter()
+            due = max(due + env.control_dt, now - 0.1)  # late: go on from here
+            time.sleep(max(0.0, due - now))

@@ -1,0 +1,254 @@
+"""Driving: commands reach the policy, pages the robot, and nobody who leaves or talks nonsense disturbs the others."""
+
+from __future__ import annotations
+
+import functools
+import http.client
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import CHROMIUM, Browser
+
+from diffsim import __main__ as command
+from diffsim import startup
+from diffsim.robot.mjcf import load_scene
+from diffsim.tasks import Ant
+from diffsim.training import load_policy, make_policy_env
+from diffsim.view import drive
+from diffsim.view.drive import Handler, Pilot, Server, Stage, Wish
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+# The pages' side, without a simulation --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stage() -> Iterator[tuple[Stage, int]]:
+    shared = Stage()
+    with Server(("127.0.0.1", 0), functools.partial(Handler, shared, "the page", 3)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield shared, server.server_port
+        server.shutdown()
+
+
+def connect(port: int) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse, int]:
+    """A stream, and the number that it gives the client."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", "/stream")
+    stream = connection.getresponse()
+    return connection, stream, json.loads(news(stream))["client"]
+
+
+def news(stream: http.client.HTTPResponse) -> str:
+    line, blank = stream.readline(), stream.readline()
+    assert line.startswith(b"data: ") and blank == b"\n"
+    return line[6:-1].decode()
+
+
+def ask(port: int, body: object, **headers: str) -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("POST", "/ask", body if isinstance(body, str) else json.dumps(body), headers)
+    return connection.getresponse().status
+
+
+def test_two_clients_see_all_and_one_that_leaves_takes_its_wish_along(
+    stage: tuple[Stage, int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    shared, port = stage
+    (first, one, a), (_, two, b) = connect(port), connect(port)
+    assert a != b
+    assert ask(port, {"client": a, "move": [1, 0, 0], "pull": None, "restarts": 0}) == 200
+    assert ask(port, {"client": b, "move": [0, 0, -1], "pull": [2, 0, 0, 1], "restarts": 1}) == 200
+    assert shared.wishes == {a: Wish((1, 0, 0)), b: Wish((0, 0, -1), (2, 0, 0, 1), 1)}
+    shared.show({"poses": "x"})
+    assert news(one) == news(two) == '{"poses": "x"}'
+    one.close()
+    first.close()
+    end = time.monotonic() + 20
+    while a in shared.wishes:  # the server finds out as it sends
+        assert time.monotonic() < end
+        shared.show({"poses": "y" * 1000})
+        time.sleep(0.02)
+    assert [*shared.wishes] == [b] and news(two).startswith('{"poses": "y')
+    assert capfd.readouterr().err == ""
+
+
+GOOD = {"move": [0, 0, 1], "pull": None, "restarts": 0}
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        *("", "{", "[]", "null", "[" * 900, {"client": 1}),
+        *(GOOD | {"move": move} for move in ([0, 0], [0, 0, math.nan], ["a", 0, 0], None, [1e400, 0, 0])),
+        *(GOOD | {"pull": pull} for pull in ([0, 1, 1, 1], [3, 1, 1, 1], [1.5, 1, 1, 1], [1, 1], [1, 1, 1, math.inf])),
+        *(GOOD | {"restarts": math.inf}, GOOD | {"restarts": None}),
+    ],
+)
+def test_nonsense_changes_nothing(stage: tuple[Stage, int], said: object) -> None:
+    shared, port = stage
+    _, _, client = connect(port)
+    assert ask(port, {"client": client} | said if isinstance(said, dict) and said != {"client": 1} else said) == 400
+    assert shared.wishes == {client: Wish()}
+
+
+def test_only_the_page_itself_asks(stage: tuple[Stage, int]) -> None:
+    shared, port = stage
+    _, _, client = connect(port)
+    wish = GOOD | {"client": client}
+    assert ask(port, wish, Origin="http://elsewhere.org") == 403 and shared.wishes == {client: Wish()}
+    assert ask(port, wish, Origin=f"http://127.0.0.1:{port}") == 200 and shared.wishes == {client: Wish((0, 0, 1))}
+    assert ask(port, wish | {"client": 77}) == 200 and ask(port, wish | {"client": []}) == 200
+    assert [*shared.wishes] == [client]
+    connection = http.client.HTTPConnection("127.0.0.1", port)
+    connection.request("GET", "/../secret")
+    assert connection.getresponse().status == 404
+
+
+# The robot's side -----------------------------------------------------------------------------------------------------
+
+
+def test_a_turned_robot_looks_the_same_to_itself(rng: np.random.Generator) -> None:
+    """What the ant's task observes does not depend on where its way leads, if state and way turn alike."""
+    task = Ant(dtype=torch.float64)
+    task._target = torch.tensor([1e12, 0.0], dtype=torch.float64)  # else the way turns a little as the robot moves
+    scene = load_scene(ROOT / "diffsim" / "assets" / "ant.xml")
+    qpos, qvel = (torch.tensor(rng.normal(size=(5, n))) for n in (scene.nq, scene.nv))
+    qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
+    there = drive.turned(0.7, qpos, qvel)
+    speed = torch.linalg.vecdot(qvel[:, :2], torch.tensor([[math.cos(-0.7), math.sin(-0.7)]]).double())
+    before, after = task.observe(qpos, qvel, qvel[:, 6:]), task.observe(*there, qvel[:, 6:])
+    columns = [0, *range(11, 28)]  # height, joints and rates, up
+    torch.testing.assert_close(before[:, columns], after[:, columns])
+    torch.testing.assert_close(after[:, 5], speed)
+    back = drive.turned(-0.7, *there)
+    torch.testing.assert_close(back[0], qpos)
+    torch.testing.assert_close(back[1], qvel)
+    quarter, _ = drive.turned(math.pi / 2, torch.eye(1, 15, dtype=torch.float64) + torch.eye(15)[3:4], qvel[:1])
+    torch.testing.assert_close(quarter[0, :2], torch.tensor([0.0, 1.0]).double())
+    torch.testing.assert_close(quarter[0, 3:7], torch.tensor([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]).double())
+
+
+def fly(pilot: Pilot, seconds: float, wish: Wish) -> np.ndarray:
+    """Where the robot is after a time, x, y, and how much it has turned."""
+    for _ in range(round(seconds / pilot.env.control_dt)):
+        pilot.step([wish])
+    w, x, y, z = pilot.env.qpos[0, 3:7].tolist()
+    return np.array([*pilot.env.qpos[0, :2].tolist(), math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))])
+
+
+@pytest.mark.slow
+def test_each_command_moves_the_robot_its_way() -> None:
+    saved = load_policy(command.shipped("go2"))
+    with startup.quick_kernels():
+        pilot = Pilot(make_policy_env(saved, 1, forces=True), saved.network)
+        for k, sign in ((0, 1), (0, -1), (1, 1), (1, -1), (2, 1), (2, -1)):
+            pilot.restart()
+            start = fly(pilot, 0.5, Wish())
+            moved = fly(pilot, 1.5, Wish(tuple(sign * np.eye(3)[k]))) - start
+            assert sign * moved[k] > (0.9, 0.5, 0.9)[k] and np.abs(np.delete(moved, k)).max() < 0.4, (k, sign, moved)
+        pilot.restart()
+        start = fly(pilot, 0.5, Wish())
+        moved = fly(pilot, 0.5, Wish(pull=(1, *(start[:2] + (0, 3)), 0.3))) - start
+        assert moved[1] > 0.2, "pulled to the left"
+
+
+@pytest.mark.slow
+def test_the_ant_turns_to_where_it_is_sent() -> None:
+    saved, ends = load_policy(command.shipped("ant")), []
+    with startup.quick_kernels():
+        pilot = Pilot(make_policy_env(saved, 1, forces=True), saved.network)
+        for turn in (0.0, 1.0, -1.0):
+            pilot.env.generator.manual_seed(1)
+            pilot.restart()
+            fly(pilot, 2.0, Wish())
+            fly(pilot, 1.5, Wish((0, 0, turn)))
+            ends.append(fly(pilot, 1.0, Wish())[:2])
+    straight, left, right = ends
+    assert min(x for x, _ in ends) > 15 and left[1] > straight[1] + 1 and right[1] < straight[1] - 1, ends
+
+
+# The command ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("drive nothing", "unknown task 'nothing': choose from cartpole, hopper"),
+        ("drive hopper", "hopper cannot be driven: choose from ant, humanoid"),
+        ("drive g1", "no policy of g1 comes with this version; there are: "),
+        ("drive go1 --checkpoint {go2}", "go2.pt is a checkpoint of go2, not of go1"),
+        (
+            "drive go2 --port {taken}",
+            "cannot listen on 127.0.0.1:{taken}: Address already in use; choose another",
+        ),
+        ("drive go2 --port 70000", "cannot listen on 127.0.0.1:70000: "),
+        ("drive go2 --host nowhere.invalid", "cannot listen on nowhere.invalid:8080: "),
+    ],
+)
+def test_mistakes_are_one_line(
+    arguments: str, message: str, stage: tuple[Stage, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {"go2": str(ROOT / "diffsim" / "policies" / "go2.pt"), "taken": stage[1]}
+    with pytest.raises(SystemExit) as exit:
+        command.main(arguments.format(**names).split())
+    error = capsys.readouterr().err
+    assert exit.value.code == 2 and message.format(**names) in error and error.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+def test_a_browser_drives(tmp_path: Path) -> None:
+    path = os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
+    words = [sys.executable, "-m", "diffsim", "drive", "go2", "--port", "0"]
+    options = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path})
+    driven, browser = subprocess.Popen(words, **options), Browser(tmp_path / "profile")
+    try:
+        assert driven.stdout and driven.stderr
+        address = driven.stdout.readline().split()[0]
+        assert address.startswith("http://127.0.0.1:")
+        page, other = browser.open(address), browser.open(address)
+        for each in (page, other):
+            each.wait("typeof client === 'number' && Number(page.drawn) > 2")
+        start = page.evaluate("track[3]")
+        page.key("ArrowUp", True)
+        assert page.wait(f"track[3] > {start} + 0.5 && track[3]") < start + 5
+        assert other.wait(f"track[3] > {start} + 0.5")
+        other.key("ArrowDown", True)  # against the first: both are heard
+        time.sleep(2)
+        rest = page.evaluate("track[3]")
+        time.sleep(2)
+        assert abs(page.evaluate("track[3]") - rest) < 0.8
+        other.close()  # with its key down
+        assert page.wait(f"track[3] > {rest} + 0.8")
+        page.key("ArrowUp", False)
+        page.mouse("Pressed", 400, 300, button="right", clickCount=1)
+        page.mouse("Moved", 500, 100, button="right", buttons=2)
+        page.wait("asked.includes('\"pull\":[')")
+        assert page.evaluate("pull.to[2]") > 0.3
+        page.mouse("Released", 500, 100, button="right", clickCount=1)
+        page.wait("asked.includes('\"pull\":null')")
+        page.key("Enter", True)
+        page.wait(f"track[3] < {start} + 0.4")
+        assert page.evaluate("page.error || ''") == ""
+        assert {url.removeprefix(address) for url in page.requests()} <= {"/", "/stream", "/ask", "data:,"}
+        driven.send_signal(signal.SIGINT)
+        assert driven.wait(30) == 0
+        page.wait("!byId('error').hidden")
+        said = [line for line in driven.stderr.read().splitlines() if "compiling" not in line]
+        assert said == []
+    finally:
+        driven.kill()
+        browser.close()
