@@ -392,9 +392,10 @@ class Resampling(nn.Module):
         head.log_std.clamp_(*LOG_STD)
         self.age += 1
         due = self.age % self.args.resampling_interval == 0
-        every = distributed.stack(self.seen)  # ranks decide alike
-        weight = every[:, 0].sum(0) / every[:, 0].sum((0, -1)).unsqueeze(-1)  # where nothing was recorded not a number
-        least, largest = self.args.dead / head.shape[1], torch.maximum(weight, every[:, 1].amax(0))
+        every = distributed.stack(self.seen)
+        self.seen.copy_(torch.stack((every[:, 0].mean(0), every[:, 1].amax(0))))  # ranks decide and resume alike
+        weight = self.seen[0] / self.seen[0].sum(-1, keepdim=True)  # where nothing was recorded not a number
+        least, largest = self.args.dead / head.shape[1], torch.maximum(weight, self.seen[1])
         below = {"mean": weight < least, "max": largest < least}  # Eq. 8 has the second
         dead = below[self.args.dead_by]
         if self.args.resampling != "none":

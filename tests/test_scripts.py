@@ -38,7 +38,7 @@ SCALARS = {
     "ppo_baseline": "losses/policy losses/value losses/kl charts/learning_rate charts/std time/roll_out time/update",
     "pfpn": (
         "losses/policy losses/value losses/kl charts/learning_rate charts/entropy time/interact time/learn "
-        "particles/dead particles/moved particles/active particles/std"
+        "particles/dead_mean particles/dead_max particles/moved particles/active particles/std"
     ),
 }
 COMMON_SCALARS = (
