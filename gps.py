@@ -299,16 +299,16 @@ class Search:
 
     def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
         """Line 7, from two starts (Section 5): theta*, and theta* fitted to the sample of the highest reward."""
-        policy, iterations = self.network, self.args.lbfgs_iterations
-        mixture, reward, top = S.log_mixture, S.reward / self.scale, S.returns.argmax()
-
-        def objective(theta: Tensor) -> Tensor:
-            return sparse(lambda log_pi: phi(log_pi, mixture, reward, self.w_r), policy, theta, S)
-
+        policy, iterations, top = self.network, self.args.lbfgs_iterations, S.returns.argmax()
+        objective = self.objective(S.log_mixture, S.reward / self.scale)
         starts = policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)
-        ends = [maximise(objective, theta, iterations) for theta in starts]
+        ends = [maximise(lambda theta: sparse(objective, policy, theta, S), theta, iterations) for theta in starts]
         start = int(ends[1][1] > ends[0][1])
         return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
+
+    def objective(self, mixture: Tensor, reward: Tensor) -> Callable[[Tensor], Tensor]:
+        """Phi () of log pi (m, T), for samples of this mixture and these rewards (m, T)."""
+        return lambda log_pi: phi(log_pi, mixture, reward, self.w_r)
 
     def imitate(self) -> tuple[Tensor, dict[str, float]]:
         """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides."""

@@ -91,7 +91,7 @@ def measure(torch: str, folder: Path) -> list[Row]:
 def main(argv: Sequence[str] | None = None) -> None:
     args = common.parse(Args, __doc__, argv)
     with tempfile.TemporaryDirectory() as folder:
-        args.write("front_door", measure(args.torch, Path(folder)))
+        args.merge("front_door", measure(args.torch, Path(folder)), ("part",))
 
 
 if __name__ == "__main__":

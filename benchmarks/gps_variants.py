@@ -8,7 +8,7 @@ Takes the flags of gps.py. --resume and --evaluate take the checkpoints of this 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,8 +16,7 @@ import torch
 from tables import ROOT
 from torch import Tensor
 
-from diffsim.planning.lbfgs import maximise
-from diffsim.planning.samples import Samples, log_weights, phi, sparse
+from diffsim.planning.samples import Samples, log_weights, phi
 from diffsim.training import command, evaluate_checkpoint, parse
 
 sys.path.append(str(ROOT))
@@ -90,18 +89,13 @@ class DAgger(NonGuided):
 class Effective(gps.Search):
     """Tang and Abbeel 2010: in place of the regulariser a bound on the effective samples of each step."""
 
-    def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
-        policy, mixture, top, iterations = self.network, S.log_mixture, S.returns.argmax(), self.args.lbfgs_iterations
-
+    def objective(self, mixture: Tensor, reward: Tensor) -> Callable[[Tensor], Tensor]:
         def value(log_pi: Tensor) -> Tensor:
             effective = 1 / log_weights(log_pi, mixture).softmax(0).square().sum(0)
             missing = (LEAST - effective).clamp(min=0)
-            return phi(log_pi, mixture, S.reward / self.scale, 0.0) - missing.square().sum()
+            return phi(log_pi, mixture, reward, 0.0) - missing.square().sum()
 
-        starts = policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)
-        ends = [maximise(lambda theta: sparse(value, policy, theta, S), theta, iterations) for theta in starts]
-        start = int(ends[1][1] > ends[0][1])
-        return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
+        return value
 
 
 Name = Literal["unregularized", "effective", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]

@@ -67,12 +67,12 @@ def record(steps: int = 350, settling: int = 150) -> Clip:
 
     policy = load_policy(ASSETS.parent / "policies" / "go2.pt").network
     env = diffsim.make("go2", num_envs=4, seed=1)
-    (obs, _), frames = env.reset(seed=1), []
+    env.reset(seed=1)
+    frames, action = list[Tensor](), torch.zeros(4, env.scene.nu)
     for _ in range(steps):
-        env.memory[:, :3] = command = torch.tensor(COMMAND)
-        obs = obs.clone()
-        obs[:, 45:48] = command  # see Joystick.observe_with
-        obs = env.step(policy(obs))[0]
+        env.memory[:, :3] = torch.tensor(COMMAND)
+        action = policy(env.observe(env.qpos, env.qvel, action))
+        env.step(action)
         frames.append(env.qpos.double().clone())
     found = (cycle(motion, PERIOD, PERIOD) for motion in torch.stack(frames[settling:], dim=1))
     qpos, _ = min(found, key=lambda each: each[1])

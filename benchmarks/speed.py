@@ -27,13 +27,14 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import mujoco
 import torch
+import tyro
 import warp as wp
-from common import Panel, Part, TaskName, lines, measured, plot, run
-from motions import CONTROL_DT, shac, simulator
+from common import TASKS, Panel, Part, TaskName, lines, measured, plot, run
+from motions import shac, simulator
 from runner import ScriptFlags
 from tables import ROOT, Row, read_csv
 
@@ -46,6 +47,7 @@ from diffsim.training import Count, fail, graph
 from diffsim.training import parse as parse_script
 from diffsim.training.evaluation import make_env
 
+Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 KernelName = Literal["blocks", "scalar", "float64"]
 KERNELS: dict[KernelName, dict[str, Any]] = {
     "blocks": {},  # float32; on a CPU in vectors of environments
@@ -59,6 +61,7 @@ TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid
 
 @dataclass
 class Args(ScriptFlags):
+    env: Annotated[tuple[TaskName | Robot, ...], tyro.conf.arg(aliases=["--env-id"])] = TASKS  # type: ignore[assignment]
     device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
     parts: tuple[PartName, ...] = ("physics", "training")  # tables to measure
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
@@ -145,10 +148,10 @@ def race(competitors: Mapping[K, Callable[[State], Times]], states: Sequence[Sta
     return {key: {what: median(t[what] for t in times) for what in times[0]} for key, times in found.items()}
 
 
-def mujoco_timer(scene: Scene, num_envs: int, substeps: int) -> Callable[[State], Times]:
+def mujoco_timer(scene: Scene, num_envs: int, timestep: float, substeps: int) -> Callable[[State], Times]:
     """mj_step of each environment in turn on one core: Euler, the substep's length, MuJoCo's own contact solver."""
     model = mujoco.MjModel.from_xml_path(scene.path)
-    model.opt.timestep, model.opt.integrator = CONTROL_DT / substeps, mujoco.mjtIntegrator.mjINT_EULER
+    model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
     low, high = model.actuator_ctrlrange.T
     environments = [mujoco.MjData(model) for _ in range(num_envs)]
 
@@ -164,10 +167,11 @@ def mujoco_timer(scene: Scene, num_envs: int, substeps: int) -> Callable[[State]
     return time_step
 
 
-def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
+def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     """Beside MuJoCo: with all models of its muscles and without, if a task has any; the hopper also on rough ground."""
     threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()} if args.device == "cpu" else {args.device: 1}
-    default, whole = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs=1).scene
+    task, whole = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene
+    default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
     if "muscle" in whole.features:
         scenes = {f"{kind} muscles": dataclasses.replace(whole, muscle_model=kind) for kind in ("linear", "hill")}
@@ -177,9 +181,9 @@ def measure_physics(args: Args, name: TaskName) -> Iterator[Row]:
     kernels = [kernel for kernel in args.kernels if args.device == "cpu" or kernel != "scalar"]
     for num_envs in args.num_envs:
         reference = "", "", "mj_step"
-        competitors = {reference: mujoco_timer(whole, num_envs, default.substeps)}
+        competitors = {reference: mujoco_timer(whole, num_envs, task.control_dt / default.substeps, default.substeps)}
         for (scene_name, scene), kernel, (place, count) in product(scenes.items(), kernels, threads.items()):
-            sim = simulator(scene, default, num_envs, device=args.device, threads=count, **KERNELS[kernel])
+            sim = simulator(scene, default, num_envs, threads=count, **options, **KERNELS[kernel])
             competitors[scene_name, kernel, place] = timer(sim)
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
         per_substep = num_envs * default.substeps
@@ -360,6 +364,9 @@ PARTS: dict[PartName, Part] = {
 
 
 def main(args: Args) -> None:
+    robots = [name for name in args.env if name not in TASKS]
+    if robots and args.parts != ("physics",):
+        fail(f"--env {' '.join(robots)}: measured by --parts physics alone")
     for part in args.parts:
         rows = measured(args, PARTS[part])
         if part == "scaling" and rows:

@@ -319,11 +319,12 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def film(path: Path, env: DiffEnv, here: Motion, there: Motion) -> None:
-    """The episode of median return here (left), and its start there (right); who has fallen stays as it fell."""
+    """The episode of median return here (left), and its start there (right), small as a gif; the fallen lie there."""
     episode = int(here.returns.argsort()[(len(here.returns) - 1) // 2])
     stride = max(1, math.ceil(1 / (render.VIDEO_FPS * env.control_dt) - 1e-6))
-    renderer = partial(render.Renderer, env.scene, *render.VIDEO_SIZE)
-    count = min(max(here.lengths[episode], there.lengths[episode]), round(render.VIDEO_SECONDS / env.control_dt))
+    size, seconds = ((288, 208), 4.0) if path.suffix == ".gif" else (render.VIDEO_SIZE, render.VIDEO_SECONDS)
+    renderer = partial(render.Renderer, env.scene, *size)
+    count = min(max(here.lengths[episode], there.lengths[episode]), round(seconds / env.control_dt))
     with renderer() as left, renderer() as right:
         sides = (left, here), (right, there)
         frames = (

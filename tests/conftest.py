@@ -14,30 +14,12 @@ torch.set_num_threads(1)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it to what they run in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Tests with kernels that no other one needs, each beside a like one that stays in the plain run.
-HEAVY = {
-    "test_accurate_presets_are[half_cheetah]",
-    "test_accurate_presets_are[humanoid_mtu]",
-    "test_extremes_stay_finite_or_contained[ant-mujoco]",
-    "test_gradient_of_bounded_servos_is_that_of_differences[implicit-0.5]",
-    "test_gymnasium_robots_fall_as_in_mujoco[ant]",
-    "test_jacobians_are_those_of_differences[swimmer]",
-    "test_kernels_with_every_feature_compile_for_a_gpu_without_one",
-    "test_laws_are_those_of_float64[hopper on hills-integration5-options5]",
-    "test_muscle_gradient_is_that_of_differences[hill]",
-    "test_quadratic_of_a_reward_after_the_step[ant]",
-    "test_servos_are_damped_as_by_implicitfast[mjcf1]",
-    "test_system_identification",
-    "test_task_gradient_is_that_of_differences[ant]",
-    "test_threads_may_take_first_steps_and_a_damaged_cache_is_compiled_anew",
-}
-
 
 @pytest.hookimpl(tryfirst=True)  # before pytest looks for the marks that are asked for
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:  # of the benchmarks' tests, those that write files run commands
         commands = item.path.parent.name == "benchmarks" and item.path.name != "test_tables.py"
-        if (commands and "tmp_path" in getattr(item, "fixturenames", ())) or item.name in HEAVY:
+        if commands and "tmp_path" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.slow)
     if not torch.cuda.is_available():
         for item in items:

@@ -48,7 +48,12 @@ def test_presets_of_every_task_are_used(name):
     assert default.integration == task.integration("default")
 
 
-@pytest.mark.parametrize("name", SHAC_TASKS)
+HEAVY = "half_cheetah", "humanoid_mtu"  # whose kernels no other test needs
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in HEAVY)) for name in SHAC_TASKS]
+)
 def test_accurate_presets_are(name, rng):
     """Error after a control step, median over states in contact: a fifth of the default's, fast at most five times."""
     scene, states = task_scene(name), acting_states(task_scene(name), 16, rng)

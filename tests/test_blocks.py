@@ -65,7 +65,7 @@ def step(scene, states, dtype, integration, weights=None, **options):
         pytest.param("fish", SEMI, {}, marks=pytest.mark.slow),
         pytest.param("half_cheetah", IMPLICIT, {}, marks=pytest.mark.slow),
         pytest.param("hill", SEMI, {"factors": True}, marks=pytest.mark.slow),
-        ("hopper on hills", SEMI, {}),
+        pytest.param("hopper on hills", SEMI, {}, marks=pytest.mark.slow),
         pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),
     ],
 )

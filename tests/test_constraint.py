@@ -236,7 +236,7 @@ def check_gradients(scene, states, rng, optional=None, enough=0.5):
             assert np.minimum(*wrong).max() < 1e-6, f"gradient with respect to {name}: {np.minimum(*wrong)}"
 
 
-@pytest.mark.parametrize("name", ["hopper", "ant"])
+@pytest.mark.parametrize("name", ["hopper", pytest.param("ant", marks=SLOW)])
 def test_task_gradient_is_that_of_differences(name, rng):
     scene = task_scene(name)
     check_gradients(scene, acting_states(scene, 8, rng), rng, enough=0.9)

@@ -43,6 +43,7 @@ def compiled(module: wp.Module, arch: int) -> str:
     return source.read_text()
 
 
+@pytest.mark.slow  # half a minute; the constraints' kernels stay
 def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
     """A leg whose knee slides, too, in a fluid and on terrain, with factors and forces; threads share its limb."""
     text = leg("hill", grounded=True).replace(KNEE, f'<joint type="slide" axis="0 0 1"/> {KNEE}')

@@ -127,7 +127,7 @@ def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
     check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(integrator, theta=theta))
 
 
-@pytest.mark.parametrize("model", ["linear", "hill"])
+@pytest.mark.parametrize("model", ["linear", pytest.param("hill", marks=pytest.mark.slow)])
 def test_muscle_gradient_is_that_of_differences(model, rng):
     scene = leg_scene(model, grounded=model == "linear")
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))

@@ -34,7 +34,7 @@ def check_quadratic(system: System, cost: Cost, start: Tensor, u: Tensor, rng: n
         torch.testing.assert_close(gradient[:, 0] @ d, slope, rtol=1e-4, atol=1e-4 * slope.abs().max().item())
 
 
-@pytest.mark.parametrize("name", ["ant", "cartpole", "hopper"])
+@pytest.mark.parametrize("name", ["cartpole", "hopper", pytest.param("ant", marks=pytest.mark.slow)])
 def test_quadratic_of_a_reward_after_the_step(name: str, rng: np.random.Generator) -> None:
     system = task_system(name)
     reward = AfterStep(system, lambda x, u: -system.reward(x, u))

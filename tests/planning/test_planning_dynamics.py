@@ -12,7 +12,9 @@ from systems import normal, one_step, random_states, task_system
 from diffsim.planning import dynamics
 
 
-@pytest.mark.parametrize("name", ["cartpole", "hopper", "ant", "swimmer", "walker"])
+@pytest.mark.parametrize(
+    "name", ["cartpole", "hopper", "ant", "walker", pytest.param("swimmer", marks=pytest.mark.slow)]
+)
 def test_jacobians_are_those_of_differences(name: str, rng: np.random.Generator) -> None:
     system = task_system(name)
     x, u = random_states(system, rng)
