@@ -30,16 +30,17 @@ import ppo_baseline
 from diffsim.training import Count, Positive, Run, fail, graph, parse
 
 PartName = Literal["speed", "train"]
-Name = Literal["hopper", "half_cheetah", "ant", "humanoid"]
+Name = Literal["hopper", "half_cheetah", "ant", "humanoid", "go1", "go2", "g1"]
 # Contacts and rows of constraints for which mujoco_warp has room in a world; `lost` tells whether they are too few.
 ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64), "humanoid": (24, 96)}
+ROOM |= {"go1": (16, 96), "go2": (16, 96), "g1": (24, 192)}
 PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
 HORIZON = 32  # control steps of a timed window
 
 
 @dataclass
 class Args(ScriptFlags):
-    env: tuple[Name, ...] = ("ant", "humanoid")  # tasks
+    env: tuple[Name, ...] = ("ant", "humanoid")  # type: ignore[assignment]  # tasks
     parts: tuple[PartName, ...] = ("speed",)  # what to measure
     num_envs: tuple[Count, ...] = (1024, 4096)  # batch sizes of the speed
     repeats: Count = 10  # windows of 32 control steps; the fastest counts
@@ -62,6 +63,8 @@ class MuJoCoWarp(diffsim.Simulator):
             m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, sim.num_envs, contacts, njmax=rows)
         m.opt.warn_overflow = 0  # printing from kernels is slow
         self._qpos, self._qvel, self._ctrl = map(wp.to_torch, (d.qpos, d.qvel, d.ctrl))
+        low, high = torch.tensor(model.actuator_ctrlrange.T, dtype=torch.float32, device=self.device)
+        self._middle, self._half = (low + high) / 2, (high - low) / 2
         self._warmstart, self._overflow = map(wp.to_torch, (d.qacc_warmstart, d.overflow))
 
         def advance() -> None:
@@ -86,7 +89,7 @@ class MuJoCoWarp(diffsim.Simulator):
         self._warmstart.masked_fill_(moved[:, None], 0.0)
         self._qpos.copy_(qpos)
         self._qvel.copy_(qvel)
-        self._ctrl.copy_(ctrl)  # the range of all motors of these tasks is [-1, 1]
+        self._ctrl.copy_(self._middle + self._half * ctrl)
         self._advance()
         lost = ~((self._qvel.abs() < FASTEST).all(1) & self._qpos.isfinite().all(1))
         self.nonfinite.copy_(lost)

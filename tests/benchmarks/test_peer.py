@@ -21,23 +21,24 @@ pytest.importorskip("mujoco_warp")
 
 @pytest.mark.slow
 @torch.no_grad()
-def test_a_step_is_mujoco_s_and_ours() -> None:
+@pytest.mark.parametrize(("name", "share"), [("hopper", 0.95), ("go2", 0.5)])
+def test_a_step_is_mujoco_s_and_ours(name: peer.Name, share: float) -> None:
     """Through a fall to the ground, with a reset; and a robot that is lost stays where it was."""
-    env = diffsim.make("hopper", 2, seed=0, contact="mujoco", max_episode_steps=40)
-    other = peer.MuJoCoWarp(env.sim, "hopper")
+    env = diffsim.make(name, 2, seed=0, contact="mujoco", max_episode_steps=40)
+    other = peer.MuJoCoWarp(env.sim, name)
     world = transfer.MuJoCo(env.scene, 2, env.control_dt, 1.0, True, env.sim.integration.substeps)
     errors, touching = [], 0
     for _ in range(60):
-        action = 2 * torch.rand(2, 3, generator=env.generator) - 1
+        action = 2 * torch.rand(2, env.scene.nu, generator=env.generator) - 1
         state = (x.double().numpy() for x in (env.qpos, env.qvel, action))
         expected = world.step(*state, np.ones(2, bool))[:2]
         found = [sim.step(env.qpos, env.qvel, action) for sim in (other, env.sim)]
         errors.append([[np.abs(x.numpy() - y).max() for x, y in zip(f, expected, strict=True)] for f in found])
         touching += sum(data.ncon for data in world.data)
         env.step(action)
-    assert (np.quantile(errors, 0.95, axis=0) < 1e-4).all()  # rounding decides when a contact begins
+    assert (np.quantile(errors, share, axis=0) < 1e-4).all()  # rounding decides when a contact begins or slips
     assert touching and other.lost() == 0 and not other.nonfinite.any()
-    qvel = torch.tensor([[0.0] * 6, [2e5] + [0.0] * 5])
+    qvel = torch.tensor([0.0, 2e5])[:, None] * torch.eye(env.scene.nv)[0]
     assert (other.step(env.qpos, qvel, action)[0][1] == env.qpos[1]).all() and other.nonfinite.tolist() == [False, True]
 
 
