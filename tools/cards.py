@@ -1,4 +1,4 @@
-"""Measure the policies that come with the package, and write what is found to their cards, diffsim/policies/cards.csv.
+"""Measure the policies that come with the package, and write it to their cards, diffsim/policies/cards.csv.
 
     python tools/cards.py                              all of them
     python tools/cards.py diffsim/policies/ant.pt      one: write its other cells, command to revision, by hand
@@ -55,9 +55,9 @@ def in_mujoco(case: Case) -> dict[str, object]:
 
 
 @command
-def main(policies: Positional[tuple[Path, ...]] = tuple(sorted(CARDS.parent.glob("*.pt")))) -> None:
+def main(policies: Positional[tuple[Path, ...]] = ()) -> None:
     torch.set_num_threads(1)
-    for path in policies:
+    for path in policies or sorted(CARDS.parent.glob("*.pt")):
         case = load_case(path, EPISODES, "cpu")
         row = {"policy": path.stem, "sha256": fingerprint(path)} | here(case) | in_mujoco(case)
         print(", ".join(f"{name} {digits(value)}" for name, value in row.items()), flush=True)
