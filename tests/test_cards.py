@@ -6,7 +6,7 @@ import re
 
 import pytest
 from common import load_case
-from tables import read_csv
+from tables import origins, read_csv, unknown
 
 from diffsim.training import load_policy
 from tools import cards
@@ -25,6 +25,7 @@ def check(name: str, found: dict[str, object], rel: float) -> None:
 
 def test_every_policy_has_a_card_that_says_where_it_comes_from() -> None:
     assert {*CARDS} == {path.stem for path in FOLDER.glob("*.pt")}
+    assert origins(cards.CARDS) and not any(map(unknown, origins(cards.CARDS)))
     for name, card in CARDS.items():
         saved = load_policy(path := FOLDER / f"{name}.pt")
         command = f"python {saved.script}.py --env {saved.args['env']} --seed {card['seed']}"

@@ -199,8 +199,8 @@ def test_a_browser_draws_the_page(task: str, tmp_path: Path, rng: np.random.Gene
     if task in ("ant", "humanoid_mtu"):
         motion = motion_of(task, 120, rng)
     else:
-        model = mujoco.MjModel.from_xml_string(MESHES)
-        motion = SimpleNamespace(mj_model=model, terrain=[terrain.rough(1)]), np.tile(model.qpos0, (120, 1)), 1 / 60
+        model, hills = mujoco.MjModel.from_xml_string(MESHES), terrain.rough(1)
+        motion = SimpleNamespace(mj_model=model, terrain=[hills]), np.tile(model.qpos0, (120, 1)), 1 / 60
     path = web.write_page(tmp_path / "page.html", *motion, title=HOSTILE, caption=HOSTILE)
     path.write_text(path.read_text().replace("</body>", TOUCH))
     browser = Browser(tmp_path / "profile")
@@ -209,6 +209,9 @@ def test_a_browser_draws_the_page(task: str, tmp_path: Path, rng: np.random.Gene
         page.call("Emulation.setDeviceMetricsOverride", width=480, height=400, deviceScaleFactor=1, mobile=False)
         page.wait("typeof page === 'object' && (page.touched || page.error)")
         assert page.evaluate("[page.error ?? '', document.title]") == ["", HOSTILE]
+        if "hills" in task:
+            heights = page.evaluate("[-99, 1.5, 2, 7.3, 49, 999].map(x => height(below(x), x))")
+            np.testing.assert_allclose(heights, np.interp([-99, 1.5, 2, 7.3, 49, 999], *hills.T), atol=1e-4)
         page.screenshot(tmp_path / "shot.png")
         assert {url for url in page.requests() if not url.startswith("data:")} == {path.as_uri()}
     finally:
