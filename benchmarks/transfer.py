@@ -214,6 +214,14 @@ def act(
     return Motion(positions, rates, returns, lengths, fallen)
 
 
+def travel(case: Case, world: World, steps: int) -> Motion:
+    """A policy's episodes in a world, from the start states that all worlds share."""
+    env = case.env
+    env.reset(seed=SEED)
+    qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
+    return act(world, type(env.task)(dtype=torch.float64), case.saved.network, qpos, qvel, env.scene.nu, steps)
+
+
 def speed(motion: Motion, control_dt: float, forward: int = 0) -> float:
     """Mean forward speed over all control steps of all episodes, m/s."""
     x = motion.qpos[..., forward]
@@ -260,11 +268,9 @@ def conditions(case: Case, args: Args) -> dict[str, World]:
 def compare(case: Case, args: Args) -> dict[str, Motion]:
     """The motions of one policy by their worlds; each is in the csv as soon as it is measured."""
     env, how = case.env, case.env.sim.integration
-    env.reset(seed=SEED)
-    qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
-    task, motions, own = type(env.task)(dtype=torch.float64), dict[str, Motion](), math.nan
+    motions, own = dict[str, Motion](), math.nan
     for name, world in conditions(case, args).items():
-        motion = motions[name] = act(world, task, case.saved.network, qpos, qvel, env.scene.nu, args.steps)
+        motion = motions[name] = travel(case, world, args.steps)
         found = measure(motion, env.scene, env.control_dt, env.task.forward)
         if isinstance(value := found["speed"], float):
             own = value if len(motions) == 1 else own

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Iterator
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -15,6 +21,8 @@ import torch
 from learners import refusal
 
 import diffsim
+from diffsim.training import load_policy
+from diffsim.view import render
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -77,16 +85,73 @@ def test_system_identification(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "is no .npz of qpos, qvel and ctrl: [Errno 2]" in refusal(lambda: module.main(none), capsys)
 
 
-def test_first_steps() -> None:
-    """All cells of the notebook, in order and with fewer iterations; it holds no outputs."""
-    cells = json.loads((EXAMPLES / "first_steps.ipynb").read_text())["cells"]
-    codes = [cell for cell in cells if cell["cell_type"] == "code"]
-    assert len(codes) >= 4 and not any(cell["outputs"] or cell["execution_count"] for cell in codes)
-    names: dict[str, object] = {}
-    for cell in codes:
-        exec("".join(cell["source"]).replace("iterations = 150", "iterations = 2"), names)
-    torch.testing.assert_close(names["gradient"][:, 0], names["difference"], rtol=1e-5, atol=0)  # type: ignore[index]
-    assert names["iterations"] == 2 and 0 <= names["upright"].float().mean() <= 1  # type: ignore[attr-defined]
+NOTEBOOK = json.loads((EXAMPLES / "first_steps.ipynb").read_text())
+CODES = [cell for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code"]
+
+
+def execute(cells: list[dict[str, Any]], system: Callable[[str], object], **parameters: object) -> dict[str, Any]:
+    """The names that cells leave. What follows ! or % goes to `system`; parameters come after the cell of this tag."""
+    names: dict[str, Any] = {"system": system}
+    for cell in cells:
+        exec(re.sub(r"^( *)[!%](.+)$", r"\1system(f'\2')", "".join(cell["source"]), flags=re.MULTILINE), names)
+        names |= parameters if "parameters" in cell["metadata"].get("tags", ()) else {}
+    return names
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """The videos that a notebook shows."""
+    videos = list[bytes]()
+    display = SimpleNamespace(Video=lambda path, embed: videos.append(Path(path).read_bytes() if embed else b""))
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(display=display))
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    return videos
+
+
+def test_first_steps(shown: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    """All cells in order, with a policy instead of a training; the notebook holds no outputs."""
+    commands = list[str]()
+
+    def system(command: str) -> None:
+        commands.append(command)
+        Path("runs/ant").mkdir(parents=True, exist_ok=True)
+        shutil.copy(EXAMPLES.parent / "diffsim" / "policies" / "ant.pt", "runs/ant/checkpoint.pt")
+        Path("ant.mp4").write_bytes(b"video")
+
+    assert len(CODES) >= 4 and not any(cell["outputs"] or cell["execution_count"] for cell in CODES)
+    names = execute(CODES, system, iterations=7)
+    torch.testing.assert_close(names["gradient"][:, 0], names["difference"], rtol=1e-5, atol=0)
+    assert [command.split()[:5] for command in commands] == [
+        ["python", "-m", "diffsim", "train", "shac"],
+        ["python", "-m", "diffsim", "view", "runs/ant"],
+    ]
+    assert "--iterations 7" in commands[0] and shown == [b"video"] and os.environ["MUJOCO_GL"] == "egl"
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)  # as on a fresh runtime
+    execute(CODES[:2], system)
+    project = (EXAMPLES.parent / "pyproject.toml").read_text()
+    assert commands[2].startswith("pip install ") and f'name = "{commands[2].split()[-1]}"' in project
+
+
+@pytest.mark.slow
+def test_first_steps_train_and_film(shown: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "")
+    try:
+        render.check_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    path = os.pathsep.join([str(EXAMPLES.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
+
+    def system(command: str) -> None:
+        words = [sys.executable, *command.split()[1:]]
+        subprocess.run(words, env=os.environ | {"PYTHONPATH": path, "CUDA_VISIBLE_DEVICES": ""}, check=True)
+
+    names = execute(CODES, system, iterations=2)
+    assert load_policy(Path("runs/ant/checkpoint.pt")).iteration == 2
+    assert names["policy"](torch.zeros(1, 37)).shape == (1, 8)
+    (video,) = shown
+    assert len(video) > 10_000 and video[4:8] == b"ftyp"
 
 
 # Other libraries ------------------------------------------------------------------------------------------------------

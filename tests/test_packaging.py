@@ -54,7 +54,8 @@ def test_the_wheel_holds_the_package_and_the_licenses(repository: list[str], sou
     assert {f"{name}.py" for name in LEARNERS} | {"view.py"} == scripts
     package |= {f"diffsim/learners/{name}" for name in scripts}
     assert {name for name in names if ".dist-info/" not in name} == package
-    assert {f"diffsim/{name}" for name in ("py.typed", "assets/web.html", "assets/NOTICE", "policies/ant.pt")} <= names
+    needed = "py.typed", "assets/web.html", "assets/NOTICE", "policies/ant.pt", "policies/cards.csv"
+    assert {f"diffsim/{name}" for name in needed} <= names
     licenses = {name.partition(".dist-info/licenses/")[2] for name in names} - {""}
     assert licenses == {"LICENSE", "NOTICE", *(f"licenses/{path.name}" for path in (ROOT / "licenses").iterdir())}
 

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Scene
-from diffsim.view.render import GROUND, activations, orbit, whole_file
-from diffsim.view.slabs import slabs
+from diffsim.view.render import activations, orbit, whole_file
 
 MAX_BYTES = 700_000  # of poses; a longer motion keeps every second control step, or fewer
+MESH_BYTES = 1_500_000  # of meshes; vertices of finer ones are merged
 HIDDEN_GROUP = 3  # geoms from this group on are not drawn, as in MuJoCo
-SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder")  # whatever else there is, is drawn as a box
+MESHES = (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_HFIELD)
+Array = NDArray[Any]
 
 
 def write_page(
@@ -36,7 +37,7 @@ def write_page(
     """Write a page that plays qpos (T, nq), with muscles coloured by ctrl (T, nu) in [-1, 1]; returns the file.
 
     A row is a control step of control_dt [s]; the path ends in .html. The page says title and caption, which may have
-    several lines. Meshes are drawn as their boxes, muscles straight from point to point.
+    several lines. Muscles are drawn straight from point to point, terrain as the first environment has it.
 
     Raises:
         ValueError: another suffix.
@@ -68,27 +69,36 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
     planes, painted = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, model.geom_matid >= 0
     rgba = model.geom_rgba.copy()
     rgba[painted] = model.mat_rgba[model.geom_matid[painted]]
-    geoms = []
-    for k in np.flatnonzero(~planes & (model.geom_group < HIDDEN_GROUP) & (rgba[:, 3] > 0)):
-        kind = mujoco.mjtGeom(model.geom_type[k]).name.removeprefix("mjGEOM_").lower()
-        kind, body = kind if kind in SHAPES else "box", model.geom_bodyid[k]
-        geoms.append(_shape(kind, body, model.geom_size[k], model.geom_pos[k], model.geom_quat[k], rgba[k]))
-    for size, centre, rotation in [] if scene.terrain is None else slabs(scene.terrain[0]):  # the first profile
-        mujoco.mju_mat2Quat(quat := np.empty(4), rotation.ravel())
-        geoms.append(_shape("box", 0, size, centre, quat, GROUND))
+    geoms, surfaces = [], dict[tuple[bool, int], tuple[Array, Array]]()  # height fields and meshes have own numbers
+    for k in np.flatnonzero(~planes & (model.geom_group < HIDDEN_GROUP) & (rgba[:, 3] > 0)).tolist():
+        kind, data = mujoco.mjtGeom(model.geom_type[k]), int(model.geom_dataid[k])
+        numbers = {"size": model.geom_size, "pos": model.geom_pos, "quat": model.geom_quat, "rgba": rgba}
+        geom = {"body": int(model.geom_bodyid[k])} | {name: _rounded(values[k]) for name, values in numbers.items()}
+        if kind in MESHES:
+            key = kind == mujoco.mjtGeom.mjGEOM_HFIELD, data
+            surfaces.setdefault(key, _surface(model, *key))
+            geoms.append(geom | {"type": "mesh", "mesh": [*surfaces].index(key)})
+        else:
+            geoms.append(geom | {"type": kind.name.removeprefix("mjGEOM_").lower()})
+    ground = None
+    if scene.terrain is not None:
+        ground = [_rounded(vertex) for vertex in scene.terrain[0]]
+    elif planes.any():
+        ground = [[x, float(model.geom_pos[planes][0, 2])] for x in (0.0, 1.0)]
     return {
         "dt": stride * control_dt,
         "frames": len(ctrl),
         "bodies": model.nbody,
-        "floor": float(model.geom_pos[planes][0, 2]) if planes.any() and scene.terrain is None else None,
+        "ground": ground,  # a profile (K, 2) of x and z, whose first and last segment go on for ever
         "geoms": geoms,
+        "meshes": _meshes([*surfaces.values()]),
         "muscles": [_muscle(model, tendon) for tendon in activations(model, ctrl)[0]],
         "camera": orbit(model),
         **frames(model, qpos[::stride], ctrl),
     }
 
 
-def frames(model: mujoco.MjModel, qpos: NDArray[np.float64], ctrl: NDArray[Any]) -> dict[str, str]:
+def frames(model: mujoco.MjModel, qpos: NDArray[np.float64], ctrl: Array) -> dict[str, str]:
     """What moves, of configurations qpos (T, nq) with ctrl (T, nu): numbers in the page's order, as base64."""
     poses, track = _poses(model, qpos)
     activation = activations(model, ctrl)[1]
@@ -115,9 +125,43 @@ def _poses(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> tuple[NDArray[np
     return poses, track
 
 
-def _shape(kind: str, body: int, size: ArrayLike, pos: ArrayLike, quat: ArrayLike, rgba: ArrayLike) -> dict[str, Any]:
-    numbers = {"size": size, "pos": pos, "quat": quat, "rgba": rgba}
-    return {"type": kind, "body": int(body)} | {name: _rounded(values) for name, values in numbers.items()}
+def _surface(model: mujoco.MjModel, is_field: bool, number: int) -> tuple[Array, Array]:
+    """Vertices (n, 3) and triangles (m, 3) of a mesh or of a height field's top, in its geom's frame."""
+    if not is_field:
+        vertices, faces = model.mesh_vert[model.mesh_vertadr[number] :], model.mesh_face[model.mesh_faceadr[number] :]
+        return vertices[: model.mesh_vertnum[number]], faces[: model.mesh_facenum[number]]
+    shape = rows, columns = model.hfield_nrow[number], model.hfield_ncol[number]
+    reach, heights = model.hfield_size[number], model.hfield_data[model.hfield_adr[number] :][: rows * columns]
+    y, x = np.meshgrid(*(np.linspace(-r, r, n) for r, n in zip(reach[1::-1], shape, strict=True)), indexing="ij")
+    corner = np.arange(rows * columns).reshape(shape)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    return np.stack([x.ravel(), y.ravel(), reach[2] * heights], 1), np.stack([a, b, c, a, c, d], 1).reshape(-1, 3)
+
+
+def _meshes(surfaces: list[tuple[Array, Array]]) -> list[dict[str, Any]]:
+    """Vertices as whole steps (uint16) from an origin, and triangles (uint16), of the smallest cells that fit."""
+    step = cell = max((float(np.ptp(vertices, 0).max()) for vertices, _ in surfaces), default=0.0) / 65535
+    while True:
+        merged = [_merge(*surface, cell) for surface in surfaces]
+        size = 6 * sum(len(vertices) + len(faces) for vertices, faces in merged)
+        if size <= MESH_BYTES and all(len(vertices) <= 65536 for vertices, _ in merged):
+            break
+        cell *= 1.3
+    packed = []
+    for vertices, faces in merged:
+        places = ((vertices - vertices.min(0)) / step).round().astype("<u2")
+        about = {"origin": _rounded(vertices.min(0)), "step": step}
+        packed.append(about | {"vertices": _base64(places), "faces": _base64(faces.astype("<u2"))})
+    return packed
+
+
+def _merge(vertices: Array, faces: Array, cell: float) -> tuple[Array, Array]:
+    """The mean of the vertices in each cubic cell, and the triangles that are left (Rossignac and Borrel 1993)."""
+    place = ((vertices - vertices.min(0)) / cell).round().astype(np.int64) @ (1, 2**17, 2**34)
+    _, number, count = np.unique(place, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(number, column) for column in vertices.T], 1) / count[:, None]
+    corners = number[faces]
+    return means, corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
 
 
 def _muscle(model: mujoco.MjModel, tendon: int) -> dict[str, Any]:
@@ -133,5 +177,5 @@ def _rounded(values: ArrayLike) -> list[float]:
     return [round(float(value), 5) for value in np.asarray(values)]
 
 
-def _base64(array: NDArray[Any]) -> str:
+def _base64(array: Array) -> str:
     return base64.b64encode(array.tobytes()).decode()

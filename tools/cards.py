@@ -1,0 +1,68 @@
+"""Measure the policies that come with the package, and write it to their cards, diffsim/policies/cards.csv.
+
+    python tools/cards.py                              all of them
+    python tools/cards.py diffsim/policies/ant.pt      one: write its other cells, command to revision, by hand
+
+Returns are of the first episodes of 64 environments, as --evaluate has them. In MuJoCo the policies meet its own
+contact, as in benchmarks/transfer.py; those of joystick tasks follow the commands of benchmarks/joystick.py.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from pathlib import Path
+
+import torch
+import tyro
+from tyro.conf import Positional
+
+from diffsim.__main__ import POLICIES
+from diffsim.tasks.joystick import Joystick
+from diffsim.training import command, evaluate
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+import joystick  # noqa: E402
+import transfer  # noqa: E402
+from common import Case, load_case  # noqa: E402
+from tables import digits, merge_csv  # noqa: E402
+
+CARDS, EPISODES = Path(str(POLICIES)) / "cards.csv", 64
+
+
+def fingerprint(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+def here(case: Case) -> dict[str, object]:
+    found = evaluate(case.env, case.saved.network)
+    row = {"return": found.returns.median().item(), "least return": found.returns.min().item()}
+    return row | {"speed": "" if found.speed is None else found.speed}
+
+
+def in_mujoco(case: Case) -> dict[str, object]:
+    """Nothing of muscles, which are not simulated in MuJoCo here."""
+    env = case.env
+    if isinstance(env.task, Joystick):
+        (found,) = joystick.measure(case.path, joystick.Args(friction=(1.0,)))
+        return {"error in MuJoCo": found["error"]}
+    if "muscle" in env.scene.features:
+        return {}
+    world = transfer.MuJoCo(env.scene, env.num_envs, env.control_dt)
+    motion = transfer.travel(case, world, env.episode_length)
+    row = transfer.measure(motion, env.scene, env.control_dt, env.task.forward)
+    return {f"{name} in MuJoCo": row[name] for name in ("return", "speed")}
+
+
+@command
+def main(policies: Positional[tuple[Path, ...]] = ()) -> None:
+    torch.set_num_threads(1)
+    for path in policies or sorted(CARDS.parent.glob("*.pt")):
+        case = load_case(path, EPISODES, "cpu")
+        row = {"policy": path.stem, "sha256": fingerprint(path)} | here(case) | in_mujoco(case)
+        print(", ".join(f"{name} {digits(value)}" for name, value in row.items()), flush=True)
+        merge_csv(CARDS, [row], ("policy",))
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
