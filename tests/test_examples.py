@@ -12,7 +12,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from learners import refusal
 
 import diffsim
 
@@ -50,31 +49,19 @@ def test_learned_controller() -> None:
     assert np.mean(distances[-5:]) < 0.3 * np.mean(distances[:5])
 
 
-def test_system_identification(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of a robot that MuJoCo simulates; and recordings that do not fit the task are refused."""
+@pytest.mark.parametrize("truth", [{"mu": 0.7, "mass": 1.2}, {"mu": 0.5, "mass": 0.85}])
+def test_system_identification(truth: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a robot that MuJoCo simulates, at its own time step."""
     module = load("system_identification")
-    small, path = {"segments": 128, "iterations": 8}, tmp_path / "walk.npz"
-    motion = module.record(diffsim.make("hopper", 20, contact="mujoco"))
-    good = dict(zip(("qpos", "qvel", "ctrl"), (x.numpy() for x in motion), strict=True))
-    np.savez(path, **good)
-    args = module.Args(recording=path, **small)
-    for name, factor in zip(args.fit, module.main(args).tolist(), strict=True):
-        assert factor == pytest.approx(module.TRUTH[name], rel=0.05), name
-    torch.testing.assert_close(module.main(args), module.main(module.Args(**small)), rtol=1e-3, atol=0)
-
-    for bad, message in (
-        ({k: good[k] for k in ("qpos", "ctrl")}, "is no .npz of qpos, qvel and ctrl"),
-        (good | {"qpos": np.zeros((20, 61, 15))}, "qpos has shape (20, 61, 15), must be (20, 61, 6)"),
-        (good | {"qvel": good["qvel"][:, :-1]}, "qvel has shape (20, 60, 6), must be (20, 61, 6)"),
-        (good | {"ctrl": good["ctrl"] * np.nan}, "ctrl holds numbers that are not finite"),
-        ({k: x[:, : 6 - (k == "ctrl")] for k, x in good.items()}, "with at least 6 control steps"),
-    ):
-        np.savez(path, **bad)
-        assert message in refusal(lambda: module.main(args), capsys)
-    path.write_text("hello")
-    assert "is no .npz of qpos, qvel and ctrl" in refusal(lambda: module.main(args), capsys)
-    none = module.Args(recording=tmp_path / "none.npz", **small)
-    assert "is no .npz of qpos, qvel and ctrl: [Errno 2]" in refusal(lambda: module.main(none), capsys)
+    monkeypatch.setattr(module, "TRUTH", truth)
+    sim = diffsim.make("hopper", 128, horizon=module.STEPS, contact="mujoco", factors=True).sim
+    recording = module.record(diffsim.make("hopper", 20))
+    assert [x.shape for x in recording] == [(20, 120, 6), (20, 120, 6), (20, 120, 3)]
+    torch.manual_seed(0)
+    estimates = module.identify(sim, recording)
+    assert estimates.shape == (13, 2) and estimates[0].tolist() == [1, 1]
+    for estimate, factor in zip(estimates[-1].tolist(), truth.values(), strict=True):
+        assert estimate == pytest.approx(factor, rel=0.05)
 
 
 def test_first_steps() -> None:
