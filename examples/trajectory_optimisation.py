@@ -13,7 +13,7 @@ import tyro
 from torch import Tensor
 
 import diffsim
-from diffsim.view.render import film
+from diffsim.view.render import check_video, film
 
 STEPS = 90  # control steps of 1/60 s
 
@@ -40,6 +40,8 @@ def optimise(
     guesses: int = 64, iterations: int = 200, seed: int = 0, video: Path | None = None
 ) -> tuple[Tensor, Tensor]:
     """The path qpos (STEPS, 2) of the best commands, and the costs (iterations, guesses) on the way to them."""
+    if video:
+        check_video(video)  # before the work
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     scene = diffsim.load_scene(str(files("diffsim") / "assets" / "cartpole.xml"))

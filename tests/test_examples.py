@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import diffsim
+from diffsim.view import render
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -33,6 +34,11 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     state = torch.get_rng_state()
     yield
     torch.set_rng_state(state)
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_examples_are_short(path: Path) -> None:
+    assert path.read_text().count("\n") < 80
 
 
 # The simulator on its own ---------------------------------------------------------------------------------------------
@@ -62,6 +68,22 @@ def test_system_identification(truth: dict[str, float], monkeypatch: pytest.Monk
     assert estimates.shape == (13, 2) and estimates[0].tolist() == [1, 1]
     for estimate, factor in zip(estimates[-1].tolist(), truth.values(), strict=True):
         assert estimate == pytest.approx(factor, rel=0.05)
+
+
+@pytest.mark.slow
+def test_pictures(tmp_path: Path) -> None:
+    """Those of docs/examples.md."""
+    try:
+        render.check_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    load("system_identification").main(tmp_path / "found.png")
+    load("trajectory_optimisation").optimise(guesses=2, iterations=1, video=tmp_path / "swing_up.gif")
+    assert (tmp_path / "found.png").read_bytes()[:4] == b"\x89PNG" and (
+        tmp_path / "swing_up.gif"
+    ).stat().st_size > 10_000
+    with pytest.raises(ValueError, match="a video ends in"):
+        load("trajectory_optimisation").optimise(video=tmp_path / "swing_up.avi")
 
 
 def test_first_steps() -> None:
