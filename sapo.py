@@ -41,6 +41,7 @@ PER_TASK = {
     "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0, 16, 2048, 2500, 16),
     "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
     "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400, 16),
+    "g1":           ((256, 128),    (256, 128), "silu", 2e-3, 1e-3, 0.9,  -2.0, -1.0, -1.0,  1, 1024,  800, 16),
     "humanoid_imitation": ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
 }
 # How --accuracy default integrates, where that is not as in the paper.
@@ -132,7 +133,7 @@ class Args(ParallelFlags):
             values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
             values |= ON_CPU.get(self.env, {})
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
-            values["horizon"] = 8
+            values["horizon"] = 16 if self.env == "g1" else 8
             if self.device == "cpu":
                 values["num_envs"] = 4 * values["num_envs"]
         if (self.accuracy, self.contact) == ("default", "soft") and self.env in INTEGRATION:

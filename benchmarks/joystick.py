@@ -12,6 +12,7 @@ Writes joystick.csv, a row for each policy and world, and with --update-results 
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from diffsim.sim.launcher import available_cores
 from diffsim.tasks.joystick import Joystick
 from diffsim.tasks.locomotion import rotate
 from diffsim.training import NonNegative, Positive, fail
+from diffsim.training.checkpoint import HOME
 
 Array = NDArray[np.float64]
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
@@ -161,13 +163,15 @@ def training(case: Case) -> dict[str, object]:
     rows = tables.read_csv(progress) if progress.is_file() else []
     evaluated = next((row for row in reversed(rows) if row["eval_return"]), None)
     device = str(case.saved.args.get("device", "")).partition(":")[0]
-    if not rows or evaluated is None:
-        return {"device": device, "return": "", "training s": ""}
-    return {"device": device, "return": float(evaluated["eval_return"]), "training s": float(rows[-1]["seconds"])}
+    found = {"return": float(evaluated["eval_return"]) if evaluated else ""}
+    return {"device": device, **found, "training s": float(rows[-1]["seconds"]) if rows else ""}
 
 
 def measure(path: Path, args: Args) -> list[dict[str, object]]:
     case, rows = load_case(path, 1, "cpu"), list[dict[str, object]]()
+    about = case.about
+    if case.saved.simulator != HOME:
+        about["learner"] = f"{about['learner']} in {case.saved.simulator}"
     if not isinstance(case.env.task, Joystick):
         fail(f"{path} was trained on {case.env.task.name}, which follows no command")
     for friction in args.friction:
@@ -180,7 +184,7 @@ def measure(path: Path, args: Args) -> list[dict[str, object]]:
         row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
         row |= {"error": found[:, 0].mean(), "worst error": found[:, 0].max(), "yaw error": found[:, 1].mean()}
         row |= {"whole": 1 - fallen.mean(), "seconds": args.seconds}
-        rows.append(case.about | training(case) | row)
+        rows.append(about | training(case) | row)
         print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, found[:, 0], strict=True)))
     return rows
 
@@ -196,10 +200,12 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
         calm = [row for row in group if float(row["push"]) == 0]
         plain = [row for row in calm if float(row["friction"]) == 1]
         pushed = [float(row["whole"]) for row in group if float(row["push"]) > 0]
-        middle = {name: median(float(row[name]) for row in plain) for name in ("return", "training s", "error")}
+        known = {name: [float(row[name]) for row in plain if row[name]] for name in ("return", "training s", "error")}
+        middle = {name: median(values) if values else math.nan for name, values in known.items()}
         lines.append(
             {"task": task, "learner": learner, "machine": machine, "seeds": len(plain)}
-            | {"return": f"{middle['return']:,.0f}", "training (s)": f"{middle['training s']:.0f}", "judged on": file}
+            | {"return": f"{middle['return']:,.0f}".replace("nan", "")}
+            | {"training (s)": f"{middle['training s']:.0f}", "judged on": file}
             | {"error (m/s)": f"{middle['error']:.3f}"}
             | {"worst command": f"{max(float(row['worst error']) for row in plain):.2f}"}
             | {"yaw (rad/s)": f"{median(float(row['yaw error']) for row in plain):.2f}"}

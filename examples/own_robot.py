@@ -25,6 +25,6 @@ class RunForward(Task):
         return torch.cat((qpos[..., 1:], qvel), dim=-1)
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Forward speed, a level bar, small actions, and 1 for not falling."""
+        """Forward speed, a level bar, small actions, and 2 for not falling."""
         speed, pitch = obs[..., 4], obs[..., 1]
-        return 1.0 + 2.0 * speed - 2.0 * pitch.square() - 0.1 * action.square().sum(-1)
+        return 2.0 + 4.0 * speed - 4.0 * pitch.square() - 0.1 * action.square().sum(-1)

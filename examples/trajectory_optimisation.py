@@ -1,17 +1,19 @@
 """Swing a pole up by gradient descent on the motor's commands: no policy, no reward, no learning.
 
-    python examples/trajectory_optimisation.py
+    python examples/trajectory_optimisation.py --video swing_up.gif
 
 Several random guesses are improved at once. One backward pass gives each the gradient of its cost in all its commands.
 """
 
 from importlib.resources import files
+from pathlib import Path
 
 import torch
 import tyro
 from torch import Tensor
 
 import diffsim
+from diffsim.view.render import check_video, film
 
 STEPS = 90  # control steps of 1/60 s
 
@@ -34,15 +36,19 @@ def cost(qpos: Tensor, qvel: Tensor) -> Tensor:
     return (5 * angle_error + 0.1 * qvel[-15:].square().sum(-1)).mean(0) + 0.1 * qpos[:, :, 0].square().mean(0)
 
 
-def optimise(guesses: int = 64, iterations: int = 200, seed: int = 0) -> tuple[Tensor, Tensor]:
+def optimise(
+    guesses: int = 64, iterations: int = 200, seed: int = 0, video: Path | None = None
+) -> tuple[Tensor, Tensor]:
     """The path qpos (STEPS, 2) of the best commands, and the costs (iterations, guesses) on the way to them."""
+    if video:
+        check_video(video)  # before the work
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     scene = diffsim.load_scene(str(files("diffsim") / "assets" / "cartpole.xml"))
     sim = diffsim.Simulator(scene, guesses, diffsim.Integration(substeps=4), horizon=STEPS)
     # Slow random waves: what one command does, the next must not undo.
     ctrl = torch.randn(STEPS // 10, guesses, 1).repeat_interleave(10, 0).mul(0.3).requires_grad_()
-    adam = torch.optim.Adam([ctrl], lr=0.05)
+    adam = torch.optim.Adam([ctrl], lr=0.1)
     history = []
     for iteration in range(iterations):
         qpos, qvel = simulate(sim, ctrl)
@@ -54,7 +60,10 @@ def optimise(guesses: int = 64, iterations: int = 200, seed: int = 0) -> tuple[T
         if iteration % 20 == 0:
             print(f"iteration {iteration}: cost median {costs.median():.3f}, best {costs.min():.3f}")
     best = qpos.detach()[:, costs.argmin()]
-    print(f"best: {best[-1, 1].rad2deg().remainder(360):.1f} degrees from upright, cart at {best[-1, 0]:.2f} m")
+    angle = torch.acos(best[-1, 1].cos()).rad2deg()
+    print(f"best: {angle:.1f} degrees from upright, cart at {best[-1, 0]:.2f} m")
+    if video:
+        film(video, scene, best, sim.control_dt, size=(320, 240))
     return best, torch.stack(history)
 
 

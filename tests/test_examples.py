@@ -18,7 +18,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from learners import refusal
 
 import diffsim
 from diffsim.training import load_policy
@@ -44,6 +43,11 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     torch.set_rng_state(state)
 
 
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_examples_are_short(path: Path) -> None:
+    assert path.read_text().count("\n") < 80
+
+
 # The simulator on its own ---------------------------------------------------------------------------------------------
 
 
@@ -58,31 +62,35 @@ def test_learned_controller() -> None:
     assert np.mean(distances[-5:]) < 0.3 * np.mean(distances[:5])
 
 
-def test_system_identification(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of a robot that MuJoCo simulates; and recordings that do not fit the task are refused."""
+@pytest.mark.parametrize("truth", [{"mu": 0.7, "mass": 1.2}, {"mu": 0.5, "mass": 0.85}])
+def test_system_identification(truth: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a robot that MuJoCo simulates, at its own time step."""
     module = load("system_identification")
-    small, path = {"segments": 128, "iterations": 8}, tmp_path / "walk.npz"
-    motion = module.record(diffsim.make("hopper", 20, contact="mujoco"))
-    good = dict(zip(("qpos", "qvel", "ctrl"), (x.numpy() for x in motion), strict=True))
-    np.savez(path, **good)
-    args = module.Args(recording=path, **small)
-    for name, factor in zip(args.fit, module.main(args).tolist(), strict=True):
-        assert factor == pytest.approx(module.TRUTH[name], rel=0.05), name
-    torch.testing.assert_close(module.main(args), module.main(module.Args(**small)), rtol=1e-3, atol=0)
+    monkeypatch.setattr(module, "TRUTH", truth)
+    sim = diffsim.make("hopper", 128, horizon=module.STEPS, contact="mujoco", factors=True).sim
+    recording = module.record(diffsim.make("hopper", 20))
+    assert [x.shape for x in recording] == [(20, 120, 6), (20, 120, 6), (20, 120, 3)]
+    torch.manual_seed(0)
+    estimates = module.identify(sim, recording)
+    assert estimates.shape == (13, 2) and estimates[0].tolist() == [1, 1]
+    for estimate, factor in zip(estimates[-1].tolist(), truth.values(), strict=True):
+        assert estimate == pytest.approx(factor, rel=0.05)
 
-    for bad, message in (
-        ({k: good[k] for k in ("qpos", "ctrl")}, "is no .npz of qpos, qvel and ctrl"),
-        (good | {"qpos": np.zeros((20, 61, 15))}, "qpos has shape (20, 61, 15), must be (20, 61, 6)"),
-        (good | {"qvel": good["qvel"][:, :-1]}, "qvel has shape (20, 60, 6), must be (20, 61, 6)"),
-        (good | {"ctrl": good["ctrl"] * np.nan}, "ctrl holds numbers that are not finite"),
-        ({k: x[:, : 6 - (k == "ctrl")] for k, x in good.items()}, "with at least 6 control steps"),
-    ):
-        np.savez(path, **bad)
-        assert message in refusal(lambda: module.main(args), capsys)
-    path.write_text("hello")
-    assert "is no .npz of qpos, qvel and ctrl" in refusal(lambda: module.main(args), capsys)
-    none = module.Args(recording=tmp_path / "none.npz", **small)
-    assert "is no .npz of qpos, qvel and ctrl: [Errno 2]" in refusal(lambda: module.main(none), capsys)
+
+@pytest.mark.slow
+def test_pictures(tmp_path: Path) -> None:
+    """Those of docs/examples.md."""
+    try:
+        render.check_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    load("system_identification").main(tmp_path / "found.png")
+    load("trajectory_optimisation").optimise(guesses=2, iterations=1, video=tmp_path / "swing_up.gif")
+    assert (tmp_path / "found.png").read_bytes()[:4] == b"\x89PNG" and (
+        tmp_path / "swing_up.gif"
+    ).stat().st_size > 10_000
+    with pytest.raises(ValueError, match="a video ends in"):
+        load("trajectory_optimisation").optimise(video=tmp_path / "swing_up.avi")
 
 
 NOTEBOOK = json.loads((EXAMPLES / "first_steps.ipynb").read_text())
