@@ -326,16 +326,15 @@ def table(runs: Runs) -> list[Row]:
 
 
 def shown(runs: Runs) -> list[Row]:
-    """Of each run, at some steps: mean log weight of the guides' samples, and effective samples."""
+    """Of each case, at some steps: mean log weight of the guides' samples, and effective samples; medians over seeds."""
     result = list[Row]()
-    for name, rows in runs.items():
-        at = {
-            f"t = {float(row['step']):.0f}": (number(row["guides"]), number(row["effective"]))
-            for row in rows
-            if int(float(row["step"])) in SHOWN
-        }
-        cells = {t: f"{nats:.0f} / {effective:.0f}" for t, (nats, effective) in at.items()}
-        result.append(dict(zip(RUN, name, strict=True)) | cells)
+    for (env, case), rows in runs.items():
+        line = dict(task=env, case=case)
+        for (step,), own in grouped(rows, "step").items():
+            if int(float(step)) in SHOWN:
+                nats, effective = (median(number(row[name]) for row in own) for name in ("guides", "effective"))
+                line[f"t = {float(step):.0f}"] = f"{nats:.0f} / {effective:.0f}"
+        result.append(line)
     return result
 
 
@@ -397,7 +396,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     collect(args)
     runs = grouped(args.read("gps_runs"), *RUN)
     args.publish("gps runs", markdown(table(runs)), "gps.md")
-    args.publish("gps weights", markdown(shown(grouped(args.read("gps_weights"), *RUN))), "gps.md")
+    args.publish("gps weights", markdown(shown(grouped(args.read("gps_weights"), *RUN[:2]))), "gps.md")
     args.publish("gps temperatures", markdown(spreads(grouped(args.read("gps_temperatures"), "env"))), "gps.md")
     plot(args.picture("gps_variants"), [[variants(runs, env) for env in SUITE if any(env == key[0] for key in runs)]])
     groups = grouped(args.read("gps_generalisation"), "env", "variant", "kind")
