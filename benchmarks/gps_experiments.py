@@ -312,17 +312,18 @@ def summarise(env: str, case: str, seeds: list[list[dict[str, str]]]) -> Row:
         "T": seeds[0][0]["horizon"],
         "guides": f"{average('gps_guides'):.1f}",
         "pretrained": f"{average('gps_objective'):.0f}",
-        "end, each seed": ", ".join("-" if math.isnan(value) else f"{value:.1f}" for value in final),
+        "end, each seed": ", ".join(f"{value:.1f}" for value in final),
         "iterations": "-".join(map(str, iterations[:: len(iterations) - 1 or 1])),
     }
 
 
 def table(runs: Runs) -> list[Row]:
-    """One row of each task and case."""
+    """One row of each task and case, of the runs that have been evaluated."""
     cases: dict[tuple[str, str], list[list[dict[str, str]]]] = {}
     for (env, case, _), rows in runs.items():
         cases.setdefault((env, case), []).append(rows)
-    return [summarise(env, case, seeds) for (env, case), seeds in cases.items()]
+    evaluated = {key: [rows for rows in seeds if not math.isnan(final_return(rows))] for key, seeds in cases.items()}
+    return [summarise(env, case, seeds) for (env, case), seeds in evaluated.items() if seeds]
 
 
 def shown(runs: Runs) -> list[Row]:
