@@ -8,6 +8,7 @@ import functools
 import json
 import math
 import re
+import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import mean, median, pstdev
@@ -160,6 +161,32 @@ WITHOUT_ORIGIN = {
         shac_h8_ant time
     """,
 }
+
+
+# Of commits that this history does not hold, or by commands that are gone: these may only shrink, too.
+OF_OTHER_COMMITS = (
+    "cpu/learning",
+    "cpu/pods_cartpole",
+    "cpu/pods_second_cartpole",
+    "cpu/robustness",
+    "cpu/robustness_curves",
+)
+OF_OLDER_COMMANDS = "cpu/learning", "cpu/tradeoff", "h100/learning"
+
+
+def test_every_csv_file_is_of_a_commit() -> None:
+    def git(*words: str) -> list[str]:
+        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout.split()
+
+    if git("rev-parse", "--is-shallow-repository") != ["false"]:
+        pytest.skip("the history is not here")
+    commits, other = git("log", "--format=%H"), set[str]()
+    for path in sorted((ROOT / "results").glob("*/*.csv")):
+        for line in path.read_text().splitlines():
+            revisions = re.findall(r"\b[0-9a-f]{7}\b", line.split("; ", 3)[2]) if line.startswith("# ") else ()
+            if not all(any(commit.startswith(short) for commit in commits) for short in revisions):
+                other.add(f"{path.parent.name}/{path.stem}")
+    assert other == {*OF_OTHER_COMMITS}
 
 
 def test_every_csv_file_says_where_it_comes_from() -> None:
@@ -355,6 +382,23 @@ def test_flags_exist(page: Path) -> None:
             assert script.is_file(), f"{page.name} mentions {name}, which does not exist"
             known = flags(script) if "Args" in classes(script) else ANY
         assert mentioned <= known, f"{page.name}: {name} has no {sorted(mentioned - known)}"
+
+
+def test_commands_of_results_run_today() -> None:
+    """Their scripts and flags exist; files of older ones are listed, until they are measured again."""
+    older = set[str]()
+    for path in sorted((ROOT / "results").glob("*/*.csv")):
+        for line in path.read_text().splitlines():
+            if not line.startswith("# "):
+                break
+            command = re.sub(r"\([^)]*\)", "", line.split("; ", 3)[3])
+            for words in (part.split() for part in re.split(r", (?:then )?(?=python )", command)):
+                script = ROOT / words[1]
+                own = words[: words.index("--")] if "--" in words else words
+                mentioned = {word.partition("=")[0] for word in own if re.match(r"--[a-z]", word)}
+                if not script.is_file() or not mentioned <= (flags(script) if "Args" in classes(script) else ANY):
+                    older.add(f"{path.parent.name}/{path.stem}")
+    assert older == {*OF_OLDER_COMMANDS}
 
 
 @functools.cache

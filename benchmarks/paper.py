@@ -1,0 +1,245 @@
+"""The results of docs/experiments.md as one list of cells: a learner on a task with a seed, trained to its end, alone.
+
+    python benchmarks/paper.py --check                             what is missing, and results of no known origin
+    python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables
+    python benchmarks/paper.py --time-limit 500 --train-only       on a machine that is lent: bring runs/paper home
+    python benchmarks/paper.py --machine h200 --evaluate-only --update-results    and evaluate there
+    python benchmarks/paper.py --draw-only --update-results        only the tables
+
+Groups of cells are in cases.json: learners on tasks of a machine, by seeds. A cell counts for a revision if the package
+and the scripts are the same there. Writes cells.csv, a line for each; a line of a table has all seeds of one revision.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import subprocess
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, median
+from typing import NamedTuple
+
+import common
+import tables
+import transfer
+from common import load_case, run
+from learning import CASES, LEARNERS, RETURNS
+from runner import Case, Runner, ScriptFlags, checked, curve, evaluation, finer, passing
+from tables import ROOT, Row, markdown, read_csv
+
+import diffsim
+from diffsim.training import checkpoint, fail
+from diffsim.training.evaluation import kept
+
+CODE = ("diffsim", ":(glob)*.py")  # what a training depends on
+KEY = ("learner", "task", "seed")
+
+
+class Group(NamedTuple):
+    machine: str  # the folder of results/ and runs/paper/
+    learners: Sequence[str]
+    tasks: Sequence[str]
+    seeds: int
+
+
+GROUPS = {name: Group(**case) for name, case in CASES["paper"].items()}
+
+
+class Cell(NamedTuple):
+    machine: str
+    learner: str
+    task: str
+    seed: int
+
+    def case(self, runs: Path) -> Case:
+        script, *flags = LEARNERS.get(self.learner, self.learner).split()
+        return Case(
+            runs / self.machine / self.learner / f"{self.task}__{self.seed}", self.task, self.seed, script, (*flags,)
+        )
+
+    @property
+    def command(self) -> str:
+        device = "cpu" if self.machine == "cpu" else "cuda"
+        script, *flags = LEARNERS.get(self.learner, self.learner).split()
+        return " ".join((f"python {script}.py --env {self.task} --seed {self.seed} --device {device}", *flags))
+
+
+@dataclass
+class Args(ScriptFlags):
+    runs: Path = ROOT / "runs" / "paper"  # directory of the runs: {runs}/{machine}/{learner}/{task}__{seed}
+    only: tuple[str, ...] = tuple(GROUPS)  # groups
+    seeds: tuple[int, ...] = ()  # seeds (default: all of a group)
+    machine: str = ""  # whose cells these are (default: that of --device)
+    check: bool = False  # only say what is missing
+    train_only: bool = False  # evaluate nothing
+    evaluate_only: bool = False  # train nothing
+
+    @property
+    def place(self) -> str:
+        return self.machine or common.machine(self.device)
+
+    @property
+    def directory(self) -> Path:
+        return self.output or (common.RESULTS if self.update_results else common.OUTPUT) / self.place
+
+
+def cells(args: Args) -> Iterator[Cell]:
+    """Each once, those of seed 1 of all groups first."""
+    found = {
+        (seed, Cell(group.machine, learner, task, seed)): None
+        for group in (GROUPS[name] for name in args.only)
+        for learner in group.learners
+        for task in group.tasks
+        for seed in range(1, group.seeds + 1)
+        if task in args.env and seed in (args.seeds or [seed])
+    }
+    return (cell for _, cell in sorted(found, key=lambda each: each[0]))
+
+
+@functools.cache
+def same_code(revision: str) -> bool:
+    """Whether a training there would be the same; no, of one that is not in this history."""
+    call = ["git", "diff", "--quiet", revision, "HEAD", "--", *CODE]
+    return subprocess.run(call, cwd=ROOT, capture_output=True).returncode == 0
+
+
+def done(rows: Sequence[Mapping[str, str]], cell: Cell) -> bool:
+    own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
+    return any(same_code(row["revision"]) for row in own)
+
+
+def train(runner: Runner, case: Case) -> bool:
+    """To the end; whether it got there. A cell that another revision began is refused, since none is of two."""
+    path, revision = case.folder / "cell.json", tables.revision()
+    if tables.unknown(f"; ; {revision}"):
+        fail(f"a cell is of a commit, not of {revision}")
+    begun = json.loads(path.read_text()) if path.is_file() else {}
+    if begun and not same_code(begun["revision"]):
+        fail(f"{case.folder} was begun at {begun['revision']}: remove it, or check that revision out")
+    if not begun:
+        case.folder.mkdir(parents=True, exist_ok=True)
+        trained_on = tables.origin(runner.args.device).removeprefix("# ").partition("; ")[0]
+        path.write_text(json.dumps(begun := {"revision": revision, "trained on": trained_on}))
+    fresh, start = not (case.folder / "progress.csv").is_file(), time.monotonic()
+    if not runner.train(case):
+        return False
+    if fresh:  # trained in one go
+        path.write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
+    return True
+
+
+def measure(runner: Runner, cell: Cell, case: Case) -> Row:
+    """A cell's line: what its training and all its evaluations say; empty if it is not whole."""
+    path = case.folder / "checkpoint.pt"
+    if not path.is_file() or not (case.folder / "cell.json").is_file():
+        return {}
+    state = checkpoint.load(path)
+    how, begun = state["args"], json.loads((case.folder / "cell.json").read_text())
+    if state["iteration"] < how["iterations"] or not runner.evaluate(case):
+        return {}
+    own, finest, reference = (
+        evaluation(folder) for folder in (case.folder, *(finer(case.folder, n) for n in checked(cell.task, how)))
+    )
+    progress, returns = read_csv(case.folder / "progress.csv"), RETURNS[cell.task]
+    curves = [curve(progress)]
+    row: dict[str, object] = dict(zip(KEY, cell[1:], strict=True)) | begun
+    row |= {"iterations": state["iteration"], "control steps": float(progress[-1]["control_steps"])}
+    row |= {
+        "training (s)": float(progress[-1]["seconds"]),
+        "return": own["return"],
+        "speed": "" if own["speed"] is None else own["speed"],
+    }
+    row |= {"falls": mean(length < diffsim.TASKS[cell.task].episode_length for length in own["lengths"])}
+    row |= {"kept": kept(own["return"], finest["return"]), "in the reference": reference["return"]}
+    for target in returns.timed or (returns.target,):
+        for x in ("control_steps", "seconds"):
+            row[f"{x} to {target}"] = passing(curves, target, x)[0]
+    saved = load_case(path, len(own["lengths"]), "cpu")
+    if "muscle" not in saved.env.scene.features:
+        world = transfer.MuJoCo(saved.env.scene, saved.env.num_envs, saved.env.control_dt)
+        motion = transfer.travel(saved, world, saved.env.episode_length)
+        found = transfer.measure(motion, saved.env.scene, saved.env.control_dt, saved.env.task.forward)
+        row |= {"return in MuJoCo": found["return"], "speed in MuJoCo": found["speed"]}
+    return row
+
+
+def number(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
+    return [float(row[name]) for row in rows if row.get(name)]
+
+
+def line(cell: Cell, rows: Sequence[Mapping[str, str]]) -> Row:
+    """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
+    returns = number(rows, "return")
+    shown: dict[str, object] = {"task": cell.task, "learner": cell.learner, "machine": cell.machine, "seeds": len(rows)}
+    shown["return"] = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
+    for name in ("training (s)", "in all (s)"):
+        values = number(rows, name)
+        shown[name] = f"{median(values):.0f}" if values else ""
+    shown["falls"] = f"{max(number(rows, 'falls')):.2f}"
+    shown["kept"] = f"{median(number(rows, 'kept')):.3f}"
+    for name in ("speed", "speed in MuJoCo"):
+        values = number(rows, name)
+        shown[name] = f"{median(values):.2f}" if values else ""
+    target = RETURNS[cell.task].target
+    seconds, steps = (median(number(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
+    passed = f"{seconds:.0f} s, {steps / 1e6:.3g} M" if seconds < math.inf else "never"
+    return shown | {"target": target, "passes it after": passed}
+
+
+def table(args: Args, name: str) -> list[Row]:
+    """A line for each learner and task of which all seeds are there, of one revision."""
+    group, lines = GROUPS[name], list[Row]()
+    rows = read_csv(args.directory.parent / group.machine / "cells.csv")
+    for task in group.tasks:
+        for learner in group.learners:
+            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
+            revisions = {row["revision"] for row in own if same_code(row["revision"])}
+            own = [row for row in own if row["revision"] in revisions and int(row["seed"]) <= group.seeds]
+            if len(own) == group.seeds:
+                lines.append(line(Cell(group.machine, learner, task, 0), own))
+    return lines
+
+
+def check(args: Args) -> str:
+    """What is missing, a line for each learner and task; then csv files whose origin is unknown, or not in history."""
+    lines, missing, count = list[str](), dict[tuple[str, str, str], list[Cell]](), 0
+    known = {name: read_csv(common.RESULTS / name / "cells.csv") for name in {GROUPS[g].machine for g in args.only}}
+    for cell in cells(args):
+        count += 1
+        if not done(known[cell.machine], cell):
+            missing.setdefault(cell[:3], []).append(cell)
+    for each in missing.values():
+        seeds = " ".join(str(cell.seed) for cell in each)
+        lines.append(f"{each[0].machine}: {each[0].command.replace(f'--seed {each[0].seed}', f'--seed {{{seeds}}}')}")
+    lines.append(f"{sum(map(len, missing.values()))} of {count} cells are missing")
+    for path in sorted(common.RESULTS.glob("*/*.csv")):
+        if found := next((bad for origin in tables.origins(path) if (bad := tables.unknown(origin))), ""):
+            lines.append(f"{path.relative_to(common.RESULTS.parent)}: {found}")
+    return "\n".join(lines)
+
+
+def main(args: Args) -> None:
+    if unknown := [name for name in args.only if name not in GROUPS]:
+        fail(f"--only: there is no group {unknown[0]!r}; choose from {', '.join(GROUPS)}")
+    if args.check:
+        print(check(args))
+        return
+    runner = Runner(args)
+    for cell in () if args.draw_only else cells(args):
+        if cell.machine != args.place or done(args.read("cells"), cell):
+            continue
+        case = cell.case(args.runs)
+        if not args.evaluate_only and not train(runner, case):
+            continue
+        if not args.train_only and (row := measure(runner, cell, case)):
+            args.keep("cells", row, KEY)
+    for name in args.only:
+        args.publish(name, markdown(table(args, name)), "experiments.md", everywhere=True)
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)

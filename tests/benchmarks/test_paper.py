@@ -1,0 +1,113 @@
+"""The list of cells: which are missing, which are printed, and that none is of two revisions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import common
+import paper
+import pytest
+import tables
+from learners import refusal
+from runner import Runner
+
+SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4")
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
+    """The lines of the H200's cells.csv; the code is that of aaaaaaa."""
+    rows = list[dict[str, str]]()
+    monkeypatch.setattr(paper, "read_csv", lambda path: rows if path.parts[-2:] == ("h200", "cells.csv") else [])
+    monkeypatch.setattr(paper, "same_code", lambda revision: revision == "aaaaaaa")
+    for seed, value in enumerate((5000.0, 5100.0, 4800.0, 5300.0, 5200.0), start=1):
+        row = SAPO | {"seed": str(seed), "return": f"{value}", "training (s)": f"{60 + seed}", "falls": f"{seed / 100}"}
+        rows.append(row | {"seconds to 3000": "inf" if seed < 3 else "9", "control_steps to 3000": f"{seed}e6"})
+    return rows
+
+
+def test_every_cell_is_there_once_the_first_seeds_first() -> None:
+    found = list(paper.cells(paper.Args()))
+    assert len(found) == len({*found}) and [cell.seed for cell in found] == sorted(cell.seed for cell in found)
+    for group in paper.GROUPS.values():
+        assert group.machine in ("cpu", "h200") and group.seeds >= 3
+        for learner in group.learners:
+            assert paper.Cell(group.machine, learner, group.tasks[-1], group.seeds) in found
+    some = list(paper.cells(paper.Args(only=("headline", "muscles"), env=("humanoid_mtu",), seeds=(2, 4))))
+    assert {(cell.learner, cell.seed) for cell in some} == {
+        *((learner, seed) for learner in ("shac", "sapo", "ppo_4096") for seed in (2, 4)),
+        ("sac_large", 2),
+    }
+    (cell,) = (cell for cell in some if cell.learner == "sac_large")
+    assert (
+        cell.command == "python sac_baseline.py --env humanoid_mtu --seed 2 --device cuda --large-batch --accuracy fast"
+    )
+
+
+def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> None:
+    (line,) = paper.table(paper.Args(), "headline")
+    assert (line["task"], line["learner"], line["seeds"]) == ("hopper", "sapo", 5)
+    assert line["return"] == "5100 (4800 to 5300)" and line["training (s)"] == "63" and line["falls"] == "0.05"
+    assert line["passes it after"] == "9 s, 3 M" and line["in all (s)"] == ""
+    known[4]["revision"] = "bbbbbbb"
+    assert paper.table(paper.Args(), "headline") == []
+    known[4] |= {"revision": "aaaaaaa", "seed": "6"}
+    assert paper.table(paper.Args(), "headline") == []
+
+
+def test_what_is_missing_is_said_with_its_command(known: list[dict[str, str]]) -> None:
+    known[2]["revision"] = "bbbbbbb"
+    args = paper.Args(only=("headline",), env=("hopper",))
+    *lines, count = [line for line in paper.check(args).splitlines() if not line.startswith("results/")]
+    assert lines == [
+        "h200: python shac.py --env hopper --seed {1 2 3 4 5} --device cuda",
+        "h200: python ppo_baseline.py --env hopper --seed {1 2 3 4 5} --device cuda "
+        "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --iterations 1200",
+        "h200: python sapo.py --env hopper --seed {3} --device cuda",
+    ]
+    assert count == "11 of 15 cells are missing"
+    bad = [line.partition(":")[0] for line in paper.check(args).splitlines() if line.startswith("results/")]
+    files = (tables.ROOT / name for name in bad)
+    assert all(any(map(tables.unknown, tables.origins(path))) for path in files)
+
+
+def test_code_is_the_same_where_package_and_scripts_are() -> None:
+    assert paper.same_code("HEAD") and not paper.same_code("no-commit")
+
+
+def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    error = refusal(lambda: paper.main(paper.Args(only=("headlines",))), capsys)
+    assert "there is no group 'headlines'; choose from headline, cores" in error
+    monkeypatch.setattr(tables, "revision", lambda: "1234567-dirty")
+    case = paper.Cell("cpu", "shac", "cartpole", 1).case(Path("nowhere"))
+    error = refusal(lambda: paper.train(Runner(paper.Args()), case), capsys)
+    assert error.endswith("a cell is of a commit, not of 1234567-dirty")
+
+
+def test_cells_are_trained_evaluated_and_kept_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tables, "revision", lambda: "HEAD")
+    places = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path / "results" / "cpu"), "--device", "cpu"]
+    flags = [*places, "--only", "cores", "--env", "cartpole", "--seeds", "1"]
+    short = "-- --iterations 2 --num-envs 4 --horizon 4 --eval-episodes 2".split()
+
+    def call(*more: str) -> list[dict[str, str]]:
+        args = common.parse(paper.Args, None, [*flags, *more, *short])
+        paper.main(args)
+        return args.read("cells")
+
+    assert call("--train-only") == []
+    assert {row["learner"]: row["iterations"] for row in call("--evaluate-only")} == {"shac": "2", "sapo": "2"}
+    folder = tmp_path / "runs" / "cpu" / "shac" / "cartpole__1"
+    before = (folder / "checkpoint.pt").stat().st_mtime_ns
+    row: dict[str, Any] = next(row for row in call() if row["learner"] == "shac")
+    assert (folder / "checkpoint.pt").stat().st_mtime_ns == before and len(call()) == 2
+    assert row["revision"] == "HEAD" and float(row["in all (s)"]) > float(row["training (s)"]) > 0
+    assert float(row["return"]) < 0 and float(row["return in MuJoCo"]) < 0 and row["seconds to -1000"] == "inf"
+
+    (tmp_path / "results" / "cpu" / "cells.csv").unlink()
+    (folder / "cell.json").write_text(json.dumps({"revision": "no-commit", "trained on": ""}))
+    assert "was begun at no-commit" in refusal(call, capsys)
