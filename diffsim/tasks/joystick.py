@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
+from diffsim.robot.mjcf import load_scene
 from diffsim.sim.integration import Integration
 from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.locomotion import rotate
+from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
+from diffsim.tasks.own import robot
 
 FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
 STANDING = 0.1  # share of commands that are zero; each of the three numbers of others is with the same probability
@@ -49,7 +53,8 @@ class Robot(NamedTuple):
         home: (joints,) [rad] of the keyframe.
         height: m, of the root there.
         length: m, of a leg, from hip to foot there.
-        cycle: Hz, of the gait.
+        cycle: Hz, of the gait; legs of the two sides are half a cycle apart.
+        sides: (right, left) beginnings of the joints' names.
         command: largest vx, vy [m/s] and yaw rate [rad/s].
     """
 
@@ -59,6 +64,7 @@ class Robot(NamedTuple):
     legs: tuple[Leg, ...]
     length: float
     cycle: float
+    sides: Sides
     command: tuple[float, float, float] = (1.0, 0.6, 1.0)
 
 
@@ -74,7 +80,7 @@ def quadruped(order: Sequence[str]) -> Robot:
         for name in order
     )
     joints = tuple(f"{name}_{part}" for name in order for part in ("hip", "thigh", "calf"))
-    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 2.0)
+    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
 
 
 def humanoid() -> Robot:
@@ -93,7 +99,8 @@ def humanoid() -> Robot:
         for side in ("left", "right")
     )
     home = (*stance, *stance, 0.0, 0.0, 0.073, 0.2, *hang, 0.2, -0.2, *hang[1:])
-    return Robot(tuple(side + name for side, names in parts for name in names), home, 0.755, legs, 0.65, 1.4)
+    joints = tuple(side + name for side, names in parts for name in names)
+    return Robot(joints, home, 0.755, legs, 0.65, 1.4, (("right_", "left_"),))
 
 
 def score(square: Tensor, scale: float) -> Tensor:
@@ -150,6 +157,18 @@ class Joystick(Task):
         self._noise = tensor(scales + (JOINT_NOISE,) * n + (0.1 * RATE_NOISE,) * n)
         self._down = tensor((0.0, 0.0, -1.0))
         self._n = n
+
+    @cached_property
+    def mirror(self) -> Mirror:
+        """See Task. The image's clock is half a cycle ahead."""
+        device, dtype = self._start.device, self._start.dtype
+        qpos, qvel, action = reflections(load_scene(robot(self)).mj_model, self.robot.sides, device, dtype)
+        joints, rates = (Reflection(part.index[n:] - n, part.sign[n:]) for part, n in ((qpos, 7), (qvel, 6)))
+        signs = (*VECTOR, *PSEUDOVECTOR, *VECTOR), (1.0, -1.0, -1.0, -1.0, -1.0), (1.0,)
+        body, command, height = (Reflection.of(enumerate(part), device, dtype) for part in signs)
+        sensed = body, joints, rates
+        obs = Reflection.cat((*sensed, action, command, *sensed, height, action, joints))
+        return Mirror(qpos, qvel, action, obs)
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """The keyframe, with joints and rates drawn around it."""

@@ -190,3 +190,46 @@ def test_memory_goes_with_the_episode() -> None:
     torch.testing.assert_close(again, reward, rtol=0, atol=1e-12)
     begun = env.begin(torch.tensor([2]), torch.full((1, env.task.num_random), 0.5, dtype=REAL))
     assert (begun[2, 45:48] == 0).all() and torch.equal(begun[:2], obs[:2])  # a command of zero
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_image_follows_the_mirrored_command(name: str) -> None:
+    """With its clock half a cycle ahead it sees the image and gains the same; its motors turn its image's joints."""
+    task, model, n = task_of(name), task_scene(name).mj_model, 8
+    generator, mirror = torch.Generator().manual_seed(0), task.mirror
+    qpos, qvel = task.reset(some(task, n))
+    qpos[:, :7] += torch.randn(n, 7, dtype=REAL, generator=generator) * torch.tensor([1.0] * 3 + [0.3] * 4)
+    qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
+    action, last, before = torch.randn(3, n, model.nu, dtype=REAL, generator=generator)
+    command, clock = (
+        torch.randn(n, 3, dtype=REAL, generator=generator),
+        torch.rand(n, 1, dtype=REAL, generator=generator),
+    )
+    noise = torch.randn(n, 9 + 2 * model.nu, dtype=REAL, generator=generator)
+    memory = torch.cat((command, clock, last, before, noise), dim=1)
+    turned = command * torch.tensor([1.0, -1.0, -1.0]), (clock + 0.5) % 1.0
+    sensed = mirror.obs(torch.cat((noise, torch.zeros(n, task.obs_dim - noise.shape[1], dtype=REAL)), 1))
+    image = torch.cat((*turned, *map(mirror.action, (last, before)), sensed[:, : noise.shape[1]]), dim=1)
+    obs = task.observe_with(qpos, qvel, action, memory)
+    seen = task.observe_with(mirror.qpos(qpos), mirror.qvel(qvel), mirror.action(action), image)
+    torch.testing.assert_close(seen, mirror.obs(obs), rtol=0, atol=1e-12)
+    torch.testing.assert_close(task.reward(seen, mirror.action(action)), task.reward(obs, action), rtol=0, atol=1e-12)
+
+    low, high = torch.tensor(model.actuator_ctrlrange.T)
+    joints = model.jnt_qposadr[model.actuator_trnid[:, 0]]
+    targets = torch.zeros(2, n, model.nq, dtype=REAL)
+    for target, asked in zip(targets, (action, mirror.action(action)), strict=True):
+        target[:, joints] = (low + high) / 2 + (high - low) / 2 * asked
+    torch.testing.assert_close(targets[1], mirror.qpos(targets[0]), rtol=0, atol=1e-12)
+
+
+@torch.no_grad()
+def test_the_image_moves_like_the_robot() -> None:
+    env = diffsim.make("go2", num_envs=8, horizon=1, seed=1)
+    mirror, sim = env.task.mirror, env.sim
+    env.reset(seed=1)
+    state, image = (env.qpos, env.qvel), (mirror.qpos(env.qpos), mirror.qvel(env.qvel))
+    for action in torch.rand(10, 8, 12, generator=env.generator) - 0.5:
+        state, image = sim.step(*state, action), sim.step(*image, mirror.action(action))
+    errors = (mirror.qpos(state[0]) - image[0]).abs().amax(1)  # its inertias are not quite alike
+    assert errors.max() < 0.01 and (state[0] - env.qpos).abs().amax() > 0.1

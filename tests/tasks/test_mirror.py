@@ -17,7 +17,7 @@ from diffsim.tasks import TASKS
 from diffsim.tasks.mirror import reflections
 from diffsim.view.gait import trace
 
-MIRRORED = ("ant", "humanoid", "humanoid_mtu")
+MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1")
 ASSETS = Path(diffsim.__file__).parent / "assets"
 
 
