@@ -38,6 +38,7 @@ from diffsim.training import Count
 PartName = Literal["step", "sweeps", "horizon", "long", "energy"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 HORIZONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
+SHOWN = (1, 32, 128, 1000)  # of them in the page
 SWEEPS: dict[str, tuple[float, ...]] = {
     "contact stiffness x": (0.01, 0.1, 1, 10, 100, 1000),
     "contact damping x": (0, 1, 10, 100),
@@ -191,22 +192,35 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
             yield {**row, "gradient": norm, "gradients not finite": lost}
 
 
-def summary(rows: list[dict[str, str]]) -> list[Row]:
-    """One line for each task and sweep: of each integrator the first value that is not finite or not bounded."""
-    groups: dict[tuple[str, str], list[dict[str, str]]] = {}
+def steps(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each task: its default's substeps, and the fewest of each integrator."""
+    lines = dict[str, dict[str, object]]()
     for row in rows:
-        groups.setdefault((row["task"], row["sweep"]), []).append(row)
-    lines = list[Row]()
-    for (task, sweep), group in groups.items():
-        line = {"task": task, "sweep": sweep, "range": f"{group[0]['value']} .. {group[-1]['value']}"}
-        for integrator in INTEGRATORS:
-            own = [row for row in group if row["integrator"] == integrator]
-            line[integrator] = "-" if own else "not measured"
-            for row in reversed(own):
-                if "False" in (row["finite"], row["energy bounded"]):
-                    line[integrator] = f"{row['value']} ({'energy' if row['finite'] == 'True' else 'not finite'})"
-        lines.append(line | {"largest gradient": max(float(row["gradient"]) for row in group)})
-    return lines
+        line = lines.setdefault(row["task"], {"task": row["task"], "default": row["default"]})
+        line[row["integrator"]] = row["fewest substeps"]
+    return list(lines.values())
+
+
+def failures(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each task and sweep that fails: of each integrator the first value that is not finite or bounded."""
+    lines = dict[tuple[str, str], dict[str, object]]()
+    for row in rows:
+        empty = {"task": row["task"], "sweep": row["sweep"]} | dict.fromkeys(INTEGRATORS, "-")
+        line = lines.setdefault((row["task"], row["sweep"]), empty)
+        if line[row["integrator"]] == "-" and "False" in (row["finite"], row["energy bounded"]):
+            how = "energy" if row["finite"] == "True" else "not finite"
+            line[row["integrator"]] = f"{row['value']} ({how})"
+    return [line for line in lines.values() if {*map(line.get, INTEGRATORS)} != {"-"}]
+
+
+def growth(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each task, explicitly integrated: the gradient's norm over some horizons."""
+    lines = dict[str, dict[str, object]]()
+    for row in rows:
+        if row["integrator"] == "semi_implicit" and int(row["horizon"]) in SHOWN:
+            line = lines.setdefault(row["task"], {"task": row["task"], "integrator": row["integrator"]})
+            line[row["horizon"]] = row["gradient"]
+    return list(lines.values())
 
 
 def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
@@ -299,10 +313,10 @@ def draw(args: Args, rows: list[dict[str, str]]) -> None:
 
 PAGE = "stability.md"
 PARTS: dict[PartName, Part] = {
-    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE),
-    "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, summary),
-    "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon")),
-    "long": Part("stability_long", measure_long, ("task",), "long", PAGE),
+    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE, steps),
+    "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, failures),
+    "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon"), "horizon", PAGE, growth),
+    "long": Part("stability_long", measure_long, ("task",)),
 }
 
 
