@@ -205,7 +205,7 @@ def failures(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task and sweep that fails: of each integrator the first value that is not finite or bounded."""
     lines = dict[tuple[str, str], dict[str, object]]()
     for row in rows:
-        empty = {"task": row["task"], "sweep": row["sweep"]} | dict.fromkeys(INTEGRATORS, "-")
+        empty: dict[str, object] = {"task": row["task"], "sweep": row["sweep"], **dict.fromkeys(INTEGRATORS, "-")}
         line = lines.setdefault((row["task"], row["sweep"]), empty)
         if line[row["integrator"]] == "-" and "False" in (row["finite"], row["energy bounded"]):
             how = "energy" if row["finite"] == "True" else "not finite"
