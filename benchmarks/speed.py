@@ -190,13 +190,8 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
         mj = times.pop(reference)["mj_step"] / per_substep
         for (scene_name, kind, place), t in times.items():
             scalar = times.get((scene_name, "scalar", place), {})
-            row: dict[str, object] = {
-                "task": name,
-                "environments": num_envs,
-                "scene": scene_name,
-                "kernel": kind,
-                "device": place,
-            }
+            row: dict[str, object] = {"task": name, "environments": num_envs, "scene": scene_name}
+            row |= {"kernel": kind, "device": place}
             row |= {f"{what} (us/substep)": microseconds / per_substep for what, microseconds in t.items()}
             ratios = {what: t[what] / scalar[what] for what in scalar if "kernel" in what}
             row |= {f"{what}/scalar": ratio for what, ratio in ratios.items()}
@@ -310,19 +305,17 @@ def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
     yield {**row, "critic, ms": critic, **{f"published {part}, s (TITAN X)": seconds for part, seconds in published}}
 
 
-def start(command: Sequence[str], directory: Path, cache: str) -> tuple[float, float]:
-    """Seconds from a script's start to the end of its first iteration, and its peak memory in MiB."""
-    began, first, ended = time.perf_counter(), None, 0
+def start(command: Sequence[str], directory: Path, cache: str) -> float:
+    """Seconds from a script's start to the end of its first iteration; waits for its end."""
+    began, first = time.perf_counter(), None
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"WARP_CACHE_PATH": cache})
-    while not ended:
-        ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+    while process.poll() is None:
         if first is None and read_csv(directory / "progress.csv"):
             first = time.perf_counter() - began
         time.sleep(0.01)
-    process.returncode = os.waitstatus_to_exitcode(status)
     if first is None or process.returncode:
         fail(f"{' '.join(command)} failed")
-    return first, usage.ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
+    return first
 
 
 def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
@@ -336,9 +329,9 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
     for technique, flags in techniques.items():
         with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as runs:
             run = Path(runs)
-            cold, _ = start([*command, *flags, "--stop-after", "1", "--run-dir", f"{run}/cold"], run / "cold", cache)
+            cold = start([*command, *flags, "--stop-after", "1", "--run-dir", f"{run}/cold"], run / "cold", cache)
             last = ["--stop-after", str(args.iterations + 3), "--run-dir", f"{run}/warm"]
-            warm, memory = start([*command, *flags, *last], run / "warm", cache)
+            warm = start([*command, *flags, *last], run / "warm", cache)
             progress = read_csv(run / "warm" / "progress.csv")[3:]
             num_envs = json.loads((run / "warm" / "args.json").read_text())["num_envs"]
         critic = [1e3 * float(row["time_update_critic"]) for row in progress if "time_update_critic" in row]
@@ -350,7 +343,6 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
             "iteration (ms)": 1e3 * median(float(row["time_total"]) for row in progress),
             "critic": median(critic) if critic else "",
             "start to first iteration (s)": warm,
-            "peak memory (MiB)": memory,
             "start with nothing compiled (s)": cold,
         }
 
