@@ -34,7 +34,7 @@ import torch
 import tyro
 import warp as wp
 from common import TASKS, Panel, Part, TaskName, lines, measured, plot, run
-from motions import shac, simulator
+from motions import shac
 from runner import ScriptFlags
 from tables import ROOT, Row, read_csv
 
@@ -48,12 +48,12 @@ from diffsim.training import parse as parse_script
 from diffsim.training.evaluation import make_env
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
-KernelName = Literal["blocks", "scalar", "float64"]
+KernelName = Literal["blocks", "scalar"]
 KERNELS: dict[KernelName, dict[str, Any]] = {
-    "blocks": {},  # float32; on a CPU in vectors of environments
+    "blocks": {},  # on a CPU in vectors of environments
     "scalar": {"block": 1},
-    "float64": {"dtype": torch.float64},
 }
+THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
 PartName = Literal["physics", "scaling", "training", "time"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; the scaling table leaves out larger settings
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
@@ -67,7 +67,7 @@ class Args(ScriptFlags):
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
     scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
     horizons: tuple[Count, ...] = (1, 4, 8, 16, 32, 64, 128)  # horizons of the scaling table, at 64 environments
-    kernels: tuple[KernelName, ...] = ("blocks", "scalar", "float64")  # of the physics table; scalar on a CPU
+    kernels: tuple[KernelName, ...] = ("blocks", "scalar")  # of the physics table; scalar on a CPU
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
     script: str = "shac"  # script of the training table, in the repository's root, without .py
@@ -169,7 +169,7 @@ def mujoco_timer(scene: Scene, num_envs: int, timestep: float, substeps: int) ->
 
 def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     """Beside MuJoCo: with all models of its muscles and without, if a task has any; the hopper also on rough ground."""
-    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()} if args.device == "cpu" else {args.device: 1}
+    threads = THREADS if args.device == "cpu" else {args.device: 1}
     task, whole = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
@@ -183,7 +183,7 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
         reference = "", "", "mj_step"
         competitors = {reference: mujoco_timer(whole, num_envs, task.control_dt / default.substeps, default.substeps)}
         for (scene_name, scene), kernel, (place, count) in product(scenes.items(), kernels, threads.items()):
-            sim = simulator(scene, default, num_envs, threads=count, **options, **KERNELS[kernel])
+            sim = Simulator(scene, num_envs, default, threads=count, **options, **KERNELS[kernel])
             competitors[scene_name, kernel, place] = timer(sim)
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
         per_substep = num_envs * default.substeps
@@ -212,9 +212,8 @@ def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: 
 
 
 def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
-    techniques = ["cuda graph", "cuda graph, one thread per environment", "cuda, eager"]
-    if args.device == "cpu":
-        techniques = ["cpu, 1 thread", "cpu, all cores"]
+    graphs = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"
+    techniques = THREADS if args.device == "cpu" else graphs
     substeps, scene = diffsim.TASKS[name].substeps, diffsim.make(name, num_envs=1).scene
     numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
     settings = dict.fromkeys([(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons])
@@ -247,11 +246,9 @@ def time_window(name: TaskName, num_envs: int, horizon: int, technique: str) -> 
         torch.cuda.synchronize()
         free = torch.cuda.mem_get_info()[0]
     env = diffsim.make(name, num_envs=num_envs, seed=0, device=device)
-    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique)
     division, default = divide(env.scene) if "one thread" in technique else None, env.task.integration("default")
-    sim = simulator(
-        env.scene, default, num_envs, horizon=horizon, device=device.type, threads=threads, division=division
-    )
+    options = dict[str, Any](device=device.type, threads=THREADS.get(technique), division=division)
+    sim = Simulator(env.scene, num_envs, default, horizon=horizon, **options)
     actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()
     calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)
     captured = [graph.capture(call, device) if "graph" in technique else call for call in calls]
@@ -320,7 +317,7 @@ def start(command: Sequence[str], directory: Path, cache: str) -> float:
 
 def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
     """Iterations of a script in a process of its own, which is never evaluated."""
-    techniques = {"cpu, 1 thread": ["--threads", "1"], "cpu, all cores": ["--threads", str(available_cores())]}
+    techniques = {technique: ["--threads", str(threads)] for technique, threads in THREADS.items()}
     if args.device != "cpu":
         techniques = {"cuda graph": [], "cuda, eager": ["--no-cuda-graph"]}
     words = f"{args.script}.py --env {name} --device {args.device} --quiet --iterations {args.iterations + 4}"
