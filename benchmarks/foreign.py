@@ -31,13 +31,10 @@ STEP = 2.0**-10  # s: no acceleration reaches the speed at which a simulator con
 
 @dataclass
 class Args:
-    """Which files, and how many states of each robot."""
-
     folder: tyro.conf.Positional[Path]  # where the files are
     pattern: str = "*/scene*.xml"  # which of its files
     name: str = ""  # of the collection (default: the folder's)
     states: int = 200  # random states of each robot whose accelerations are compared; 0 for none
-    seed: int = 1  # of the states
     update_results: bool = False  # write results/cpu/foreign.csv instead of runs/benchmarks/cpu/foreign.csv
 
 
@@ -65,12 +62,12 @@ def random_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[n
     return qpos, rng.normal(size=(count, m.nv)), rng.uniform(-1, 1, (count, m.nu))
 
 
-def difference(scene: Scene, count: int, seed: int) -> float:
+def difference(scene: Scene, count: int) -> float:
     """Largest error of an acceleration, relative to the largest one of its state."""
     m = copy.copy(scene.mj_model)
     m.dof_frictionloss[:] = 0
     m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    states = random_states(scene, count, np.random.default_rng(seed))
+    states = random_states(scene, count, np.random.default_rng(1))
     scene = dataclasses.replace(scene, mj_model=m, ground_height=-1e3)
     sim = Simulator(scene, count, Integration(substeps=1), control_dt=STEP, dtype=torch.float64)
     qpos, qvel, ctrl = (torch.tensor(x) for x in states)
@@ -97,7 +94,7 @@ def main() -> None:
         row: dict[str, object] = {"collection": name, "file": path.relative_to(folder).as_posix(), "refused": why}
         if scene:
             row |= {"nq": scene.nq, "nv": scene.nv, "nu": scene.nu, "contact points": scene.ncontact}
-            row["relative error of qacc"] = difference(scene, args.states, args.seed) if args.states else ""
+            row["relative error of qacc"] = difference(scene, args.states) if args.states else ""
         print(*(f"{key} {tables.digits(value)}" for key, value in row.items() if value != ""), sep=", ", flush=True)
         tables.merge_csv(csv, [row], ("collection", "file"))
     print(f"{sum(scene is not None for scene, _ in scenes.values())} of {len(scenes)} load: {csv}")
