@@ -211,17 +211,6 @@ def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: 
     return seconds[warmup:]
 
 
-def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
-    graphs = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"
-    techniques = THREADS if args.device == "cpu" else graphs
-    substeps, scene = diffsim.TASKS[name].substeps, diffsim.make(name, num_envs=1).scene
-    numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
-    settings = dict.fromkeys([(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons])
-    for (num_envs, horizon), technique in product(settings, techniques):
-        if 4 * numbers * num_envs * horizon * substeps <= MAX_MEMORY:
-            yield time_window(name, num_envs, horizon, technique)
-
-
 def windows(
     sim: Simulator, qpos: torch.Tensor, qvel: torch.Tensor, actions: torch.Tensor
 ) -> tuple[Callable[[], torch.Tensor], ...]:
@@ -237,45 +226,42 @@ def windows(
     return torch.no_grad()(forward), forward, lambda: torch.autograd.grad(forward(), actions)[0]
 
 
-def time_window(name: TaskName, num_envs: int, horizon: int, technique: str) -> Row:
-    """A window of control steps without gradients, differentiably, and with its backward pass."""
-    device = torch.device("cuda" if "cuda" in technique else "cpu")
-    if device.type == "cuda":
-        gc.collect()  # the graphs of the setting before
-        torch.cuda.empty_cache()
-        torch.cuda.synchronize()
-        free = torch.cuda.mem_get_info()[0]
-    env = diffsim.make(name, num_envs=num_envs, seed=0, device=device)
-    division, default = divide(env.scene) if "one thread" in technique else None, env.task.integration("default")
-    options = dict[str, Any](device=device.type, threads=THREADS.get(technique), division=division)
-    sim = Simulator(env.scene, num_envs, default, horizon=horizon, **options)
-    actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()
-    calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)
-    captured = [graph.capture(call, device) if "graph" in technique else call for call in calls]
-    no_grad, one_way, both = (min(timed(call, device, warmup=3, calls=4)) for call in captured)
-    return {
-        "task": name,
-        "environments": num_envs,
-        "horizon": horizon,
-        "technique": technique,
-        "forward (us/substep of all)": 1e6 * one_way / horizon / default.substeps,
-        "backward (us/substep of all)": 1e6 * (both - one_way) / horizon / default.substeps,
-        "differentiated control steps/s": num_envs * horizon / both,
-        "substeps/s without gradient": num_envs * horizon * default.substeps / no_grad,
-        "memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if device.type == "cuda" else "",
-    }
+def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
+    """A window of control steps differentiably, and with its backward pass."""
+    graphs = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"
+    settings = dict.fromkeys([(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons])
+    default, cuda = diffsim.TASKS[name].integration("default"), args.device != "cpu"
+    for (num_envs, horizon), technique in product(settings, graphs if cuda else THREADS):
+        if cuda:
+            gc.collect()  # the graphs of the setting before
+            torch.cuda.empty_cache()
+            torch.cuda.synchronize()
+            free = torch.cuda.mem_get_info()[0]
+        env = diffsim.make(name, num_envs=num_envs, seed=0, device=args.device)
+        scene, steps = env.scene, num_envs * horizon
+        numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
+        if 4 * numbers * steps * default.substeps > MAX_MEMORY:
+            continue
+        options = dict[str, Any](device=args.device, threads=THREADS.get(technique))
+        options["division"] = divide(scene) if "one thread" in technique else None
+        sim = Simulator(scene, num_envs, default, horizon=horizon, **options)
+        actions = (torch.rand(horizon, num_envs, sim.nu, device=env.device) * 2 - 1).requires_grad_()
+        calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]
+        captured = [graph.capture(call, env.device) if "graph" in technique else call for call in calls]
+        one_way, both = (min(timed(call, env.device, warmup=3, calls=4)) for call in captured)
+        passes = {"forward": one_way, "backward": both - one_way}
+        row = {"task": name, "environments": num_envs, "horizon": horizon, "technique": technique}
+        row |= {f"{way} (us/substep of all)": 1e6 * s / horizon / default.substeps for way, s in passes.items()}
+        row["differentiated control steps/s"] = steps / both
+        yield row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if cuda else ""}
 
 
 def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     """Microseconds of one differentiated control step of one environment, against environments and horizon."""
-    panels, unit = list[Panel](), "us per control step, forward + backward"
+    panels, unit, speed = list[Panel](), "us per control step, forward + backward", "differentiated control steps/s"
     for x, fixed, value in (("environments", "horizon", "32"), ("horizon", "environments", "64")):
-        points = [
-            {**row, unit: str(1e6 / float(row["differentiated control steps/s"]))}
-            | {"curve": f"{row['task']}, {row['technique']}"}
-            for row in rows
-            if row[fixed] == value
-        ]
+        own = [row for row in rows if row[fixed] == value]
+        points = [{x: r[x], unit: str(1e6 / float(r[speed])), "curve": f"{r['task']}, {r['technique']}"} for r in own]
         panels.append(Panel(lines(points, x, unit, "curve"), "", f"{x} ({fixed} {value})", unit, "xy"))
     plot(args.picture("speed"), [panels], (4.5, 3.6))
 
@@ -332,11 +318,9 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
             progress = read_csv(run / "warm" / "progress.csv")[3:]
             num_envs = json.loads((run / "warm" / "args.json").read_text())["num_envs"]
         critic = [1e3 * float(row["time_update_critic"]) for row in progress if "time_update_critic" in row]
-        yield {
-            "task": name,
-            "environments": num_envs,
-            "device": technique,
-            "script": " ".join((args.script, *args.arguments)),
+        row = {"task": name, "environments": num_envs, "device": technique}
+        row["script"] = " ".join((args.script, *args.arguments))
+        yield row | {
             "iteration (ms)": 1e3 * median(float(row["time_total"]) for row in progress),
             "critic": median(critic) if critic else "",
             "start to first iteration (s)": warm,

@@ -195,17 +195,16 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
 
 
 def summary(rows: list[dict[str, str]]) -> list[Row]:
-    """One line for each task and sweep: of each integrator the first value that is not finite or not bounded."""
+    """A line for each task and sweep in which an integrator failed: of each the first value not finite or bounded."""
     lines = list[Row]()
     for (task, sweep), group in grouped(rows, "task", "sweep").items():
-        line = {"task": task, "sweep": sweep, "range": f"{group[0]['value']} .. {group[-1]['value']}"}
-        for integrator in INTEGRATORS:
-            own = [row for row in group if row["integrator"] == integrator]
-            failed = [row for row in own if "False" in (row["finite"], row["energy bounded"])]
-            line[integrator] = "-" if own else "not measured"
-            for row in failed[:1]:
-                line[integrator] = f"{row['value']} ({'energy' if row['finite'] == 'True' else 'not finite'})"
-        lines.append(line | {"largest gradient": max(numbers(group, "gradient"))})
+        failed: dict[str, str] = dict.fromkeys(INTEGRATORS, "-")
+        for row in reversed(group):
+            if "False" in (row["finite"], row["energy bounded"]):
+                how = "energy" if row["finite"] == "True" else "not finite"
+                failed[row["integrator"]] = f"{row['value']} ({how})"
+        if {*failed.values()} != {"-"}:
+            lines.append({"task": task, "sweep": sweep, **failed})
     return lines
 
 
