@@ -57,7 +57,7 @@ SPREADS = (1.0, 3.0, 10.0, 30.0, 0.0)  # the last one is of eta = 1
 COUNT = 20  # trajectories of guides, and perturbed starts and pushes of each size
 WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
 SHOWN = (1, 10, 50, 500)  # of them in the page
-STARTS, PUSHES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), (0.5, 1.0, 2.0)
+KINDS = {"start": (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), "push": (0.5, 1.0, 2.0)}  # perturbations and their sizes
 DRAWN = [*VARIANTS, "full", "paper", "adaptive", "feedback", "feedback-short", "feedback-long"]
 COLOURS = [*(f"C{i}" for i in range(10)), "k", "m", "y"]
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
@@ -201,8 +201,7 @@ def generalisation(search: gps.Search, count: int = COUNT) -> list[Row]:
     draws = torch.randn(count, system.nd, generator=torch.Generator().manual_seed(gps.SEED), dtype=REAL)
     kick = torch.zeros_like(draws)
     kick[:, system.nv] = draws[:, 0].sign()
-    cases = [("start", size) for size in STARTS] + [("push", size) for size in PUSHES]
-    for kind, size in cases:
+    for kind, size in ((kind, size) for kind, sizes in KINDS.items() for size in sizes):
         start, push = path[:1].expand(count, -1), None
         if kind == "start":
             start = system.retract(start, size * spread * draws)
@@ -264,10 +263,6 @@ def temperatures(env: str) -> Iterator[Row]:
 # Table and pictures ---------------------------------------------------------------------------------------------------
 
 
-def number(text: str) -> float:
-    return float(text or "nan")
-
-
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
     found: dict[str, list[Row]] = {"gps_runs": [], "gps_generalisation": [], "gps_weights": []}
@@ -300,10 +295,10 @@ def table(runs: Runs) -> list[Row]:
         ends = [[row["eval_objective"] for row in rows if row["eval_objective"]] for rows in seeds]
         guides, pretrained = (mean(numbers([rows[0] for rows in seeds], f"gps_{c}")) for c in ("guides", "objective"))
         iterations = sorted({int(rows[-1]["iteration"]) for rows in seeds})
-        line: Row = {"task": env, "case": case, "T": own[0]["horizon"], "guides": f"{guides:.1f}"}
-        line = {**line, "pretrained": f"{pretrained:.0f}"}
-        line = {**line, "end, each seed": ", ".join(f"{float(each[-1]):.1f}" if each else "-" for each in ends)}
-        result.append({**line, "iterations": "-".join(map(str, iterations[:: len(iterations) - 1 or 1]))})
+        line = {"task": env, "case": case, "T": own[0]["horizon"], "guides": f"{guides:.1f}"}
+        line |= {"pretrained": f"{pretrained:.0f}"}
+        line |= {"end, each seed": ", ".join(f"{float(each[-1]):.1f}" if each else "-" for each in ends)}
+        result.append(line | {"iterations": "-".join(map(str, iterations[:: len(iterations) - 1 or 1]))})
     return result
 
 
@@ -312,10 +307,10 @@ def shown(rows: Runs) -> list[Row]:
     result = list[Row]()
     for (env, case), own in grouped(rows, "env", "variant").items():
         steps = {int(float(step)): seeds for (step,), seeds in grouped(own, "step").items()}
-        cells = {
-            f"t = {t}": [middle(steps[t], name, ".0f") for name in ("guides", "effective")] for t in SHOWN if t in steps
-        }
-        result.append({"task": env, "case": case, **{name: " / ".join(cell) for name, cell in cells.items()}})
+        line = {"task": env, "case": case}
+        for t in (t for t in SHOWN if t in steps):
+            line[f"t = {t}"] = " / ".join(middle(steps[t], name, ".0f") for name in ("guides", "effective"))
+        result.append(line)
     return result
 
 
@@ -324,8 +319,8 @@ def spreads(rows: Runs) -> list[Row]:
     result = list[Row]()
     for (env,), own in grouped(rows, "env").items():
         cells = {f"spread {row['spread']}" if row["spread"] != "0" else "η = 1": row for row in own}
-        shares = {name: f"{number(row['median']):.0f} ({number(row['kept']):.0%})" for name, row in cells.items()}
-        result.append({"task": env, "plan": f"{number(own[0]['plan']):.0f}", **shares})
+        shares = {name: f"{float(row['median']):.0f} ({float(row['kept']):.0%})" for name, row in cells.items()}
+        result.append({"task": env, "plan": f"{float(own[0]['plan']):.0f}", **shares})
     return result
 
 
@@ -334,11 +329,11 @@ def variants(rows: Runs, env: str) -> Panel:
     lines = list[Line]()
     for case, colour in zip(DRAWN, COLOURS, strict=False):
         seeds = grouped((row for row in rows if (row["env"], row["variant"]) == (env, case)), "seed").values()
-        costs = [[-number(row["gps_objective"]) for row in own] for own in seeds]
+        costs = [[-value for value in numbers(own, "gps_objective")] for own in seeds]
+        middles = [median(values) for values in zip(*costs, strict=False)]
         lines += [Line(range(len(cost)), cost, f"{colour}-", width=0.4) for cost in costs]
-        median_cost = [median(values) for values in zip(*costs, strict=False)]
-        lines.append(Line(range(len(median_cost)), median_cost, f"{colour}-", case, 2.0))
-        lines += [Line((0, len(median_cost)), [-number(own[0]["gps_guides"])] * 2, "0.6", width=0.8) for own in seeds]
+        lines.append(Line(range(len(middles)), middles, f"{colour}-", case, 2.0))
+        lines += [Line((0, len(middles)), [-numbers(own, "gps_guides")[0]] * 2, "0.6", width=0.8) for own in seeds]
     return Panel(lines, env, "iteration", "cost of the proposal", log="y")
 
 
@@ -380,11 +375,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     args.publish("gps temperatures", markdown(spreads(args.read("gps_temperatures"))), "gps.md")
     drawn = [env for env in SUITE if any(row["env"] == env for row in runs)]
     plot(args.picture("gps_variants"), [[variants(runs, env) for env in drawn]])
-    groups = grouped(args.read("gps_generalisation"), "kind", "env", "variant")
-    grid = [
-        [kept(rows, f"{env}, {case}", kind) for (own, env, case), rows in groups.items() if own == kind]
-        for kind in ("start", "push")
-    ]
+    groups = grouped(args.read("gps_generalisation"), "kind", "env", "variant").items()
+    grid = [[kept(rows, f"{env}, {case}", kind) for (kind, env, case), rows in groups if kind == k] for k in KINDS]
     plot(args.picture("gps_generalisation"), grid)
 
 

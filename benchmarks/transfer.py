@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
+from typing import NamedTuple
 
 import common
 import mujoco
@@ -100,15 +101,10 @@ def mujoco_model(scene: Scene, control_dt: float, substeps: int | None = None) -
 
 
 class MuJoCo:
-    """N robots in MuJoCo with its own contact and limits on a scene's file.
+    """N robots in MuJoCo with its own contact and limits on a scene's file, of whose friction `friction` is a factor.
 
-    Args:
-        scene: its file is read again, whose mu is the friction of all geoms, whatever the scene's own is.
-        num_envs: number of robots N.
-        control_dt: s of a control step.
-        friction: factor on that friction.
-        own_friction: each geom keeps the friction that the file gives it, in place of the springs' mu.
-        substeps: see mujoco_model.
+    That is the springs' mu of the file, whatever the scene's own is, or with own_friction what each geom has there. Of
+    substeps see mujoco_model.
     """
 
     def __init__(
@@ -167,23 +163,14 @@ def load(path: Path, args: Args) -> Case:
     return case
 
 
-@dataclass
-class Motion:
-    """The first episode of each of n robots in one world.
+class Motion(NamedTuple):
+    """The first episode of each of n robots in one world."""
 
-    Attributes:
-        qpos: (T + 1, n, nq) from the start on; valid up to an episode's length.
-        qvel: (T + 1, n, nv).
-        returns: (n,).
-        lengths: (n,) control steps.
-        fallen: (n,) whether the episode ended with a fall.
-    """
-
-    qpos: Array
-    qvel: Array
-    returns: Array
-    lengths: np.ndarray
-    fallen: Flags
+    qpos: Array  # (T + 1, n, nq) from the start on; valid up to an episode's length
+    qvel: Array  # (T + 1, n, nv)
+    returns: Array  # (n,)
+    lengths: np.ndarray  # (n,) control steps
+    fallen: Flags  # (n,) whether the episode ended with a fall
 
 
 @torch.no_grad()
@@ -192,9 +179,7 @@ def act(
 ) -> Motion:
     """Episodes of at most so many steps in a world, from qpos (n, nq) and qvel (n, nv).
 
-    Args:
-        task: in float64, on the CPU; says what is observed and rewarded, and who has fallen.
-        policy: observations (n, obs_dim) in float32 -> actions (n, nu).
+    The task, in float64 on the CPU, says what is observed and rewarded, and who has fallen.
     """
     n = len(qpos)
     alive, fallen, returns, lengths = np.ones(n, bool), np.zeros(n, bool), np.zeros(n), np.zeros(n, int)
