@@ -16,26 +16,26 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import tables
 import torch
 import tyro
-from common import OUTPUT, RESULTS
+from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import SceneError, Simulator, load_scene
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
-from diffsim.training import command, fail
+from diffsim.training import fail
 
 STEP = 2.0**-10  # s: no acceleration reaches the speed at which a simulator contains a state
 
 
 @dataclass
-class Args:
-    folder: tyro.conf.Positional[Path]  # where the files are
+class Args(CommonFlags):
+    folder: tyro.conf.Positional[Path] = Path()  # where the files are
     pattern: str = "*/scene*.xml"  # which of its files
     name: str = ""  # of the collection (default: the folder's)
     states: int = 200  # random states of each robot whose accelerations are compared; 0 for none
-    update_results: bool = False  # write results/cpu/foreign.csv instead of runs/benchmarks/cpu/foreign.csv
+    env: tyro.conf.Suppress[Tasks] = TASKS
+    draw_only: tyro.conf.Suppress[bool] = False  # there is nothing to draw
 
 
 def load(path: Path) -> tuple[Scene | None, str]:
@@ -82,10 +82,7 @@ def difference(scene: Scene, count: int) -> float:
     return float(np.max(errors)) if not sim.nonfinite.any() else np.inf  # nan if one is
 
 
-@command
-def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
-    csv = (RESULTS if args.update_results else OUTPUT) / "cpu" / "foreign.csv"
+def main(args: Args) -> None:
     name, folder = args.name or args.folder.name, args.folder.resolve()  # meshes may lie beside the folder
     scenes = {path: load(path) for path in sorted(folder.glob(args.pattern))}
     if not scenes:
@@ -95,10 +92,9 @@ def main() -> None:
         if scene:
             row |= {"nq": scene.nq, "nv": scene.nv, "nu": scene.nu, "contact points": scene.ncontact}
             row["relative error of qacc"] = difference(scene, args.states) if args.states else ""
-        print(*(f"{key} {tables.digits(value)}" for key, value in row.items() if value != ""), sep=", ", flush=True)
-        tables.merge_csv(csv, [row], ("collection", "file"))
-    print(f"{sum(scene is not None for scene, _ in scenes.values())} of {len(scenes)} load: {csv}")
+        args.keep("foreign", row, ("collection", "file"))
+    print(f"{sum(scene is not None for scene, _ in scenes.values())} of {len(scenes)} load: {args.csv('foreign')}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main, Args, __doc__)

@@ -48,11 +48,7 @@ from diffsim.training import parse as parse_script
 from diffsim.training.evaluation import make_env
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
-KernelName = Literal["blocks", "scalar"]
-KERNELS: dict[KernelName, dict[str, Any]] = {
-    "blocks": {},  # on a CPU in vectors of environments
-    "scalar": {"block": 1},
-}
+KernelName = Literal["blocks", "scalar"]  # on a CPU in vectors of environments, or one environment at a time
 THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
 PartName = Literal["physics", "scaling", "training", "time"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; the scaling table leaves out larger settings
@@ -183,7 +179,8 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
         reference = "", "", "mj_step"
         competitors = {reference: mujoco_timer(whole, num_envs, task.control_dt / default.substeps, default.substeps)}
         for (scene_name, scene), kernel, (place, count) in product(scenes.items(), kernels, threads.items()):
-            sim = Simulator(scene, num_envs, default, threads=count, **options, **KERNELS[kernel])
+            block = {"block": 1} if kernel == "scalar" else {}
+            sim = Simulator(scene, num_envs, default, threads=count, **options, **block)
             competitors[scene_name, kernel, place] = timer(sim)
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
         per_substep = num_envs * default.substeps
