@@ -15,7 +15,7 @@ from tables import ROOT
 from torch import Tensor, nn
 
 import diffsim
-from diffsim import Integration, Scene, Simulator
+from diffsim import Integration, Simulator
 from diffsim.training import Count, load_policy, parse
 
 sys.path.append(str(ROOT))
@@ -85,11 +85,6 @@ def visited_states(name: str, policy: nn.Module, count: int) -> tuple[Tensor, Te
             obs = env.step(policy(obs.double()).float())[0]
         qpos[first::4], qvel[first::4] = env.qpos[first::4].double(), env.qvel[first::4].double()
     return qpos, qvel
-
-
-def idle(scene: Scene) -> Tensor:
-    """(nu,) the control without any force: 0 of a motor, -1 of a muscle."""
-    return torch.where(torch.tensor(scene.motor_link) > 0, 0.0, -1.0).double()
 
 
 @torch.no_grad()

@@ -137,7 +137,8 @@ def bounded(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> 
 def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, Tensor, Tensor, Tensor]:
     """Scene, MuJoCo's model, qpos, qvel and actions of one extreme."""
     scene, model, qpos, qvel = case.scene, case.model, case.qpos.clone(), case.qvel.clone()
-    actions = motions.idle(scene).expand(60, case.n, scene.nu)
+    idle = torch.where(torch.tensor(scene.motor_link) > 0, 0.0, -1.0).double()  # without force: of a motor, of a muscle
+    actions = idle.expand(60, case.n, scene.nu)
     height = 2 if scene.floating else 1  # in qpos; the planar robots' second slide
     lowest = torch.tensor(-gait.trace(scene, qpos.numpy()).depth.max(1)) if scene.ncontact else 0.0
     if sweep in CONSTANTS:
