@@ -15,11 +15,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import motions
@@ -251,10 +249,8 @@ def chain(links: int) -> Scene:
     """A fixed chain of capsules of 0.2 m on parallel hinges, without damping and contact."""
     link = '<joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.04" contype="0" conaffinity="0"/>'
     bodies = "".join(f'<body pos="{0.2 * (k > 0)} 0 0">{link}' for k in range(links)) + links * "</body>"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "chain.xml"
-        path.write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-        return diffsim.load_scene(path)
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    return diffsim.load_scene(model)
 
 
 def measure_energy(args: Args, links: int) -> Iterator[Row]:

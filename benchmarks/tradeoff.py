@@ -14,6 +14,7 @@ import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal
 
 import motions
@@ -37,10 +38,7 @@ PANELS = {
 }
 ERRORS = ("state 0.5 s", "gradient 8", "gradient 32", "cosine 32", "policy")
 COLOURS = {kind: f"C{k}" for k, kind in enumerate(INTEGRATORS)}
-
-
 Precision = Literal["float32", "float64"]
-DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "float64": torch.float64}
 
 
 @dataclass
@@ -81,22 +79,22 @@ class Reference(motions.Case):
         env = diffsim.make(self.task.name, 64, "cpu", None, 1, *how)
         return evaluate(env, copy.deepcopy(self.policy).float()).returns.median().item()
 
-    def errors(self, setting: Integration, dtype: Precision) -> Iterator[tuple[str, object]]:
+    def errors(self, setting: Integration, dtype: torch.dtype) -> Iterator[tuple[str, object]]:
         """What a setting of the simulator makes of the same motion."""
-        sim = Simulator(self.scene, self.n, setting, dtype=DTYPES[dtype])
+        sim = Simulator(self.scene, self.n, setting, dtype=dtype)
         path, _, bad = replay(sim, self.qpos, self.qvel, self.actions)
         away, errors = np.zeros(self.scene.nv), list[float]()
         for found, expected in zip(path[30].numpy(), self.state.numpy(), strict=True):
             mujoco.mj_differentiatePos(self.scene.mj_model, away, 1.0, expected, found)
             errors.append(np.sqrt(np.mean(away**2)))
         yield "state 0.5 s", float(np.median(errors))
-        for h, gradient in self.reward_gradients(setting, DTYPES[dtype]).items():
+        for h, gradient in self.reward_gradients(setting, dtype).items():
             wanted = self.gradients[h]
             size, norm = (np.linalg.norm(x, axis=1) for x in (gradient, wanted))
             yield f"cosine {h}", float(np.median((gradient * wanted).sum(1) / np.maximum(size * norm, 1e-300)))
             yield f"gradient {h}", float(np.median(np.linalg.norm(gradient - wanted, axis=1) / norm))
         yield "not finite", bad
-        if dtype == "float32":
+        if dtype == torch.float32:
             value = self.policy_return(setting)
             yield "policy", value / self.best if self.best > 0 else self.best / value
 
@@ -109,17 +107,15 @@ def measure(args: Args, name: TaskName) -> Iterator[Row]:
         qpos, qvel = motions.visited_states(name, reference.policy, args.num_envs)
         nothing = torch.zeros(args.num_envs, reference.scene.nu, dtype=torch.float64)
         state = qpos, qvel, reference.policy(reference.task.observe(qpos, qvel, nothing))
-    wanted = [integration(kind, n) for kind in INTEGRATORS for n in counts if kind != "extrapolated" or n % 2 == 0]
-    for setting in wanted:
-        for dtype in args.dtype:
-            threads = 1 if args.device == "cpu" else None
-            options = dict[str, Any](dtype=DTYPES[dtype], device=args.device, threads=threads)
-            sim = Simulator(reference.scene, args.num_envs, setting, **options)
-            t = race({0: timer(sim)}, [state, state], repeats=31)[0]
-            row = {"task": name, "simulator": motions.label(setting), "substeps": setting.substeps}
-            row |= {"precision": dtype, "device": args.device}
-            row |= {f"{kind} (us)": t[kind] / args.num_envs for kind in ("forward", "backward")}
-            yield row | dict(reference.errors(setting, dtype))
+    kinds = [(kind, n) for kind in INTEGRATORS for n in counts if kind != "extrapolated" or n % 2 == 0]
+    for (kind, n), precision in product(kinds, args.dtype):
+        setting, dtype = integration(kind, n), getattr(torch, precision)
+        options = dict[str, Any](dtype=dtype, device=args.device, threads=1 if args.device == "cpu" else None)
+        sim = Simulator(reference.scene, args.num_envs, setting, **options)
+        t = race({0: timer(sim)}, [state, state], repeats=31)[0]
+        row: dict[str, object] = {"task": name, "simulator": kind, "substeps": n, "precision": precision}
+        row |= {"device": args.device} | {f"{way} (us)": t[way] / args.num_envs for way in ("forward", "backward")}
+        yield row | dict(reference.errors(setting, dtype))
 
 
 def number(row: dict[str, str], column: str) -> float:
