@@ -69,13 +69,9 @@ class State(NamedTuple):
 
 
 class Walkers:
-    """Robots under their policy, which forces may push. Nothing is reset: what has fallen lies there.
+    """Robots under their policy, which forces may push at a body. Nothing is reset: what has fallen lies there.
 
-    Args:
-        env: the policy's environment, whose simulator's settings are taken over.
-        policy: observations (n, obs_dim) -> actions (n, nu).
-        body: MuJoCo's number of the pushed body.
-        state: where they begin.
+    Of env the task and the simulator's settings are taken over.
     """
 
     def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int, state: State) -> None:

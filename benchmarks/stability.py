@@ -103,6 +103,12 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
         yield row | {"largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
 
 
+def fewest_substeps(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each task, a column for each integrator."""
+    groups = grouped(rows, "task", "default").items()
+    return [{"task": t, "default": n} | {r["integrator"]: r["fewest substeps"] for r in own} for (t, n), own in groups]
+
+
 def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple[float, int]:
     """Largest over environments of |d sum(qpos after 8 control steps) / d qvel|, and number of adjoints not finite."""
     before, leaf = int(sim.nonfinite_gradients.sum()), qvel.to(sim.dtype).requires_grad_()
@@ -293,7 +299,7 @@ def draw(args: Args, rows: list[dict[str, str]]) -> None:
 
 PAGE = "stability.md"
 PARTS: dict[PartName, Part] = {
-    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE),
+    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE, fewest_substeps),
     "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, summary),
     "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon")),
     "long": Part("stability_long", measure_long, ("task",), "long", PAGE),
