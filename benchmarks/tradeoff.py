@@ -24,7 +24,7 @@ import torch
 from common import TASKS, Line, Panel, Part, TaskName, measured, plot, run
 from motions import INTEGRATORS, Array, Integration, PolicyFlags, integration, replay
 from speed import race, timer
-from tables import Row, markdown
+from tables import Row, digits, markdown
 
 import diffsim
 from diffsim import Simulator
@@ -159,7 +159,7 @@ def presets(rows: list[dict[str, str]]) -> Iterator[Row]:
         for accuracy, row in own.items():
             if row.get("state 0.5 s") and own["default"].get("state 0.5 s"):
                 line = {"task": name, "--accuracy": accuracy, "integrator": row["simulator"]}
-                line |= {"substeps": row["substeps"], "us": f"{cost(row):.3g}"}
+                line |= {"substeps": row["substeps"], "us": digits(cost(row))}
                 yield line | {"speed": f"{cost(own['default']) / cost(row):.2f}"} | {c: row[c] for c in ERRORS}
 
 
