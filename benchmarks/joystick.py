@@ -48,11 +48,7 @@ class Args(common.CheckpointFlags):
 
 
 class Robot:
-    """A robot in MuJoCo, driven as the task's.
-
-    Raises:
-        ValueError: the file lacks a joint or its actuator.
-    """
+    """A robot in MuJoCo, driven as the task's; a file that lacks a joint or its actuator ends the benchmark."""
 
     def __init__(self, case: Case, file: Path | None, friction: float) -> None:
         self.task, own = case.env.task, case.env.scene.mj_model
@@ -60,15 +56,13 @@ class Robot:
         m.geom_friction[:, 0] *= friction
         m.pair_friction[:, :2] *= friction
         names = [own.joint(j).name for j in range(1, own.njnt)]
-        try:
-            joints = np.array([m.joint(name).id for name in names])
-        except KeyError as error:
-            raise ValueError(f"{file}: {error}") from error
-        actuator = {int(m.actuator_trnid[a, 0]): a for a in range(m.nu)}
-        if missing := [name for name, j in zip(names, joints, strict=True) if j not in actuator]:
-            raise ValueError(f"{file}: no actuator of {', '.join(missing)}")
+        at_joints = np.flatnonzero(m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        actuator = {m.joint(m.actuator_trnid[a, 0]).name: a for a in at_joints}
+        if missing := [name for name in names if name not in actuator]:
+            fail(f"{file}: no actuator of the joints {', '.join(missing)}")
+        joints = np.array([m.joint(name).id for name in names])
+        self.ctrl = np.array([actuator[name] for name in names])
         self.qpos, self.qvel = m.jnt_qposadr[joints], m.jnt_dofadr[joints]
-        self.ctrl = np.array([actuator[j] for j in joints])
         self.servo = m.actuator_biastype[self.ctrl] == mujoco.mjtBias.mjBIAS_AFFINE
         order = [own.actuator_trnid[:, 0].tolist().index(j) for j in range(1, own.njnt)]
         low, high = own.actuator_ctrlrange[order].T
@@ -147,11 +141,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     if not isinstance(case.env.task, Joystick):
         fail(f"{path} was trained on {case.env.task.name}, which follows no command")
     for friction in args.friction:
-        try:
-            robot = Robot(case, args.file, friction)
-        except ValueError as error:
-            fail(error)
-        velocities, fallen = follow(case, robot, args)
+        velocities, fallen = follow(case, Robot(case, args.file, friction), args)
         found = errors(velocities, round(1 / case.env.task.control_dt))
         row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
         row |= {"error": found[:, 0].mean(), "worst error": found[:, 0].max(), "yaw error": found[:, 1].mean()}
