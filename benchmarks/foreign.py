@@ -16,29 +16,26 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import tables
 import torch
 import tyro
-from common import OUTPUT, RESULTS
+from common import TASKS, CommonFlags, Tasks, run
 
 from diffsim import SceneError, Simulator, load_scene
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
-from diffsim.training import command, fail
+from diffsim.training import fail
 
 STEP = 2.0**-10  # s: no acceleration reaches the speed at which a simulator contains a state
 
 
 @dataclass
-class Args:
-    """Which files, and how many states of each robot."""
-
-    folder: tyro.conf.Positional[Path]  # where the files are
+class Args(CommonFlags):
+    folder: tyro.conf.Positional[Path] = Path()  # where the files are
     pattern: str = "*/scene*.xml"  # which of its files
     name: str = ""  # of the collection (default: the folder's)
     states: int = 200  # random states of each robot whose accelerations are compared; 0 for none
-    seed: int = 1  # of the states
-    update_results: bool = False  # write results/cpu/foreign.csv instead of runs/benchmarks/cpu/foreign.csv
+    env: tyro.conf.Suppress[Tasks] = TASKS
+    draw_only: tyro.conf.Suppress[bool] = False  # there is nothing to draw
 
 
 def load(path: Path) -> tuple[Scene | None, str]:
@@ -65,12 +62,12 @@ def random_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[n
     return qpos, rng.normal(size=(count, m.nv)), rng.uniform(-1, 1, (count, m.nu))
 
 
-def difference(scene: Scene, count: int, seed: int) -> float:
+def difference(scene: Scene, count: int) -> float:
     """Largest error of an acceleration, relative to the largest one of its state."""
     m = copy.copy(scene.mj_model)
     m.dof_frictionloss[:] = 0
     m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    states = random_states(scene, count, np.random.default_rng(seed))
+    states = random_states(scene, count, np.random.default_rng(1))
     scene = dataclasses.replace(scene, mj_model=m, ground_height=-1e3)
     sim = Simulator(scene, count, Integration(substeps=1), control_dt=STEP, dtype=torch.float64)
     qpos, qvel, ctrl = (torch.tensor(x) for x in states)
@@ -85,10 +82,7 @@ def difference(scene: Scene, count: int, seed: int) -> float:
     return float(np.max(errors)) if not sim.nonfinite.any() else np.inf  # nan if one is
 
 
-@command
-def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
-    csv = (RESULTS if args.update_results else OUTPUT) / "cpu" / "foreign.csv"
+def main(args: Args) -> None:
     name, folder = args.name or args.folder.name, args.folder.resolve()  # meshes may lie beside the folder
     scenes = {path: load(path) for path in sorted(folder.glob(args.pattern))}
     if not scenes:
@@ -97,11 +91,10 @@ def main() -> None:
         row: dict[str, object] = {"collection": name, "file": path.relative_to(folder).as_posix(), "refused": why}
         if scene:
             row |= {"nq": scene.nq, "nv": scene.nv, "nu": scene.nu, "contact points": scene.ncontact}
-            row["relative error of qacc"] = difference(scene, args.states, args.seed) if args.states else ""
-        print(*(f"{key} {tables.digits(value)}" for key, value in row.items() if value != ""), sep=", ", flush=True)
-        tables.merge_csv(csv, [row], ("collection", "file"))
-    print(f"{sum(scene is not None for scene, _ in scenes.values())} of {len(scenes)} load: {csv}")
+            row["relative error of qacc"] = difference(scene, args.states) if args.states else ""
+        args.keep("foreign", row, ("collection", "file"))
+    print(f"{sum(scene is not None for scene, _ in scenes.values())} of {len(scenes)} load: {args.csv('foreign')}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main, Args, __doc__)

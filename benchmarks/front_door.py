@@ -49,18 +49,21 @@ def measure(torch: str, folder: Path) -> list[Row]:
     clean |= {"WARP_CACHE_PATH": str(folder / "kernels"), "UV_CACHE_DIR": str(folder / "cache")}
     python, rows = str(folder / "env" / "bin" / "python"), list[Row]()
 
+    def tell(part: str, own: bool, **seconds: float) -> None:
+        cells = {name.replace("_", " "): value for name, value in seconds.items()}
+        rows.append({"part": part, "own": own} | cells | {"load": os.getloadavg()[0]})
+        print(rows[-1], flush=True)
+
     def timed(part: str, own: bool, *command: str) -> None:
         start, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
         out = subprocess.run(command, cwd=folder, env=clean, check=True, stdout=subprocess.PIPE, text=True).stdout
         end, now = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
         for line in out.splitlines():
             if line.startswith("first frame"):
-                clock, used_cpu = map(float, line.split()[2:])
-                first = {"part": f"{part}: first frame", "own": own, "seconds": clock - start, "cpu seconds": used_cpu}
-                rows.append(first | {"load": os.getloadavg()[0]})
-        rows.append({"part": part, "own": own, "seconds": end - start, "cpu seconds": cpu, "load": os.getloadavg()[0]})
-        print(rows[-1], flush=True)
+                clock, cpu = map(float, line.split()[2:])
+                tell(f"{part}: first frame", own, seconds=clock - start, cpu_seconds=cpu)
+        cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
+        tell(part, own, seconds=end - start, cpu_seconds=cpu)
 
     subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT], check=True)
     install = "uv", "pip", "install", "-q", "--python", python
@@ -76,14 +79,7 @@ def measure(torch: str, folder: Path) -> list[Row]:
         address = driven.stdout.readline().split()[0]
         with urlopen(f"{address}/stream") as stream:
             stream.read(2000)
-        rows.append(
-            {
-                "part": "drive ant: first picture",
-                "own": True,
-                "seconds": time.monotonic() - start,
-                "load": os.getloadavg()[0],
-            }
-        )
+        tell("drive ant: first picture", True, seconds=time.monotonic() - start)
         driven.terminate()
     return rows
 

@@ -15,8 +15,9 @@ from pathlib import Path
 from statistics import mean
 
 import torch
-from common import CheckpointFlags, Part, checkpoint_of, measured, run
-from gps_experiments import CONTROLLERS, RUN, Act, controllers, environment, grouped, load_search
+from common import CheckpointFlags, Part, measured, run
+from gps_experiments import CONTROLLERS, RUN, Act, controllers, load_run, scalars
+from groups import grouped
 from tables import Row
 from torch import Tensor
 
@@ -53,9 +54,8 @@ def noisy(act: Act, noise: Tensor) -> Act:
 
 def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:
     """One row for each case, size and controller."""
-    path = checkpoint_of(path)
-    about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
-    level, policy, guide = System(env, 1), search.network, search.guides[0]
+    about, search = load_run(path)
+    level, policy, guide = System(search.env, 1), search.network, search.guides[0]
     T = min(round(SECONDS / level.control_dt), search.args.horizon)
     rng = torch.Generator().manual_seed(gps.SEED)
     noise = policy.sigma * torch.randn(COUNT, T, level.nu, generator=rng, dtype=REAL)
@@ -64,15 +64,15 @@ def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:
         system, start, rough = level, guide.x[:1].expand(COUNT, -1), case.startswith("rough")
         if rough:
             names = [f"rough:{size:g}:{case.split()[1]}:{seed}" for seed in SEEDS]
-            system, start = System(env, 1, named_terrains(*names)), start[: len(SEEDS)]
+            system, start = System(search.env, 1, named_terrains(*names)), start[: len(SEEDS)]
         elif case == "perturbed start":
             start = level.retract(start, size * away)
         for name, act in controllers(search).items():
             x, _, finite = system.rollout(start, T, noisy(act, noise) if case == "policy's noise" else act)
             steps, speed = until_fall(system, x, finite)
             numbers = dict(whole=steps == T, seconds=steps * level.control_dt, speed=speed)
-            means = {key: value.double().mean().item() for key, value in numbers.items()}
-            yield about | dict(case=case, size=size, controller=name, trajectories=len(x)) | means
+            row = about | dict(case=case, size=size, controller=name, trajectories=len(x))
+            yield row | scalars(**{key: value.double().mean() for key, value in numbers.items()})
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:

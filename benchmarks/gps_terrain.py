@@ -17,8 +17,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 
-from common import CheckpointFlags, Part, checkpoint_of, measured, run
-from gps_experiments import RUN, controllers, environment, load_search
+from common import CheckpointFlags, Part, measured, run
+from gps_experiments import RUN, controllers, keeps, load_run, scalars
+from groups import grouped, numbers
 from tables import Row
 from torch import Tensor
 
@@ -66,39 +67,37 @@ def until_fall(x: Tensor, height: int) -> tuple[Tensor, Tensor]:
 
 def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:
     """One row for each terrain, size and controller."""
-    path = checkpoint_of(path)
-    about, search, env = dict(zip(RUN, path.parent.name.split("__"), strict=True)), load_search(path), environment(path)
+    about, search = load_run(path)
     steps, height, guides = search.args.horizon, 2 if search.system.scene.floating else 1, search.guide_return[0]
     way = mean((guide.x[-1, 0] - guide.x[0, 0]).item() for guide in search.guides)
     start = search.guides[0].x[:1].expand(len(PLACES), -1)
     for terrain, size in ((terrain, size) for terrain, sizes in SIZES.items() for size in sizes):
-        system = System(env, 1, named_terrains(*names(terrain, size)))
+        system = System(search.env, 1, named_terrains(*names(terrain, size)))
         for name, act in controllers(search).items():
             x, u, finite = system.rollout(start, steps, act)
             returns, (up, distance) = search.measure(x, u, finite).returns, until_fall(x, height)
             standing = up & finite.all(-1)
-            kept, walked = returns >= guides - 0.25 * abs(guides), distance >= FAR * way
+            kept, walked = keeps(returns, guides), distance >= FAR * way
             shares = dict(kept=kept & standing, walked=walked & standing, standing=standing, distance=distance)
-            means = {key: value.double().mean().item() for key, value in shares.items()}
-            row = about | dict(T=steps, terrain=terrain, size=size, controller=name) | means
-            yield row | dict(median_return=returns.median().item(), guides=guides)
+            row = about | dict(T=steps, terrain=terrain, size=size, controller=name)
+            row |= scalars(**{key: value.double().mean() for key, value in shares.items()})
+            yield row | scalars(median_return=returns.median(), guides=guides)
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A row for each terrain, a column for the walkers trained on each ground, and two for the last one's guides."""
-    rows = [row for row in rows if row["env"] == "walker"]
-    cases = [case for case in GROUNDS if any(row["variant"] == case for row in rows)]
-    columns = {GROUNDS[case]: (case, "policy") for case in cases}
-    columns |= {name.upper(): (cases[-1], name) for name in ("ddp", "tbdp") if cases}
+    walkers = grouped((row for row in rows if row["env"] == "walker"), "variant", "controller")
+    cases = [case for case in GROUNDS if (case, "policy") in walkers]
+    columns = {GROUNDS[case]: walkers[case, "policy"] for case in cases}
+    columns |= {name.upper(): walkers.get((cases[-1], name), []) for name in ("ddp", "tbdp") if cases}
     shown = [(terrain, [size]) for terrain, sizes in SIZES.items() for size in sizes if size not in HIDDEN]
     result = list[Row]()
     for terrain, sizes in [*shown, ("all", [])]:
-        row: dict[str, object] = {"terrain": terrain, "size": f"{sizes[0]:g}" if sizes else ""}
-        for column, key in columns.items():
-            own = [r for r in rows if (r["variant"], r["controller"]) == key]
-            own = [r for r in own if not sizes or (r["terrain"] == terrain and float(r["size"]) in sizes)]
-            row[column] = f"{100 * mean(float(r['walked']) for r in own):.0f}" if own else ""
-        result.append(row)
+        line: dict[str, object] = {"terrain": terrain, "size": f"{sizes[0]:g}" if sizes else ""}
+        for column, own in columns.items():
+            here = [r for r in own if not sizes or (r["terrain"] == terrain and float(r["size"]) in sizes)]
+            line[column] = f"{100 * mean(numbers(here, 'walked')):.0f}" if here else ""
+        result.append(line)
     return result
 
 

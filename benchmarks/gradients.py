@@ -17,13 +17,14 @@ from typing import Any
 
 import common
 import torch
-from common import Line, Panel, Part, measured, plot, run
+from common import Panel, Part, lines, measured, plot, run
+from groups import grouped
 from tables import Row
 from torch import Tensor
 
 import diffsim
 from diffsim import DiffEnv
-from diffsim.training import Count, NonNegative, Positive, fail
+from diffsim.training import Count, fail
 from diffsim.training.evaluation import SEED
 
 GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
@@ -32,6 +33,8 @@ GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "mujoco --no-touchdown": {"contact": "mujoco", "touchdown": False},
 }
 COLUMNS = {"norm": ("norm, median", "y"), "norm 95 %": ("norm, 95 %", "y"), "cosine": ("cosine", "")}
+SHOWN = "cosine, 4 steps", "cosine, 8 steps", "cosine, 16 steps", "norm 95 %, 16 steps"
+NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
 KEY = ("task", "learner", "horizon", "ground")
 
 
@@ -40,8 +43,6 @@ class Args(common.CheckpointFlags):
     num_envs: Count = 1024  # environments
     horizons: tuple[Count, ...] = (2, 4, 8, 16, 32)  # control steps of a window
     warmup: Count = 150  # control steps before it
-    noise: NonNegative = 0.3  # standard deviation of the noise on the actions
-    difference: Positive = 0.05  # shift of the actions in either direction
 
 
 def window(env: DiffEnv, policy: torch.nn.Module, horizon: int, shift: Tensor, noise: Tensor) -> Tensor:
@@ -78,56 +79,39 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         env = diffsim.make(task, n, horizon=max(args.horizons), early_termination=False, **options)
         env.reset(seed=SEED)
         drawn = torch.Generator().manual_seed(SEED)
-        noise = args.noise * torch.randn(args.warmup, n, env.scene.nu, generator=drawn)
+        noise = NOISE * torch.randn(args.warmup, n, env.scene.nu, generator=drawn)
         with torch.no_grad():
             window(env, policy, args.warmup, torch.zeros(n, env.scene.nu), noise)
         start = env.qpos.detach().clone(), env.qvel.detach().clone()
         for horizon in args.horizons:
-            noise = args.noise * torch.randn(horizon, n, env.scene.nu, generator=drawn)
+            noise = NOISE * torch.randn(horizon, n, env.scene.nu, generator=drawn)
             env.set_state(*start)
-            slopes = differences(env, policy, horizon, noise, args.difference)
+            slopes = differences(env, policy, horizon, noise, SHIFT)
             shift = torch.zeros(n, env.scene.nu, requires_grad=True)
             (each,) = torch.autograd.grad(window(env, policy, horizon, shift, noise).sum(), shift)
             norms = each.norm(dim=1)
-            yield {
-                "task": task,
-                "learner": case.saved.script,
-                "horizon": horizon,
-                "ground": ground,
-                "norm": float(norms.median()),
-                "norm 95 %": float(norms.quantile(0.95)),
-                "cosine": float(torch.cosine_similarity(each.mean(0), slopes, dim=0)),
-                "environments": n,
-            }
+            row = {"task": task, "learner": case.saved.script, "horizon": horizon, "ground": ground}
+            row |= {"norm": float(norms.median()), "norm 95 %": float(norms.quantile(0.95))}
+            row["cosine"] = float(torch.cosine_similarity(each.mean(0), slopes, dim=0))
+            yield row | {"environments": n}
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task and ground."""
-    lines = dict[tuple[str, str], dict[str, object]]()
-    for row in rows:
-        line = lines.setdefault((row["task"], row["ground"]), {"task": row["task"], "ground": row["ground"]})
-        line[f"cosine, {row['horizon']} steps"] = row["cosine"]
-        line[f"norm 95 %, {row['horizon']} steps"] = row["norm 95 %"]
-    names = "task", "ground", "cosine, 4 steps", "cosine, 8 steps", "cosine, 16 steps", "norm 95 %, 16 steps"
-    return [{name: line.get(name, "") for name in names} for line in lines.values()]
+    lines = list[Row]()
+    for (task, ground), own in grouped(rows, "task", "ground").items():
+        cells = {f"{name}, {row['horizon']} steps": row[name] for row in own for name in COLUMNS}
+        lines.append({"task": task, "ground": ground} | {name: cells.get(name, "") for name in SHOWN})
+    return lines
 
 
 def main(args: Args) -> None:
     rows = measured(args, Part("gradients", measure, KEY, "gradients", "transfer.md", shown))
-    tasks = [name for name in common.TASKS if any(row["task"] == name for row in rows)]
     grid = list[list[Panel]]()
     for column, (text, log) in COLUMNS.items():
-        panels = list[Panel]()
-        for task in tasks:
-            lines = list[Line]()
-            for k, ground in enumerate(GROUNDS):
-                own = [row for row in rows if (row["task"], row["ground"]) == (task, ground)]
-                x, y = ([float(row[name]) for row in own] for name in ("horizon", column))
-                lines.append(Line(x, y, f"C{k}o-", ground) if own else Line([], []))
-            panels.append(Panel(lines, task, "horizon (control steps)", text, log))
-        grid.append(panels)
-    if tasks:
-        plot(args.picture("gradients"), grid)
+        curves = {task: lines(own, "horizon", column, "ground") for (task,), own in grouped(rows, "task").items()}
+        grid.append([Panel(own, task, "horizon (control steps)", text, log) for task, own in curves.items()])
+    plot(args.picture("gradients"), grid)
 
 
 if __name__ == "__main__":

@@ -12,25 +12,23 @@ Writes joystick.csv, a row for each policy and world, and with --update-results 
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 
 import common
 import mujoco
 import numpy as np
 import tables
 import torch
-from common import ABOUT, Case, load_case, run
+from common import ABOUT, Case, Part, load_case, measured, run
+from groups import grouped, middle, numbers
 from numpy.typing import NDArray
-from tables import Row, markdown
-from torch import Tensor
+from tables import Row
 
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks.joystick import Joystick
-from diffsim.tasks.locomotion import rotate
 from diffsim.training import NonNegative, Positive, fail
 from diffsim.training.checkpoint import HOME
 
@@ -38,6 +36,7 @@ Array = NDArray[np.float64]
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
 COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) for v in SIDEWAYS)]
 COMMANDS += [(0.0, 0.0, w) for w in TURNING] + [(v, 0.0, w) for v in (0.5, -0.5) for w in TURNING]
+KEY = (*ABOUT[:-1], "file", "friction", "push")
 
 
 @dataclass
@@ -49,28 +48,21 @@ class Args(common.CheckpointFlags):
 
 
 class Robot:
-    """A robot in MuJoCo, driven as the task's.
-
-    Raises:
-        ValueError: the file lacks a joint or its actuator.
-    """
+    """A robot in MuJoCo, driven as the task's; a file that lacks a joint or its actuator ends the benchmark."""
 
     def __init__(self, case: Case, file: Path | None, friction: float) -> None:
-        self.scene, self.task = case.env.scene, case.env.task
-        own = self.scene.mj_model
-        m = self.model = mujoco.MjModel.from_xml_path(str(file or self.scene.path))
+        self.task, own = case.env.task, case.env.scene.mj_model
+        m = self.model = mujoco.MjModel.from_xml_path(str(file or case.env.scene.path))
         m.geom_friction[:, 0] *= friction
         m.pair_friction[:, :2] *= friction
         names = [own.joint(j).name for j in range(1, own.njnt)]
-        try:
-            joints = np.array([m.joint(name).id for name in names])
-        except KeyError as error:
-            raise ValueError(f"{file}: {error}") from error
-        actuator = {int(m.actuator_trnid[a, 0]): a for a in range(m.nu)}
-        if missing := [name for name, j in zip(names, joints, strict=True) if j not in actuator]:
-            raise ValueError(f"{file}: no actuator of {', '.join(missing)}")
+        at_joints = np.flatnonzero(m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        actuator = {m.joint(m.actuator_trnid[a, 0]).name: a for a in at_joints}
+        if missing := [name for name in names if name not in actuator]:
+            fail(f"{file}: no actuator of the joints {', '.join(missing)}")
+        joints = np.array([m.joint(name).id for name in names])
+        self.ctrl = np.array([actuator[name] for name in names])
         self.qpos, self.qvel = m.jnt_qposadr[joints], m.jnt_dofadr[joints]
-        self.ctrl = np.array([actuator[j] for j in joints])
         self.servo = m.actuator_biastype[self.ctrl] == mujoco.mjtBias.mjBIAS_AFFINE
         order = [own.actuator_trnid[:, 0].tolist().index(j) for j in range(1, own.njnt)]
         low, high = own.actuator_ctrlrange[order].T
@@ -81,9 +73,9 @@ class Robot:
         self.least, self.most = m.actuator_ctrlrange[self.ctrl].T
         self.limited = m.actuator_ctrllimited[self.ctrl] != 0
 
-    def start(self, qpos: Array) -> mujoco.MjData:
-        data = mujoco.MjData(self.model)
-        data.qpos[:7], data.qpos[self.qpos] = qpos[:7], qpos[7:]
+    def start(self) -> mujoco.MjData:
+        data, qpos = mujoco.MjData(self.model), np.array(self.task.start, np.float32)
+        data.qpos[:7], data.qpos[self.qpos] = qpos[:7], qpos[7 : 7 + len(self.qpos)]
         mujoco.mj_forward(self.model, data)
         return data
 
@@ -100,53 +92,28 @@ class Robot:
         return qpos, np.concatenate((data.qvel[:6], data.qvel[self.qvel]))
 
 
-class Follower:
-    """The task's memory under commands that are held, without noise of the sensors."""
-
-    def __init__(self, case: Case, commands: Tensor) -> None:
-        self.task, self.commands = case.env.task, commands
-        assert isinstance(self.task, Joystick)
-        self.memory = self.task.begin(torch.full((len(commands), self.task.num_random), 0.5))
-        self.memory[:, :3] = commands
-
-    def observe(self, qpos: Array, qvel: Array, action: Tensor) -> Tensor:
-        return self.task.observe_with(torch.tensor(qpos).float(), torch.tensor(qvel).float(), action, self.memory)
-
-    def remember(self, action: Tensor) -> None:
-        quiet = torch.full((len(action), self.task.num_noise), 0.5)
-        self.memory = self.task.remember(self.memory, action, quiet)
-        self.memory[:, :3] = self.commands
-
-
-def root_velocity(qpos: Tensor, qvel: Tensor) -> Tensor:
-    """(..., 3) vx, vy in the root's frame, and its yaw rate."""
-    inverse = torch.cat((qpos[..., 3:4], -qpos[..., 4:7]), dim=-1)
-    return torch.cat((rotate(inverse, qvel[..., :3])[..., :2], qvel[..., 5:6]), dim=-1)
-
-
 @torch.no_grad()
-def follow(case: Case, robot: Robot, args: Args) -> tuple[Array, Array, Array]:
-    """Velocities (T, n, 3) of the root, falls (n,) and the way (T, n, nq), of an episode for each command."""
-    commands, steps = torch.tensor(COMMANDS), round(args.seconds / case.env.task.control_dt)
-    follower, policy, n = Follower(case, commands), case.saved.network, len(COMMANDS)
-    home = case.env.task._start[: case.env.scene.nq].numpy().astype(float)
-    data = [robot.start(home) for _ in range(n)]
+def follow(case: Case, robot: Robot, args: Args) -> tuple[Array, Array]:
+    """The root's velocities (T, n, 3), vx and vy in its frame and its yaw rate, and falls (n,), of each command."""
+    task, policy, n = case.env.task, case.saved.network, len(COMMANDS)
+    commands, quiet = torch.tensor(COMMANDS), torch.full((n, task.num_noise), 0.5)  # sensors without noise
+    memory = task.begin(torch.full((n, task.num_random), 0.5))
     action, fallen = torch.zeros(n, case.env.scene.nu), np.zeros(n, bool)
-    generator, velocities, way = np.random.default_rng(1), [], []
+    data, generator, velocities = [robot.start() for _ in range(n)], np.random.default_rng(1), []
     with ThreadPoolExecutor(available_cores()) as pool:
-        for t in range(steps):
+        for t in range(round(args.seconds / task.control_dt)):
+            memory[:, :3] = commands
             qpos, qvel = (np.stack(parts) for parts in zip(*map(robot.state, data), strict=True))
-            obs = follower.observe(qpos, qvel, action)
-            fallen |= case.env.task.terminated(obs).numpy() | ~np.isfinite(qpos).all(1)
-            velocities.append(root_velocity(torch.tensor(qpos), torch.tensor(qvel)).numpy())
-            way.append(qpos)
+            obs = task.observe_with(torch.tensor(qpos).float(), torch.tensor(qvel).float(), action, memory)
+            fallen |= task.terminated(obs).numpy() | ~np.isfinite(qpos).all(1)
+            velocities.append(obs[:, task.actor_dim :][:, [0, 1, 5]].numpy())  # of the critic's part, without noise
             action = policy(obs).clamp(-1.0, 1.0)
-            follower.remember(action)
-            if args.push and t and t % round(4.0 / case.env.task.control_dt) == 0:
+            memory = task.remember(memory, action, quiet)
+            if args.push and t and t % round(4.0 / task.control_dt) == 0:
                 for each, angle in zip(data, generator.uniform(0, 2 * np.pi, n), strict=True):
                     each.qvel[:2] += args.push * np.array((np.cos(angle), np.sin(angle)))
             list(pool.map(robot.step, data, action.numpy().astype(float)))
-    return np.stack(velocities), fallen, np.stack(way)
+    return np.stack(velocities), fallen
 
 
 def errors(velocities: Array, second: int) -> Array:
@@ -159,67 +126,51 @@ def errors(velocities: Array, second: int) -> Array:
 
 def training(case: Case) -> dict[str, object]:
     """Where the policy was trained, for how long, and its last evaluation's return, of what its run says."""
-    progress = case.path.parent / "progress.csv"
-    rows = tables.read_csv(progress) if progress.is_file() else []
-    evaluated = next((row for row in reversed(rows) if row["eval_return"]), None)
+    rows = tables.read_csv(case.path.parent / "progress.csv")
     device = str(case.saved.args.get("device", "")).partition(":")[0]
-    found = {"return": float(evaluated["eval_return"]) if evaluated else ""}
-    return {"device": device, **found, "training s": float(rows[-1]["seconds"]) if rows else ""}
+    found: dict[str, object] = {"device": device, "return": ["", *numbers(rows, "eval_return")][-1]}
+    return found | {"training s": float(rows[-1]["seconds"]) if rows else ""}
 
 
-def measure(path: Path, args: Args) -> list[dict[str, object]]:
-    case, rows = load_case(path, 1, "cpu"), list[dict[str, object]]()
+def measure(args: Args, path: Path) -> Iterator[Row]:
+    """A row for each friction."""
+    case = load_case(path, 1, "cpu")
     about = case.about
     if case.saved.simulator != HOME:
         about["learner"] = f"{about['learner']} in {case.saved.simulator}"
     if not isinstance(case.env.task, Joystick):
         fail(f"{path} was trained on {case.env.task.name}, which follows no command")
     for friction in args.friction:
-        try:
-            robot = Robot(case, args.file, friction)
-        except ValueError as error:
-            fail(error)
-        velocities, fallen, _ = follow(case, robot, args)
+        velocities, fallen = follow(case, Robot(case, args.file, friction), args)
         found = errors(velocities, round(1 / case.env.task.control_dt))
         row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
         row |= {"error": found[:, 0].mean(), "worst error": found[:, 0].max(), "yaw error": found[:, 1].mean()}
-        row |= {"whole": 1 - fallen.mean(), "seconds": args.seconds}
-        rows.append(about | training(case) | row)
         print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, found[:, 0], strict=True)))
-    return rows
+        yield about | training(case) | row | {"whole": 1 - fallen.mean(), "seconds": args.seconds}
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task, learner and machine, over seeds: medians, and the worst command of the worst seed."""
-    groups = dict[tuple[str, ...], list[dict[str, str]]]()
-    for row in sorted(rows, key=lambda row: (row["task"], row["checkpoint"])):
-        machine = row["checkpoint"].partition("/")[0]
-        groups.setdefault((row["task"], row["learner"], machine, row["file"]), []).append(row)
+    rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
+    rows.sort(key=lambda row: (row["task"], row["checkpoint"]))
     lines = list[Row]()
-    for (task, learner, machine, file), group in groups.items():
+    for (task, learner, machine, file), group in grouped(rows, "task", "learner", "machine", "file").items():
         calm = [row for row in group if float(row["push"]) == 0]
         plain = [row for row in calm if float(row["friction"]) == 1]
         pushed = [float(row["whole"]) for row in group if float(row["push"]) > 0]
-        known = {name: [float(row[name]) for row in plain if row[name]] for name in ("return", "training s", "error")}
-        middle = {name: median(values) if values else math.nan for name, values in known.items()}
         lines.append(
             {"task": task, "learner": learner, "machine": machine, "seeds": len(plain)}
-            | {"return": f"{middle['return']:,.0f}".replace("nan", "")}
-            | {"training (s)": f"{middle['training s']:.0f}", "judged on": file}
-            | {"error (m/s)": f"{middle['error']:.3f}"}
-            | {"worst command": f"{max(float(row['worst error']) for row in plain):.2f}"}
-            | {"yaw (rad/s)": f"{median(float(row['yaw error']) for row in plain):.2f}"}
-            | {"whole": f"{min(float(row['whole']) for row in calm):.0%}"}
+            | {"return": middle(plain, "return", ",.0f"), "training (s)": middle(plain, "training s", ".0f")}
+            | {"judged on": file, "error (m/s)": middle(plain, "error", ".3f")}
+            | {"worst command": f"{max(numbers(plain, 'worst error')):.2f}"}
+            | {"yaw (rad/s)": middle(plain, "yaw error", ".2f"), "whole": f"{min(numbers(calm, 'whole')):.0%}"}
             | {"whole, pushed": f"{min(pushed):.0%}" if pushed else ""}
         )
     return lines
 
 
 def main(args: Args) -> None:
-    for path in args.measured:
-        for row in measure(path, args):
-            args.keep("joystick", row, (*ABOUT[:-1], "file", "friction", "push"))
-    args.publish("joystick", markdown(table(args.read("joystick"))), "joystick.md")
+    measured(args, Part("joystick", measure, KEY, "joystick", "joystick.md", table))
 
 
 if __name__ == "__main__":

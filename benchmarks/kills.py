@@ -36,16 +36,10 @@ FLAGS = {
 
 @dataclass
 class Args:
-    """What is killed, and how often."""
-
-    scripts: tuple[str, ...] = tuple(FLAGS)
-    """names of scripts, without .py"""
-    times: int = 5
-    """runs of each"""
-    kills: int = 3
-    """in each run"""
-    seed: int = 1
-    """of the moments"""
+    scripts: tuple[str, ...] = tuple(FLAGS)  # names of scripts, without .py
+    times: int = 5  # runs of each
+    kills: int = 3  # kills in each run
+    seed: int = 1  # seed of the moments
 
 
 def start(script: str, *arguments: object) -> subprocess.Popen[bytes]:
@@ -71,20 +65,22 @@ def same(a: Any, b: Any) -> bool:
 
 def survives(script: str, folder: Path, whole: dict[str, Any], seconds: float, kills: int, rng: random.Random) -> bool:
     """Whether a run that is killed so often ends like the whole one, which took so many seconds."""
-    checkpoint, cadence = (
-        folder / "checkpoint.pt",
-        ["--save-every", rng.randint(1, 9), "--eval-every", rng.randint(0, 9)],
-    )
-    first = [*COMMON.split(), *FLAGS[script].split(), "--run-dir", folder, *cadence]
+    checkpoint = folder / "checkpoint.pt"
+    cadence = ["--save-every", rng.randint(1, 9), "--eval-every", rng.randint(0, 9)]
+
+    def go_on() -> subprocess.Popen[bytes]:
+        first = [*COMMON.split(), *FLAGS[script].split(), "--run-dir", folder]
+        return start(script, *(["--resume", checkpoint] if checkpoint.exists() else first), *cadence)
+
     for _ in range(kills):
-        process = start(script, *(["--resume", checkpoint, *cadence] if checkpoint.exists() else first))
+        process = go_on()
         time.sleep(rng.uniform(0.3, 1.0) * seconds)
         process.kill()
         process.wait()
         if checkpoint.exists() and torch.load(checkpoint, weights_only=True)["iteration"] == whole["iteration"]:
             break  # it was faster
     else:
-        finish(start(script, *(["--resume", checkpoint, *cadence] if checkpoint.exists() else first)))
+        finish(go_on())
     end = torch.load(checkpoint, weights_only=True)
     return all(same(end[name], whole[name]) for name in ("modules", "ranks", "policy", "iteration", "control_steps"))
 

@@ -8,8 +8,7 @@ mean reward of an episode of --horizon steps up to its end (a fallen robot gains
 of 32 steps from states that the policy visits. Every variation of the policy meets the same start states and the same
 noise, all at once in one batch.
 
-Writes landscape_*.csv, landscape_*.png and, with --update-results, their part of docs/experiments.md. A csv
-that exists is kept: delete it to measure it anew.
+Writes landscape_*.csv and landscape_*.png. A csv that exists is kept: delete it to measure it anew.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -45,14 +45,8 @@ State = tuple[Tensor, Tensor]
 class Args(ScriptFlags):
     env: Tasks = ("humanoid", "ant")  # tasks
     seed: int = 1  # seed of training, start states, noise and directions
-    iterations: tuple[Count, ...] = (
-        50,
-        200,
-        500,
-        1000,
-        1500,
-        2000,
-    )  # iterations of SHAC at which gradients are measured; landscapes: at the last
+    # iterations of SHAC at which gradients are measured; landscapes: at the last
+    iterations: tuple[Count, ...] = (50, 200, 500, 1000, 1500, 2000)
     horizon: Count = 1000  # control steps of BPTT's window
     trajectories: Count = 128  # environments that evaluate each variation of the policy
     points: Count = 101  # variations along one weight, from -1 to 1
@@ -214,61 +208,43 @@ def measure(args: Args, runner: Runner, task: TaskName) -> None:
         print(f"{task}, {name}: done", flush=True)
 
 
-def columns_of(args: Args, name: str) -> dict[str, Array]:
-    rows = args.read(name)
-    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-
-
 def draw(args: Args, task: TaskName) -> None:
-    line, sizes, surface = (columns_of(args, f"landscape_{task}_{name}") for name in ("weight", "gradients", "surface"))
-    x, text = line["step"], "change of one weight"
-    slopes = [Line(x, np.gradient(line["shac"], x), "-", "finite difference")]
-    slopes.append(Line(x, line["shac_gradient"], "--", "analytic"))
+    """The pictures of a task; prints the norms of both gradients, and how well SHAC's agrees with its loss."""
+    sizes = args.read(f"landscape_{task}_gradients")
+    line, surface = (
+        {column: np.array([float(row[column]) for row in rows]) for column in rows[0]}
+        for rows in (args.read(f"landscape_{task}_{name}") for name in ("weight", "surface"))
+    )
+    x, text, difference = line["step"], "change of one weight", np.gradient(line["shac"], line["step"])
+    correlation = np.corrcoef(difference[1:-1], line["shac_gradient"][1:-1])[0, 1]
+    print(f"{task}, SHAC's analytic against finite-difference gradient along one weight: correlation {correlation:.3f}")
+    print(markdown(sizes, ("iteration", *(f"{loss}_norm" for loss in LOSSES))))
+    slopes = Line(x, difference, "-", "finite difference"), Line(x, line["shac_gradient"], "--", "analytic")
     panels = [Panel([Line(x, line[loss], "k-", width=1)], f"{loss.upper()}: loss", text) for loss in LOSSES]
     plot(args.picture(f"landscape_{task}_weight"), [[*panels, Panel(slopes, "SHAC: gradient", text)]], (4, 3.2))
 
+    iterations = [float(row["iteration"]) for row in sizes]
     curves, styles = list[Line](), (("q0.5", ":", "median"), ("q0.99", "--", "0.99 quantile"), ("q1", "-", "largest"))
-    for loss, colour in zip(LOSSES, ("C2", "C0"), strict=True):
-        for quantile, style, text in styles:
-            curves.append(Line(sizes["iteration"], sizes[f"{loss}_{quantile}"], colour + style, f"{loss}, {text}"))
+    for (loss, colour), (quantile, style, name) in product(zip(LOSSES, ("C2", "C0"), strict=True), styles):
+        values = [float(row[f"{loss}_{quantile}"]) for row in sizes]
+        curves.append(Line(iterations, values, colour + style, f"{loss}, {name}"))
     panel = Panel(curves, "", "iteration of SHAC", "size of the gradient's entries", log="y")
     plot(args.picture(f"landscape_{task}_gradients"), [[panel]], (6, 4))
 
     if can_draw():
         from matplotlib.figure import Figure
 
-        side = round(len(surface["k1"]) ** 0.5)
+        side, path = round(len(surface["k1"]) ** 0.5), args.picture(f"landscape_{task}_surface")
         figure = Figure(figsize=(10, 4.2), layout="constrained")
-        axes = figure.subplots(1, 2, subplot_kw={"projection": "3d"})
-        for axis, loss in zip(axes, LOSSES, strict=True):
+        for axis, loss in zip(figure.subplots(1, 2, subplot_kw={"projection": "3d"}), LOSSES, strict=True):
             axis.plot_surface(*(surface[name].reshape(side, side) for name in ("k1", "k2", loss)), cmap="viridis")
             axis.set_title(f"{loss.upper()}: loss along two directions")
-        figure.savefig(args.picture(f"landscape_{task}_surface"), dpi=110)
-
-
-def section(args: Args, task: TaskName) -> str:
-    """The page's part on a task."""
-    line, sizes = columns_of(args, f"landscape_{task}_weight"), args.read(f"landscape_{task}_gradients")
-    rows = list[Row]()
-    for loss in LOSSES:
-        steps = np.diff(line[loss])
-        extrema = f"{(steps[:-1] * steps[1:] < 0).sum()} of {len(steps) - 1}"
-        way = f"{np.abs(steps).sum() / np.ptp(line[loss]):.2f}"
-        rows.append({"": loss, "local extrema along one weight": extrema, "way up and down / range": way})
-    difference = np.gradient(line["shac"], line["step"])
-    correlation = np.corrcoef(difference[1:-1], line["shac_gradient"][1:-1])[0, 1]
-    names = ["iteration", *(f"{loss}_{what}" for loss in LOSSES for what in ("norm", "q1"))]
-    weight, surface, gradients = (args.link(f"landscape_{task}_{name}") for name in ("weight", "surface", "gradients"))
-    return (
-        f"### {task}\n\n{markdown(rows)}\n"
-        f"Analytic against finite-difference gradient of SHAC along the weight: correlation {correlation:.3f}.\n\n"
-        f"![one weight]({weight})\n![surface]({surface})\n\n"
-        f"{markdown(sizes, names)}\n![gradients]({gradients})\n\n"
-    )
+        figure.savefig(path, dpi=110)
+        print(path)
 
 
 def main(args: Args) -> None:
-    runner, text = Runner(args), ""
+    runner = Runner(args)
     for task in () if args.draw_only else args.env:
         measure(args, runner, task)
     for task in TASKS:
@@ -276,9 +252,6 @@ def main(args: Args) -> None:
             one = dataclasses.replace(args, output=path.parent)
             if all(one.csv(f"landscape_{task}_{name}").is_file() for name in FILES):
                 draw(one, task)
-                text += section(one, task)
-    if text:
-        args.publish("landscape", text, "experiments.md", everywhere=True)
 
 
 if __name__ == "__main__":

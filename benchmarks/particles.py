@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import torch
 from common import CommonFlags, run
+from groups import grouped, numbers
 from tables import ROOT, Row, markdown
 from torch import Tensor
 
@@ -123,20 +124,17 @@ def disturb(args: Args) -> None:
 def means(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each noise: means over the seeds."""
     found = list[Row]()
-    for noise in dict.fromkeys(row["noise"] for row in rows):
-        own = [row for row in rows if row["noise"] == noise]
-        moved, change = (mean(float(row[name]) for row in own) for name in ("moved", "total variation"))
+    for (noise,), own in grouped(rows, "noise").items():
+        moved, change = (mean(numbers(own, name)) for name in ("moved", "total variation"))
         found.append({"standard deviations": noise, "particles moved": moved, "change of the policy": change})
     return found
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each policy: how many seeds have actions near both peaks, by entropy's weight and iterations."""
-    found: dict[str, dict[str, object]] = {}
-    for row in rows:
-        policy, entropy, iterations = (row[name] for name in CASE)
-        found.setdefault(policy, {"policy": policy})[f"{entropy}, {iterations}"] = row["both"]
-    return list(found.values())
+    _, entropy, iterations = CASE
+    groups = grouped(rows, "policy").items()
+    return [{"policy": name} | {f"{r[entropy]}, {r[iterations]}": r["both"] for r in own} for (name,), own in groups]
 
 
 def main(args: Args) -> None:

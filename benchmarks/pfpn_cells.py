@@ -18,7 +18,8 @@ from statistics import mean, pstdev
 from typing import NamedTuple
 
 from common import run
-from runner import Case, Runner, ScriptFlags, seed
+from groups import grouped, numbers
+from runner import Case, Runner, ScriptFlags
 from tables import Row, markdown, read_csv
 
 
@@ -30,10 +31,8 @@ class Figure(NamedTuple):
     cells: dict[str, str]
 
 
-FIGURES = {
-    name: Figure(**case)
-    for name, case in json.loads(Path(__file__).with_name("cases.json").read_text())["pfpn"].items()
-}
+CASES = json.loads(Path(__file__).with_name("cases.json").read_text())["pfpn"]
+FIGURES = {name: Figure(**case) for name, case in CASES.items()}
 KEY = ("figure", "cell", "seed")
 
 
@@ -57,44 +56,28 @@ def measured(args: Args) -> Iterator[Row]:
     """A line for each run that has been evaluated, finished or not."""
     for case in cases(args):
         rows = read_csv(case.folder / "progress.csv")
-        returns = [float(row["return"]) for row in rows if row["return"]]
-        evaluated = [row["eval_return"] for row in rows if row["eval_return"]]
+        returns, evaluated = numbers(rows, "return"), numbers(rows, "eval_return")
         if not evaluated:
             continue
         row: dict[str, object] = {"figure": case.folder.parent.name, "cell": case.folder.name.rpartition("__")[0]}
-        row |= {"seed": seed(case.folder), "control_steps": rows[-1]["control_steps"]}
-        row |= {"eval_return": float(evaluated[-1]), "training": returns[-1], "training_mean": mean(returns)}
+        row |= {"seed": case.seed, "control_steps": rows[-1]["control_steps"], "eval_return": evaluated[-1]}
+        row |= {"training": returns[-1], "training_mean": mean(returns)}
         if moved := rows[-1].get("particles_moved"):
-            dead = {f"dead_by_{by}": max(float(row[f"particles_dead_{by}"]) for row in rows) for by in ("mean", "max")}
-            row |= dead | {"moved": int(float(moved)), "active": float(rows[-1]["particles_active"])}
+            row |= {f"dead_by_{by}": max(numbers(rows, f"particles_dead_{by}")) for by in ("mean", "max")}
+            row |= {"moved": int(float(moved)), "active": float(rows[-1]["particles_active"])}
         yield row
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each cell: means over its seeds, of the evaluation their deviation, too; of the dead the most."""
-    found: dict[str, list[dict[str, str]]] = {}
-    for row in rows:
-        found.setdefault(row["cell"], []).append(row)
-    lines = [line(cell, own) for cell, own in found.items()]
-    columns = dict.fromkeys(name for row in lines for name in row)
-    return [{name: row.get(name, "") for name in columns} for row in lines]
-
-
-NUMBERS = ("eval_return", "training_mean", "dead_by_mean", "dead_by_max", "moved")
-
-
-def line(cell: str, rows: list[dict[str, str]]) -> Row:
-    numbers = {name: [float(row[name]) for row in rows if row.get(name)] for name in NUMBERS}
-    returns = numbers["eval_return"]
-    shown: dict[str, object] = {
-        "case": cell,
-        "return": f"{mean(returns):.0f}" + (f" ± {pstdev(returns):.0f}" if len(returns) > 1 else ""),
-        "in training": f"{mean(numbers['training_mean']):.0f}",
-    }
-    if numbers["moved"]:
-        dead = (max(numbers[f"dead_by_{by}"]) for by in ("mean", "max"))
-        shown |= {"dead": "/".join(f"{share:.0%}" for share in dead), "moved": f"{mean(numbers['moved']):.0f}"}
-    return shown
+    lines = list[Row]()
+    for (cell,), own in grouped(rows, "cell").items():
+        returns, moved = numbers(own, "eval_return"), numbers(own, "moved")
+        dead = (f"{max(numbers(own, f'dead_by_{by}')):.0%}" for by in ("mean", "max")) if moved else ()
+        line = {"case": cell, "return": f"{mean(returns):.0f}" + (f" ± {pstdev(returns):.0f}" if own[1:] else "")}
+        line |= {"in training": f"{mean(numbers(own, 'training_mean')):.0f}", "dead": "/".join(dead)}
+        lines.append(line | {"moved": f"{mean(moved):.0f}" if moved else ""})
+    return lines
 
 
 def main(args: Args) -> None:

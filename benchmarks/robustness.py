@@ -4,13 +4,8 @@
     python benchmarks/robustness.py runs/*/* --body torso --masses 5 10 20
 
 Robots walk for 2 to 4 s, each for a time of its own, so that they are in any phase of their gait. Then each is pushed
-at its trunk for 0.1 s, forwards (+x) or sideways (+y), as in Table 1 of the PFPN paper (Xu and Karamouzas 2021). The
-smallest push is the least force, to 2 %, at which at least half of them fall within 3 s: the force is doubled from
-1/16 of the weight until they do, then bisected. To fall is to end an episode of the task.
-
-A cube (Figure 8 there) flies at the trunk from the front at 0.2 m/s. The hit is one of point masses: it changes the
-momentum of the trunk along x by m M / (m + M) (1 + e) times the closing speed, over one control step, where M is the
-mass that the trunk shows to a push along x at this pose, limbs included, and e the restitution. The cube is gone then.
+at its trunk, or hit by a cube there, as in Table 1 and Figure 8 of the PFPN paper (Xu and Karamouzas 2021).
+docs/robustness.md explains both tests. To fall is to end an episode of the task.
 
 Writes robustness.csv, a row for each policy, and robustness_curves.csv, one for each push and cube; robustness.png; and
 with --update-results the table of docs/robustness.md.
@@ -30,6 +25,7 @@ import mujoco
 import numpy as np
 import torch
 from common import ABOUT, Case, Panel, lines, load_case, plot, run
+from groups import grouped
 from tables import Row, markdown
 from torch import Tensor
 
@@ -50,13 +46,7 @@ TOLERANCE = 0.02  # relative error of the smallest push
 KEY = ABOUT[:-1]
 CURVE_KEY = (*KEY, "test", "level")  # level: of a push in multiples of the smallest, of a cube in kg
 GROUP = ("task", "learner", "contact", "mass")  # columns in which the seeds of a table's row agree
-EACH = (
-    "seed",
-    "forward N",
-    "sideways N",
-    "forward m/s",
-    "sideways m/s",
-)  # columns of that row with a value for each seed
+EACH = ("seed", *(f"{way} {unit}" for unit in ("N", "m/s") for way in DIRECTIONS))  # which it has of each seed
 
 
 @dataclass
@@ -79,13 +69,9 @@ class State(NamedTuple):
 
 
 class Walkers:
-    """Robots under their policy, which forces may push. Nothing is reset: what has fallen lies there.
+    """Robots under their policy, which forces may push at a body. Nothing is reset: what has fallen lies there.
 
-    Args:
-        env: the policy's environment, whose simulator's settings are taken over.
-        policy: observations (n, obs_dim) -> actions (n, nu).
-        body: MuJoCo's number of the pushed body.
-        state: where they begin.
+    Of env the task and the simulator's settings are taken over.
     """
 
     def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int, state: State) -> None:
@@ -206,13 +192,11 @@ def measure(case: Case, body: int, args: Args) -> None:
         fail(f"only {count} of {env.num_envs} walk for {WALK[0]:g} to {WALK[1]:g} s without a push")
     walkers = Walkers(env, policy, body, state)
     limit, push = walkers.steps(args.after), walkers.steps(PUSH)
-
-    def endured(force: Tensor, pushed: int) -> Tensor:
-        return walkers.endure(args.after, force, pushed)
+    second = push * env.control_dt  # s, nearly PUSH
 
     def fallen(direction: str, newtons: float) -> float:
         force = newtons * torch.tensor(DIRECTIONS[direction], dtype=env.dtype, device=env.device)
-        return float((endured(force.expand(count, 3), push) < limit).double().mean())
+        return float((walkers.endure(args.after, force.expand(count, 3), push) < limit).double().mean())
 
     about = case.about | {"body": scene.mj_model.body(body).name, "after": args.after}
     unpushed = fallen(FORWARD, 0.0)
@@ -221,14 +205,12 @@ def measure(case: Case, body: int, args: Args) -> None:
     row = about | {"robots": count, "unpushed": unpushed, "mass": mass}
     for direction in DIRECTIONS if scene.floating else (FORWARD,):  # what is planar does not feel the other
         least = smallest(partial(fallen, direction), FIRST * 9.81 * mass)
-        second = push * env.control_dt  # s, nearly PUSH
         row |= {f"{direction} N": least, f"{direction} m/s": least * second / mass}
         for multiple in map(float, MULTIPLES if math.isfinite(least) else ()):
             kick = multiple * least * second
             level = {"test": direction, "level": multiple, "impulse": kick, "m/s": kick / mass}
-            args.keep(
-                "robustness_curves", about | level | {"survived": 1 - fallen(direction, multiple * least)}, CURVE_KEY
-            )
+            level["survived"] = 1 - fallen(direction, multiple * least)
+            args.keep("robustness_curves", about | level, CURVE_KEY)
     args.keep("robustness", row, KEY)
 
     hit = target(scene, state, body)
@@ -236,7 +218,7 @@ def measure(case: Case, body: int, args: Args) -> None:
         kicks = impulse(hit, kilograms, args.speed, args.restitution)
         force = torch.zeros(count, 3, dtype=env.dtype, device=env.device)
         force[:, 0] = torch.as_tensor(kicks / env.control_dt)
-        steps, kick = endured(force, 1).double(), float(-kicks.mean())
+        steps, kick = walkers.endure(args.after, force, 1).double(), float(-kicks.mean())
         level = {"test": "cube", "level": kilograms, "impulse": kick, "m/s": kick / mass}
         level |= {"survived": float((steps == limit).double().mean()), "steps": float(steps.mean())}
         level |= {"steps sd": float(steps.std()), "speed": args.speed, "restitution": args.restitution}
@@ -256,11 +238,13 @@ def panels(rows: list[dict[str, str]]) -> list[Panel]:
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each learner on a task: each seed's smallest pushes, and the change of speed that they would cause."""
-    tasks, groups = [*diffsim.TASKS, *(row["task"] for row in rows)], dict[tuple[str, ...], list[dict[str, str]]]()
-    for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"])):
-        groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
-    each = ({name: ", ".join(seed.get(name, "") for seed in seeds) for name in EACH} for seeds in groups.values())
-    return [dict(zip(GROUP, group, strict=True)) | cells for group, cells in zip(groups, each, strict=True)]
+    tasks = [*diffsim.TASKS, *(row["task"] for row in rows)]
+    rows = sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"]))
+    each = {
+        group: {name: ", ".join(row.get(name, "") for row in seeds) for name in EACH}
+        for group, seeds in grouped(rows, *GROUP).items()
+    }
+    return [dict(zip(GROUP, group, strict=True)) | cells for group, cells in each.items()]
 
 
 def main(args: Args) -> None:

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import common
 import numpy as np
-from motions import RUNS
 from tables import ROOT, read_csv
 
 import diffsim
@@ -35,7 +34,7 @@ Curve = dict[str, np.ndarray]
 class ScriptFlags(common.CommonFlags):
     device: str = "auto"  # torch device of the learners (auto: the GPU if there is one)
     time_limit: float | None = None  # seconds after which runs in progress stop and save; the next call goes on
-    runs: Path = RUNS  # directory of the runs
+    runs: Path = ROOT / "runs" / "learning"  # directory of the runs
 
 
 class Case(NamedTuple):

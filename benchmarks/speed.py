@@ -34,7 +34,7 @@ import torch
 import tyro
 import warp as wp
 from common import TASKS, Panel, Part, TaskName, lines, measured, plot, run
-from motions import shac, simulator
+from motions import shac
 from runner import ScriptFlags
 from tables import ROOT, Row, read_csv
 
@@ -48,12 +48,8 @@ from diffsim.training import parse as parse_script
 from diffsim.training.evaluation import make_env
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
-KernelName = Literal["blocks", "scalar", "float64"]
-KERNELS: dict[KernelName, dict[str, Any]] = {
-    "blocks": {},  # float32; on a CPU in vectors of environments
-    "scalar": {"block": 1},
-    "float64": {"dtype": torch.float64},
-}
+KernelName = Literal["blocks", "scalar"]  # on a CPU in vectors of environments, or one environment at a time
+THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
 PartName = Literal["physics", "scaling", "training", "time"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; the scaling table leaves out larger settings
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
@@ -67,7 +63,7 @@ class Args(ScriptFlags):
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
     scaling: tuple[Count, ...] = (64, 256, 1024, 4096, 16384, 65536)  # those of the scaling table, at a horizon of 32
     horizons: tuple[Count, ...] = (1, 4, 8, 16, 32, 64, 128)  # horizons of the scaling table, at 64 environments
-    kernels: tuple[KernelName, ...] = ("blocks", "scalar", "float64")  # of the physics table; scalar on a CPU
+    kernels: tuple[KernelName, ...] = ("blocks", "scalar")  # of the physics table; scalar on a CPU
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
     script: str = "shac"  # script of the training table, in the repository's root, without .py
@@ -169,7 +165,7 @@ def mujoco_timer(scene: Scene, num_envs: int, timestep: float, substeps: int) ->
 
 def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     """Beside MuJoCo: with all models of its muscles and without, if a task has any; the hopper also on rough ground."""
-    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()} if args.device == "cpu" else {args.device: 1}
+    threads = THREADS if args.device == "cpu" else {args.device: 1}
     task, whole = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
@@ -183,20 +179,16 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
         reference = "", "", "mj_step"
         competitors = {reference: mujoco_timer(whole, num_envs, task.control_dt / default.substeps, default.substeps)}
         for (scene_name, scene), kernel, (place, count) in product(scenes.items(), kernels, threads.items()):
-            sim = simulator(scene, default, num_envs, threads=count, **options, **KERNELS[kernel])
+            block = {"block": 1} if kernel == "scalar" else {}
+            sim = Simulator(scene, num_envs, default, threads=count, **options, **block)
             competitors[scene_name, kernel, place] = timer(sim)
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
         per_substep = num_envs * default.substeps
         mj = times.pop(reference)["mj_step"] / per_substep
         for (scene_name, kind, place), t in times.items():
             scalar = times.get((scene_name, "scalar", place), {})
-            row: dict[str, object] = {
-                "task": name,
-                "environments": num_envs,
-                "scene": scene_name,
-                "kernel": kind,
-                "device": place,
-            }
+            row: dict[str, object] = {"task": name, "environments": num_envs, "scene": scene_name}
+            row |= {"kernel": kind, "device": place}
             row |= {f"{what} (us/substep)": microseconds / per_substep for what, microseconds in t.items()}
             ratios = {what: t[what] / scalar[what] for what in scalar if "kernel" in what}
             row |= {f"{what}/scalar": ratio for what, ratio in ratios.items()}
@@ -216,18 +208,6 @@ def timed(call: Callable[[], object], device: torch.device, warmup: int, calls: 
     return seconds[warmup:]
 
 
-def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
-    techniques = ["cuda graph", "cuda graph, one thread per environment", "cuda, eager"]
-    if args.device == "cpu":
-        techniques = ["cpu, 1 thread", "cpu, all cores"]
-    substeps, scene = diffsim.TASKS[name].substeps, diffsim.make(name, num_envs=1).scene
-    numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
-    settings = dict.fromkeys([(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons])
-    for (num_envs, horizon), technique in product(settings, techniques):
-        if 4 * numbers * num_envs * horizon * substeps <= MAX_MEMORY:
-            yield time_window(name, num_envs, horizon, technique)
-
-
 def windows(
     sim: Simulator, qpos: torch.Tensor, qvel: torch.Tensor, actions: torch.Tensor
 ) -> tuple[Callable[[], torch.Tensor], ...]:
@@ -243,47 +223,42 @@ def windows(
     return torch.no_grad()(forward), forward, lambda: torch.autograd.grad(forward(), actions)[0]
 
 
-def time_window(name: TaskName, num_envs: int, horizon: int, technique: str) -> Row:
-    """A window of control steps without gradients, differentiably, and with its backward pass."""
-    device = torch.device("cuda" if "cuda" in technique else "cpu")
-    if device.type == "cuda":
-        gc.collect()  # the graphs of the setting before
-        torch.cuda.empty_cache()
-        torch.cuda.synchronize()
-        free = torch.cuda.mem_get_info()[0]
-    env = diffsim.make(name, num_envs=num_envs, seed=0, device=device)
-    threads = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}.get(technique)
-    division, default = divide(env.scene) if "one thread" in technique else None, env.task.integration("default")
-    sim = simulator(
-        env.scene, default, num_envs, horizon=horizon, device=device.type, threads=threads, division=division
-    )
-    actions = (torch.rand(horizon, num_envs, sim.nu, device=device) * 2 - 1).requires_grad_()
-    calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)
-    captured = [graph.capture(call, device) if "graph" in technique else call for call in calls]
-    no_grad, one_way, both = (min(timed(call, device, warmup=3, calls=4)) for call in captured)
-    return {
-        "task": name,
-        "environments": num_envs,
-        "horizon": horizon,
-        "technique": technique,
-        "forward (us/substep of all)": 1e6 * one_way / horizon / default.substeps,
-        "backward (us/substep of all)": 1e6 * (both - one_way) / horizon / default.substeps,
-        "differentiated control steps/s": num_envs * horizon / both,
-        "substeps/s without gradient": num_envs * horizon * default.substeps / no_grad,
-        "memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if device.type == "cuda" else "",
-    }
+def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
+    """A window of control steps differentiably, and with its backward pass."""
+    graphs = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"
+    settings = dict.fromkeys([(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons])
+    default, cuda = diffsim.TASKS[name].integration("default"), args.device != "cpu"
+    for (num_envs, horizon), technique in product(settings, graphs if cuda else THREADS):
+        if cuda:
+            gc.collect()  # the graphs of the setting before
+            torch.cuda.empty_cache()
+            torch.cuda.synchronize()
+            free = torch.cuda.mem_get_info()[0]
+        env = diffsim.make(name, num_envs=num_envs, seed=0, device=args.device)
+        scene, steps = env.scene, num_envs * horizon
+        numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
+        if 4 * numbers * steps * default.substeps > MAX_MEMORY:
+            continue
+        options = dict[str, Any](device=args.device, threads=THREADS.get(technique))
+        options["division"] = divide(scene) if "one thread" in technique else None
+        sim = Simulator(scene, num_envs, default, horizon=horizon, **options)
+        actions = (torch.rand(horizon, num_envs, sim.nu, device=env.device) * 2 - 1).requires_grad_()
+        calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]
+        captured = [graph.capture(call, env.device) if "graph" in technique else call for call in calls]
+        one_way, both = (min(timed(call, env.device, warmup=3, calls=4)) for call in captured)
+        passes = {"forward": one_way, "backward": both - one_way}
+        row = {"task": name, "environments": num_envs, "horizon": horizon, "technique": technique}
+        row |= {f"{way} (us/substep of all)": 1e6 * s / horizon / default.substeps for way, s in passes.items()}
+        row["differentiated control steps/s"] = steps / both
+        yield row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if cuda else ""}
 
 
 def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     """Microseconds of one differentiated control step of one environment, against environments and horizon."""
-    panels, unit = list[Panel](), "us per control step, forward + backward"
+    panels, unit, speed = list[Panel](), "us per control step, forward + backward", "differentiated control steps/s"
     for x, fixed, value in (("environments", "horizon", "32"), ("horizon", "environments", "64")):
-        points = [
-            {**row, unit: str(1e6 / float(row["differentiated control steps/s"]))}
-            | {"curve": f"{row['task']}, {row['technique']}"}
-            for row in rows
-            if row[fixed] == value
-        ]
+        own = [row for row in rows if row[fixed] == value]
+        points = [{x: r[x], unit: str(1e6 / float(r[speed])), "curve": f"{r['task']}, {r['technique']}"} for r in own]
         panels.append(Panel(lines(points, x, unit, "curve"), "", f"{x} ({fixed} {value})", unit, "xy"))
     plot(args.picture("speed"), [panels], (4.5, 3.6))
 
@@ -310,24 +285,22 @@ def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
     yield {**row, "critic, ms": critic, **{f"published {part}, s (TITAN X)": seconds for part, seconds in published}}
 
 
-def start(command: Sequence[str], directory: Path, cache: str) -> tuple[float, float]:
-    """Seconds from a script's start to the end of its first iteration, and its peak memory in MiB."""
-    began, first, ended = time.perf_counter(), None, 0
+def start(command: Sequence[str], directory: Path, cache: str) -> float:
+    """Seconds from a script's start to the end of its first iteration; waits for its end."""
+    began, first = time.perf_counter(), None
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"WARP_CACHE_PATH": cache})
-    while not ended:
-        ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+    while process.poll() is None:
         if first is None and read_csv(directory / "progress.csv"):
             first = time.perf_counter() - began
         time.sleep(0.01)
-    process.returncode = os.waitstatus_to_exitcode(status)
     if first is None or process.returncode:
         fail(f"{' '.join(command)} failed")
-    return first, usage.ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
+    return first
 
 
 def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
     """Iterations of a script in a process of its own, which is never evaluated."""
-    techniques = {"cpu, 1 thread": ["--threads", "1"], "cpu, all cores": ["--threads", str(available_cores())]}
+    techniques = {technique: ["--threads", str(threads)] for technique, threads in THREADS.items()}
     if args.device != "cpu":
         techniques = {"cuda graph": [], "cuda, eager": ["--no-cuda-graph"]}
     words = f"{args.script}.py --env {name} --device {args.device} --quiet --iterations {args.iterations + 4}"
@@ -336,21 +309,18 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
     for technique, flags in techniques.items():
         with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as runs:
             run = Path(runs)
-            cold, _ = start([*command, *flags, "--stop-after", "1", "--run-dir", f"{run}/cold"], run / "cold", cache)
+            cold = start([*command, *flags, "--stop-after", "1", "--run-dir", f"{run}/cold"], run / "cold", cache)
             last = ["--stop-after", str(args.iterations + 3), "--run-dir", f"{run}/warm"]
-            warm, memory = start([*command, *flags, *last], run / "warm", cache)
+            warm = start([*command, *flags, *last], run / "warm", cache)
             progress = read_csv(run / "warm" / "progress.csv")[3:]
             num_envs = json.loads((run / "warm" / "args.json").read_text())["num_envs"]
         critic = [1e3 * float(row["time_update_critic"]) for row in progress if "time_update_critic" in row]
-        yield {
-            "task": name,
-            "environments": num_envs,
-            "device": technique,
-            "script": " ".join((args.script, *args.arguments)),
+        row = {"task": name, "environments": num_envs, "device": technique}
+        row["script"] = " ".join((args.script, *args.arguments))
+        yield row | {
             "iteration (ms)": 1e3 * median(float(row["time_total"]) for row in progress),
             "critic": median(critic) if critic else "",
             "start to first iteration (s)": warm,
-            "peak memory (MiB)": memory,
             "start with nothing compiled (s)": cold,
         }
 

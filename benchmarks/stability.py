@@ -15,11 +15,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import motions
@@ -27,13 +25,15 @@ import mujoco
 import numpy as np
 import torch
 from common import Line, Panel, Part, TaskName, lines, measured, plot, run
-from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay, simulator
-from tables import Row, markdown
+from groups import grouped, numbers
+from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay
+from tables import Row
 from torch import Tensor
 
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.training import Count
+from diffsim.view import gait
 
 PartName = Literal["step", "sweeps", "horizon", "long", "energy"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
@@ -54,7 +54,7 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 }
 NEEDS_GROUND = list(SWEEPS)[:5]
 CONSTANTS = {"contact stiffness x": ("k_n", None), "contact damping x": ("k_d", None), "friction": ("mu", 1.0)}
-SWEEP_KEY = ("task", "integrator", "sweep", "value")
+SWEEP_KEY, ENERGY_KEY = ("task", "integrator", "sweep", "value"), ("links", "substeps", "integrator")
 CHAINS, CHAIN_SUBSTEPS = (1, 5, 20), (16, 32, 64)  # links; substeps
 
 
@@ -75,11 +75,12 @@ class Case(motions.Case):
 
     @cached_property
     def reference(self) -> Simulator:
-        return simulator(self.scene, integration("semi_implicit", 64 * self.task.substeps), self.n, torch.float64)
+        finest = integration("semi_implicit", 64 * self.task.substeps)
+        return Simulator(self.scene, self.n, finest, dtype=torch.float64)
 
     @cached_property
     def actions(self) -> Tensor:
-        return motions.closed_loop(self.reference, self.task, self.policy, self.qpos, self.qvel, 120)
+        return self.actions_in(self.reference)
 
     def kinetic(self, sim: Simulator, actions: Tensor) -> tuple[float, int]:
         """The largest kinetic energy under these actions, and how many environments did not stay finite."""
@@ -94,13 +95,19 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
     for integrator in INTEGRATORS:
         stable: dict[int, bool] = {}
         for count in (c for c in COUNTS if c <= 4 * default and (integrator != "extrapolated" or c % 2 == 0)):
-            sim = simulator(case.scene, integration(integrator, count), case.n)
+            sim = Simulator(case.scene, case.n, integration(integrator, count))
             energy, bad = case.kinetic(sim, case.actions)
             stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
         fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        row: Row = {"task": name, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
-        yield {**row, "largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
+        row = {"task": name, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
+        yield row | {"largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
+
+
+def fewest_substeps(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each task, a column for each integrator."""
+    groups = grouped(rows, "task", "default").items()
+    return [{"task": t, "default": n} | {r["integrator"]: r["fewest substeps"] for r in own} for (t, n), own in groups]
 
 
 def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple[float, int]:
@@ -115,18 +122,18 @@ def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -
     return gradient.norm(dim=1).max().item(), int(sim.nonfinite_gradients.sum()) - before
 
 
-def stored(scene: Scene, model: mujoco.MjModel, qpos: Tensor) -> Array:
+def stored(scene: Scene, qpos: Tensor) -> Array:
     """A lower bound (N,) of the energy in the springs of ground and limits."""
     links = np.flatnonzero(np.isfinite(scene.upper))
     joints = qpos[:, scene.qpos_adr[links]].numpy()
     beyond = np.maximum(scene.lower[links] - joints, 0) + np.maximum(joints - scene.upper[links], 0)
-    ground = (np.minimum(motions.heights(model, qpos), 0) ** 2).sum(1) if scene.ncontact else 0.0
+    ground = (np.maximum(gait.trace(scene, qpos.numpy()).depth, 0) ** 2).sum(1)
     return 0.5 * (scene.k_limit[links] * beyond**2).sum(1) + 0.5 * scene.k_n * ground
 
 
 def bounded(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> bool:
     """Whether the energy along qpos (T, N, nq), qvel (T, N, nv) stays that of the start, springs included, to 10 %."""
-    start = mechanics(model, qpos[0], qvel[0])[1] + stored(scene, model, qpos[0])
+    start = mechanics(model, qpos[0], qvel[0])[1] + stored(scene, qpos[0])
     path = np.array([mechanics(model, q, v)[:2] for q, v in zip(qpos, qvel, strict=True)])
     floor = (path[:, 1] - path[:, 0]).min(0)  # potential energy has no zero: its least value is taken off
     return bool((path[:, 1] - floor <= 1.1 * (start - floor) + 1e-3).all())
@@ -135,9 +142,10 @@ def bounded(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> 
 def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, Tensor, Tensor, Tensor]:
     """Scene, MuJoCo's model, qpos, qvel and actions of one extreme."""
     scene, model, qpos, qvel = case.scene, case.model, case.qpos.clone(), case.qvel.clone()
-    actions = motions.idle(scene).expand(60, case.n, scene.nu)
+    idle = torch.where(torch.tensor(scene.motor_link) > 0, 0.0, -1.0).double()  # without force: of a motor, of a muscle
+    actions = idle.expand(60, case.n, scene.nu)
     height = 2 if scene.floating else 1  # in qpos; the planar robots' second slide
-    lowest = torch.tensor(motions.heights(model, qpos).min(1)) if scene.ncontact else 0.0
+    lowest = torch.tensor(-gait.trace(scene, qpos.numpy()).depth.max(1)) if scene.ncontact else 0.0
     if sweep in CONSTANTS:
         name, start = CONSTANTS[sweep]
         changes: dict[str, Any] = {name: value * (getattr(scene, name) if start is None else start)}
@@ -179,7 +187,7 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
         scene, model, qpos, qvel, actions = setup(case, sweep, value)
         limit = case.kinetic(case.reference, actions)[0] if "action" in sweep else 0.0
         for integrator in INTEGRATORS:
-            sim = simulator(scene, integration(integrator, case.task.substeps), case.n, horizon=8)
+            sim = Simulator(scene, case.n, integration(integrator, case.task.substeps), horizon=8)
             if "action" in sweep:
                 energy, bad = case.kinetic(sim, actions)
                 within = energy < 2 * limit
@@ -192,35 +200,28 @@ def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
             yield {**row, "gradient": norm, "gradients not finite": lost}
 
 
-def steps(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task: its default's substeps, and the fewest of each integrator."""
-    lines = dict[str, dict[str, object]]()
-    for row in rows:
-        line = lines.setdefault(row["task"], {"task": row["task"], "default": row["default"]})
-        line[row["integrator"]] = row["fewest substeps"]
-    return list(lines.values())
-
-
-def failures(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task and sweep that fails: of each integrator the first value that is not finite or bounded."""
-    lines = dict[tuple[str, str], dict[str, object]]()
-    for row in rows:
-        empty: dict[str, object] = {"task": row["task"], "sweep": row["sweep"], **dict.fromkeys(INTEGRATORS, "-")}
-        line = lines.setdefault((row["task"], row["sweep"]), empty)
-        if line[row["integrator"]] == "-" and "False" in (row["finite"], row["energy bounded"]):
-            how = "energy" if row["finite"] == "True" else "not finite"
-            line[row["integrator"]] = f"{row['value']} ({how})"
-    return [line for line in lines.values() if {*map(line.get, INTEGRATORS)} != {"-"}]
+def summary(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each task and sweep in which an integrator failed: of each the first value not finite or bounded."""
+    lines = list[Row]()
+    for (task, sweep), group in grouped(rows, "task", "sweep").items():
+        failed: dict[str, str] = dict.fromkeys(INTEGRATORS, "-")
+        for row in reversed(group):
+            if "False" in (row["finite"], row["energy bounded"]):
+                how = "energy" if row["finite"] == "True" else "not finite"
+                failed[row["integrator"]] = f"{row['value']} ({how})"
+        if {*failed.values()} != {"-"}:
+            lines.append({"task": task, "sweep": sweep, **failed})
+    return lines
 
 
 def growth(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task, explicitly integrated: the gradient's norm over some horizons."""
-    lines = dict[str, dict[str, object]]()
-    for row in rows:
-        if row["integrator"] == "semi_implicit" and int(row["horizon"]) in SHOWN:
-            line = lines.setdefault(row["task"], {"task": row["task"], "integrator": row["integrator"]})
-            line[row["horizon"]] = row["gradient"]
-    return list(lines.values())
+    explicit = (row for row in rows if row["integrator"] == "semi_implicit" and int(row["horizon"]) in SHOWN)
+    groups = grouped(explicit, "task", "integrator").items()
+    return [
+        {"task": task, "integrator": kind} | {row["horizon"]: row["gradient"] for row in own}
+        for (task, kind), own in groups
+    ]
 
 
 def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
@@ -228,7 +229,7 @@ def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
     policy = copy.deepcopy(case.policy).float()
     weights = list(policy.parameters())  # of which the noise's standard deviation plays no part
     for integrator in INTEGRATORS:
-        sim = simulator(case.scene, integration(integrator, task.substeps), case.n, horizon=HORIZONS[-1])
+        sim = Simulator(case.scene, case.n, integration(integrator, task.substeps), horizon=HORIZONS[-1])
         for horizon in HORIZONS:
             before, bad = int(sim.nonfinite_gradients.sum()), 0
             q, v, total = case.qpos.float(), case.qvel.float(), torch.zeros(())
@@ -265,46 +266,42 @@ def chain(links: int) -> Scene:
     """A fixed chain of capsules of 0.2 m on parallel hinges, without damping and contact."""
     link = '<joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.04" contype="0" conaffinity="0"/>'
     bodies = "".join(f'<body pos="{0.2 * (k > 0)} 0 0">{link}' for k in range(links)) + links * "</body>"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "chain.xml"
-        path.write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-        return diffsim.load_scene(path)
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    return diffsim.load_scene(model)
 
 
-def measure_energy(links: int, states: int) -> Iterator[Row]:
+def measure_energy(args: Args, links: int) -> Iterator[Row]:
     """Chains fall from about horizontal at rest: how far the energy leaves that of the start, relative to the fall."""
     scene, generator = chain(links), torch.Generator().manual_seed(0)
-    qpos = 0.1 * torch.randn((states, links), generator=generator, dtype=torch.float64)
+    qpos = 0.1 * torch.randn((args.states, links), generator=generator, dtype=torch.float64)
     down = torch.zeros(1, links, dtype=torch.float64)
     down[0, 0] = math.pi / 2
     least = mechanics(scene.mj_model, down, torch.zeros_like(down))[1]
     for substeps in CHAIN_SUBSTEPS:
         for integrator in ("semi_implicit", "extrapolated"):
-            sim = simulator(scene, integration(integrator, substeps), states)
-            q, v, bad = replay(sim, qpos, torch.zeros_like(qpos), torch.zeros(600, states, 0))
+            sim = Simulator(scene, args.states, integration(integrator, substeps))
+            q, v, bad = replay(sim, qpos, torch.zeros_like(qpos), torch.zeros(600, args.states, 0))
             energy = np.array([mechanics(scene.mj_model, a, b)[1] for a, b in zip(q, v, strict=True)]) - least
             drift = np.median(abs(energy / energy[0] - 1).max(0))
             row = {"links": links, "substeps": substeps, "integrator": integrator, "energy drift": float(drift)}
-            yield row | {"chains": states, "not finite": bad}
+            yield row | {"chains": args.states, "not finite": bad}
 
 
-def energies(args: Args) -> list[Row]:
-    """The table of chains: a row for each number of links and substeps, a column for each integrator."""
-    for row in () if args.draw_only else (row for links in CHAINS for row in measure_energy(links, args.states)):
-        args.merge("stability_energy", [row], ("links", "substeps", "integrator"))
-    table: dict[tuple[str, str], dict[str, object]] = {}
-    for row in args.read("stability_energy"):
-        line = table.setdefault((row["links"], row["substeps"]), {"links": row["links"], "substeps": row["substeps"]})
+def energies(rows: list[dict[str, str]]) -> list[Row]:
+    """A row for each number of links and substeps, a column for each integrator."""
+
+    def cell(row: dict[str, str]) -> str:
         lost = f" ({row['not finite']} of {row['chains']} not finite)" if int(row["not finite"]) else ""
-        line[row["integrator"]] = row["energy drift"] + lost
-    return list(table.values())
+        return row["energy drift"] + lost
+
+    groups = grouped(rows, "links", "substeps").items()
+    return [{"links": n, "substeps": m} | {row["integrator"]: cell(row) for row in own} for (n, m), own in groups]
 
 
 def draw(args: Args, rows: list[dict[str, str]]) -> None:
     panels = list[Panel]()
-    for name in dict.fromkeys(row["task"] for row in rows):
-        own = [row for row in rows if row["task"] == name]
-        ends = [float(row["gradient"]) for row in own]
+    for (name,), own in grouped(rows, "task").items():
+        ends = numbers(own, "gradient")
         window = Line((32, 32), (min(ends), max(ends)), "k--", "SHAC's window", 0.8)
         curves = [*lines(own, "horizon", "gradient", "integrator"), window]
         panels.append(Panel(curves, name, "control steps", "" if panels else "|gradient of the mean reward|", log="xy"))
@@ -313,19 +310,18 @@ def draw(args: Args, rows: list[dict[str, str]]) -> None:
 
 PAGE = "stability.md"
 PARTS: dict[PartName, Part] = {
-    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE, steps),
-    "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, failures),
+    "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE, fewest_substeps),
+    "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, summary),
     "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon"), "horizon", PAGE, growth),
     "long": Part("stability_long", measure_long, ("task",)),
+    "energy": Part("stability_energy", measure_energy, ENERGY_KEY, "energy", PAGE, energies),
 }
 
 
 def main(args: Args) -> None:
     for part in args.parts:
-        if part == "energy":
-            args.publish(part, markdown(energies(args)), "stability.md")
-            continue
-        rows = measured(args, PARTS[part])
+        changes: dict[str, Any] = {"env": CHAINS} if part == "energy" else {}
+        rows = measured(dataclasses.replace(args, **changes), PARTS[part])
         if part == "horizon" and rows:
             draw(args, rows)
 

@@ -27,12 +27,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
+from typing import NamedTuple
 
 import common
 import mujoco
 import numpy as np
 import torch
 from common import ABOUT, Case, load_case, run
+from groups import grouped, middle, numbers
 from numpy.typing import NDArray
 from tables import Row, markdown
 from torch import Tensor
@@ -99,15 +101,10 @@ def mujoco_model(scene: Scene, control_dt: float, substeps: int | None = None) -
 
 
 class MuJoCo:
-    """N robots in MuJoCo with its own contact and limits on a scene's file.
+    """N robots in MuJoCo with its own contact and limits on a scene's file, of whose friction `friction` is a factor.
 
-    Args:
-        scene: its file is read again, whose mu is the friction of all geoms, whatever the scene's own is.
-        num_envs: number of robots N.
-        control_dt: s of a control step.
-        friction: factor on that friction.
-        own_friction: each geom keeps the friction that the file gives it, in place of the springs' mu.
-        substeps: see mujoco_model.
+    That is the springs' mu of the file, whatever the scene's own is, or with own_friction what each geom has there. Of
+    substeps see mujoco_model.
     """
 
     def __init__(
@@ -166,23 +163,14 @@ def load(path: Path, args: Args) -> Case:
     return case
 
 
-@dataclass
-class Motion:
-    """The first episode of each of n robots in one world.
+class Motion(NamedTuple):
+    """The first episode of each of n robots in one world."""
 
-    Attributes:
-        qpos: (T + 1, n, nq) from the start on; valid up to an episode's length.
-        qvel: (T + 1, n, nv).
-        returns: (n,).
-        lengths: (n,) control steps.
-        fallen: (n,) whether the episode ended with a fall.
-    """
-
-    qpos: Array
-    qvel: Array
-    returns: Array
-    lengths: np.ndarray
-    fallen: Flags
+    qpos: Array  # (T + 1, n, nq) from the start on; valid up to an episode's length
+    qvel: Array  # (T + 1, n, nv)
+    returns: Array  # (n,)
+    lengths: np.ndarray  # (n,) control steps
+    fallen: Flags  # (n,) whether the episode ended with a fall
 
 
 @torch.no_grad()
@@ -191,9 +179,7 @@ def act(
 ) -> Motion:
     """Episodes of at most so many steps in a world, from qpos (n, nq) and qvel (n, nv).
 
-    Args:
-        task: in float64, on the CPU; says what is observed and rewarded, and who has fallen.
-        policy: observations (n, obs_dim) in float32 -> actions (n, nu).
+    The task, in float64 on the CPU, says what is observed and rewarded, and who has fallen.
     """
     n = len(qpos)
     alive, fallen, returns, lengths = np.ones(n, bool), np.zeros(n, bool), np.zeros(n), np.zeros(n, int)
@@ -285,12 +271,6 @@ def compare(case: Case, args: Args) -> dict[str, Motion]:
 # What is shown --------------------------------------------------------------------------------------------------------
 
 
-def middle(rows: Sequence[dict[str, str]], column: str, form: str) -> str:
-    """The median of a column's numbers, or nothing."""
-    values = [float(row[column]) for row in rows if row[column]]
-    return format(median(values), form) if values else ""
-
-
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task, contact and learner, over its seeds: medians of the speed in each world in m/s, or of the
     return of a robot that does not travel, what is kept of the training's own speed in the world that judges, mean
@@ -298,29 +278,32 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
     Runs that are not named {learner}/{task}__{seed} have a line each.
     """
-    groups = dict[tuple[str, ...], dict[str, list[dict[str, str]]]]()
-    tasks = [*diffsim.TASKS, *(row["task"] for row in rows)]
-    for row in sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft")):
+
+    def learner_of(row: dict[str, str]) -> str:
         folder, _, run = row["checkpoint"].rpartition("/")
-        learner = folder if run == f"{row['task']}__{row['seed']}" else row["checkpoint"]
-        key = row["task"], row["contact"], learner, row.get("trained in") or HOME
-        groups.setdefault(key, {}).setdefault(row["condition"], []).append(row)
-    names = {name for group in groups.values() for name in group if name.startswith("MuJoCo x")}
-    order, lines = sorted(names, key=lambda name: float(name.partition("x")[2])), list[Row]()
-    same = [SAME] if any(SAME in group for group in groups.values()) else []
-    for (task, contact, learner, home), group in groups.items():
+        return folder if run == f"{row['task']}__{row['seed']}" else row["checkpoint"]
+
+    rows = [row | {"learner": learner_of(row), "trained in": row.get("trained in") or HOME} for row in rows]
+    tasks = [*diffsim.TASKS, *(row["task"] for row in rows)]
+    rows = sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft"))
+    names, lines = {row["condition"] for row in rows}, list[Row]()
+    worlds = sorted((name for name in names if name.startswith("MuJoCo x")), key=lambda name: float(name[8:]))
+    for (task, contact, learner, home), own in grouped(rows, "task", "contact", "learner", "trained in").items():
+        group = {name: found for (name,), found in grouped(own, "condition").items()}
         here, there = group["here"], group.get("MuJoCo x1", [])
         unit = ("speed", ".2f") if here[0]["speed"] else ("return", ".0f")
         trained, judge = ("here", "MuJoCo x1") if home == HOME else (home, "here")
-        kept = [float(row["kept"]) for row in group.get(judge, []) if row["kept"]]
-        shares = [mean(float(row["whole"]) for row in group[name]) for name in ("here", *order) if name in group]
-        line: Row = {"task": task, "contact": contact, "learner": learner, "seeds": len(here)}
-        line = {**line, **{name: middle(group.get(name, []), *unit) for name in ("here", *same, *order)}}
-        line = {**line, "trained in": trained, "judged in": judge}
-        line = {**line, "kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
-        line = {**line, "whole": " / ".join(f"{share:.0%}" for share in shares)}
-        depths = {"depth here": here, "depth MuJoCo x1": there}
-        lines.append({**line, **{name: middle(found, "penetration", ".1f") for name, found in depths.items()}})
+        kept = numbers(group.get(judge, []), "kept")
+        shares = [mean(numbers(group[name], "whole")) for name in ("here", *worlds) if name in group]
+        speeds = {name: middle(group.get(name, []), *unit) for name in ("here", *({SAME} & names), *worlds)}
+        lines.append(
+            {"task": task, "contact": contact, "learner": learner, "seeds": len(here)}
+            | speeds
+            | {"trained in": trained, "judged in": judge}
+            | {"kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
+            | {"whole": " / ".join(f"{share:.0%}" for share in shares)}
+            | {"depth here": middle(here, "penetration", ".1f"), "depth MuJoCo x1": middle(there, "penetration", ".1f")}
+        )
     return lines
 
 

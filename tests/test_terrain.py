@@ -391,8 +391,7 @@ def test_generated_profiles():
 def test_pictures_show_it():
     scene = task_scene("hopper").with_terrain(HILLS)
     page = web.describe(scene, np.zeros((2, scene.nq)), 1 / 60)
-    boxes = [geom for geom in page["geoms"] if geom["body"] == 0]
-    assert len(boxes) == len(HILLS) - 1 and page["floor"] is None
+    np.testing.assert_allclose(page["ground"], HILLS, atol=1e-3)
     try:
         render.check_opengl()
     except RuntimeError as error:

@@ -44,7 +44,7 @@ def in_mujoco(case: Case) -> dict[str, object]:
     """Nothing of muscles, which are not simulated in MuJoCo here."""
     env = case.env
     if isinstance(env.task, Joystick):
-        (found,) = joystick.measure(case.path, joystick.Args(friction=(1.0,)))
+        (found,) = joystick.measure(joystick.Args(friction=(1.0,)), case.path)
         return {"error in MuJoCo": found["error"]}
     if "muscle" in env.scene.features:
         return {}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-
 import foreign
+from common import parse
 from scenes import BOUNDED_SERVOS, pendulum
 from tables import read_csv
 
 
-def test_a_folder_becomes_a_table(tmp_path, monkeypatch, capsys):
+def test_a_folder_becomes_a_table(tmp_path, capsys):
     robots = {
         "servos": BOUNDED_SERVOS,
         "rubbed": pendulum('axis="0 1 0" frictionloss="1"'),
@@ -18,11 +17,10 @@ def test_a_folder_becomes_a_table(tmp_path, monkeypatch, capsys):
     for name, mjcf in robots.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.xml").write_text(mjcf)
-    monkeypatch.setattr(foreign, "OUTPUT", tmp_path / "out")
-    monkeypatch.setattr(sys, "argv", ["foreign.py", str(tmp_path), "--name", "mine", "--states", "8"])
-    foreign.main()
+    flags = ["--name", "mine", "--states", "8", "--output", str(tmp_path / "out")]
+    foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
     assert "2 of 3 load" in capsys.readouterr().out
-    rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "cpu" / "foreign.csv")}
+    rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
     assert rows["bad/scene.xml"]["refused"] == "joint: damping is -1, must not be negative"
     for name in ("servos", "rubbed"):
         assert rows[f"{name}/scene.xml"]["refused"] == ""

@@ -53,10 +53,12 @@ def test_table_and_pictures(runs: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert capsys.readouterr().out == first and len(list((tmp_path / "figures").glob("gps_*.png"))) == 2
 
 
-def test_a_run_that_was_stopped_before_an_evaluation_has_no_end() -> None:
-    rows = [dict(eval_objective=value) for value in ("", "-2.5", "")]
-    assert experiments.final_return(rows) == -2.5
-    assert math.isnan(experiments.final_return(rows[:1]))
+def test_runs_that_were_stopped_before_an_evaluation_are_not_shown() -> None:
+    row = dict(env="hopper", variant="full", horizon="500", gps_guides="-3", gps_objective="-4", iteration="1")
+    rows = [row | dict(seed=seed, eval_objective=value) for seed in "12" for value in ("", "-2.5" * (seed == "1"), "")]
+    (line,) = experiments.table(rows)
+    assert line["end, each seed"] == "-2.5"
+    assert experiments.table(rows[3:]) == []
 
 
 def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -> None:
@@ -122,19 +124,24 @@ def test_the_list_holds_the_runs_that_the_page_shows() -> None:
         parse(env, case, *flags)
 
 
-def test_a_finished_run_is_kept(runs: Path) -> None:
-    before = (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns
-    assert experiments.train(runs / "cartpole__full__1", [], 4) == "cartpole__full__1: done before"
-    assert (runs / "cartpole__full__1" / "checkpoint.pt").stat().st_mtime_ns == before
+def trained(runs: Path, name: str, flags: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    experiments.train(experiments.Runner(experiments.Args(runs=runs)), name, flags, 4)
+    return capsys.readouterr().out.splitlines()[-1]
 
 
-def test_an_interrupted_run_goes_on(runs: Path, tmp_path: Path) -> None:
+def test_a_finished_run_is_kept(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = {path: path.stat().st_mtime_ns for path in (runs / "cartpole__full__1").iterdir()}
+    assert trained(runs, "cartpole__full__1", [], capsys) == "cartpole__full__1: done"
+    assert files == {path: path.stat().st_mtime_ns for path in (runs / "cartpole__full__1").iterdir()}
+
+
+def test_an_interrupted_run_goes_on(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Though its plan came from a file, which the checkpoint does not name."""
     directory = tmp_path / "cartpole__nonguided__1"
     first = ["--demonstration", str(runs / "cartpole__full__1" / "plan.npz"), *SMALL[2:], "--iterations", "2"]
     flags = [*first, *experiments.CASES["nonguided"].split()]
     run(gps_variants, directory, "--env", "cartpole", *flags, "--stop-after", "1")
-    assert experiments.train(directory, flags, 4) == "cartpole__nonguided__1: done"
+    assert trained(tmp_path, directory.name, flags, capsys) == "cartpole__nonguided__1: done"
     assert len(read_csv(directory / "progress.csv")) == 3
 
 
@@ -159,5 +166,5 @@ def test_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
 
 
 def test_the_page_has_the_table_of_the_csv_file() -> None:
-    runs = experiments.grouped(read_csv(RESULTS / "cpu" / "gps_runs.csv"), *experiments.RUN)
+    runs = read_csv(RESULTS / "cpu" / "gps_runs.csv")
     assert markdown(experiments.table(runs)) in (DOCS / "gps.md").read_text()

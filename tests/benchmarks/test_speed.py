@@ -9,9 +9,9 @@ import speed
 import stability
 import torch
 import tradeoff
-from common import Panel, lines, parse
+from common import DOCS, RESULTS, Panel, lines, measured, parse
 from learners import refusal
-from tables import read_csv
+from tables import markdown, read_csv
 
 import diffsim
 
@@ -47,14 +47,21 @@ def test_energy_along_a_fall(faster: float, bounded: bool) -> None:
 
 
 def test_a_sweep_s_line_names_the_first_value_that_fails() -> None:
-    cells = {"task": "ant", "sweep": "speed (m/s)", "integrator": "semi_implicit", "gradient": "2"}
+    cells = {"task": "ant", "sweep": "speed (m/s)", "integrator": "semi_implicit"}
     rows = [
         cells | {"value": value, "finite": finite, "energy bounded": energy}
         for value, finite, energy in (("1", "True", "True"), ("10", "True", "False"), ("100", "False", "False"))
     ]
-    (line,) = stability.summary(rows)
-    assert line["semi_implicit"] == "10 (energy)" and line["implicit 0"] == "not measured"
-    assert line["range"] == "1 .. 100" and line["largest gradient"] == 2.0
+    (line,) = stability.summary([*rows, rows[0] | {"sweep": "action"}])  # which nothing fails
+    assert line["sweep"] == "speed (m/s)" and [*line.values()][2:] == ["10 (energy)", "-", "-", "-"]
+
+
+def test_the_pages_have_the_tables_of_the_csv_files(capsys: pytest.CaptureFixture[str]) -> None:
+    for part in ("step", "sweeps", "energy"):
+        measured(stability.Args(draw_only=True, output=RESULTS / "cpu"), stability.PARTS[part])
+        assert capsys.readouterr().out.removesuffix("\n") in (DOCS / "stability.md").read_text()
+    presets = tradeoff.presets(read_csv(RESULTS / "cpu" / "tradeoff.csv"))
+    assert markdown([*presets]) in (DOCS / "accuracy.md").read_text()
 
 
 def test_the_command_counts_episodes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
