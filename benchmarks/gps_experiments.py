@@ -326,7 +326,7 @@ def table(runs: Runs) -> list[Row]:
 
 
 def shown(runs: Runs) -> list[Row]:
-    """Of each case, at some steps: mean log weight of the guides' samples, and effective samples; medians over seeds."""
+    """Of each case, at some steps: mean log weight of the guides' samples, effective samples; medians over seeds."""
     result = list[Row]()
     for (env, case), rows in runs.items():
         line = dict(task=env, case=case)
