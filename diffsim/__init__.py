@@ -97,7 +97,8 @@ def make(
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
     scene = load_scene(robot(task))
-    integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes, touchdown)
+    asked = dict(substeps=substeps, theta=theta, passes=passes, touchdown=touchdown)
+    integration = task.integration(accuracy, contact).replaced(integrator, **asked)
     if penalty and integration.integrator == "mujoco":
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
     scene = scene.with_penalty(penalty or {})

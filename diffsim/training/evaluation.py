@@ -168,26 +168,12 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 
 def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **options: Any) -> DiffEnv:
     """The task as the flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
-    options = {"control_dt": getattr(args, "control_dt", None)} | options  # a flag of gps.py alone
+    names = "integrator substeps theta passes touchdown contact early_termination clip".split()
+    flags = {name: getattr(args, name) for name in names}
+    flags |= dict(penalty=parse_penalty(args.penalty), threads=args.threads or None)
+    flags["control_dt"] = getattr(args, "control_dt", None)  # a flag of gps.py alone
     try:
-        return diffsim.make(
-            args.env,
-            num_envs,
-            args.device,
-            seed,
-            horizon,
-            substeps=args.substeps,
-            integrator=args.integrator,
-            theta=args.theta,
-            passes=args.passes,
-            touchdown=args.touchdown,
-            contact=args.contact,
-            penalty=parse_penalty(args.penalty),
-            threads=args.threads or None,
-            early_termination=args.early_termination,
-            clip=args.clip,
-            **options,
-        )
+        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **flags | options)
     except ValueError as error:
         fail(error)
 
