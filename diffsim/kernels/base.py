@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spec import KernelSpec
 
 
@@ -73,4 +73,4 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
             a[r] = y * load(ck_f, row, BASE + r * (r + 1) / 2 + r, e)
         return a
 
-    return SimpleNamespace(factor_base=factor_base, store_base=store_base, solve_base=solve_base)
+    return by_name(factor_base, store_base, solve_base)

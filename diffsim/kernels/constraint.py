@@ -30,7 +30,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.factors import K_D, K_N, MU
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -287,10 +287,4 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
         return gain
 
-    return SimpleNamespace(
-        add_contacts=add_contacts,
-        contacts_along=contacts_along,
-        add_contacts_adjoint=add_contacts_adjoint,
-        joint_constraint=joint_constraint,
-        joint_gain=joint_gain,
-    )
+    return by_name(add_contacts, contacts_along, add_contacts_adjoint, joint_constraint, joint_gain)

@@ -19,8 +19,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.factors import K_D, K_N, K_T, MU
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
@@ -31,7 +30,7 @@ from diffsim.kernels.wide import blocks
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
     T, vec3, vec4, vec6, mat3, Model, Law = t.T, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
-    Place, force_at, point_velocity, pick = kinematics(spec).Place, sp.force_at, sp.point_velocity, block.pick
+    Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
     sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, VARIED = spec.implicit, spec.varied
 
@@ -230,4 +229,4 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
         return adj_a, adj_v, adj_w, adj_p
 
-    return SimpleNamespace(add_contacts=add_contacts, add_contacts_adjoint=add_contacts_adjoint)
+    return by_name(add_contacts, add_contacts_adjoint)

@@ -8,8 +8,7 @@ import warp as wp
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
 from diffsim.kernels.factors import MASS
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 
@@ -18,7 +17,7 @@ from diffsim.kernels.spec import KernelSpec
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, vec6, mat3, Model, Law = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law
-    momentum, Place, VARIED = sp.momentum, kinematics(spec).Place, spec.varied
+    momentum, Place, VARIED = sp.momentum, t.Place, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
     LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
     DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
@@ -117,4 +116,4 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             adj_w = law.mass * adj_w
         return adj_d, adj_w
 
-    return SimpleNamespace(link_inertia=link_inertia, link_adjoint=link_adjoint, damping_adjoint=damping_adjoint)
+    return by_name(link_inertia, link_adjoint, damping_adjoint)

@@ -132,6 +132,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         mat3=wp.types.matrix((3, 3), T),
         mat6=wp.types.matrix((6, 6), T),
         quat=wp.types.quaternion(T),
+        Place=wp.types.vector(2, T) if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
         array=wp.array(dtype=T),
         array2=wp.array2d(dtype=U),  # a row for each environment
         array3=wp.array3d(dtype=T),  # checkpoints
@@ -139,6 +140,11 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         Model=scene_types(U).Model,
         Law=Law,
     )
+
+
+def by_name(*functions: wp.Function) -> SimpleNamespace:
+    """What a module of the kernels offers to others."""
+    return SimpleNamespace(**{function.func.__name__: function for function in functions})
 
 
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:

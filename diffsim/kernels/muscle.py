@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.hill import hill_law
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -31,7 +31,7 @@ SHORTEST = 1e-6  # m
 
 @cache
 def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
-    t, sp, hill = types(spec), spatial(spec), hill_law(spec).hill
+    t, sp, hill = types(spec), spatial(spec), hill_law(spec)
     T, vec3, vec6, Model, Law, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.array
     join, point_velocity = sp.join, sp.point_velocity
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
@@ -229,4 +229,4 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
                 by_rate[k] = power[k] * curve[3]
         add_pull_adjoint(m, lane, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, adj_pull)
 
-    return SimpleNamespace(activate=activate, add_muscles=add_muscles, add_muscles_adjoint=add_muscles_adjoint)
+    return by_name(activate, add_muscles, add_muscles_adjoint)
