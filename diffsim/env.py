@@ -326,16 +326,9 @@ class DiffEnv(VectorEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
-        return {
-            "task": self.task.name,
-            "qpos": self.qpos.detach().clone(),
-            "qvel": self.qvel.detach().clone(),
-            "obs": self._obs.detach().clone(),
-            "episode_step": self.episode_step.clone(),
-            "episode_return": self._episode_return.clone(),
-            "generator": self.generator.get_state(),
-            **({"memory": self.memory.detach().clone()} if self.task.num_memory else {}),
-        }
+        names = *self._parts, "episode_step", "_episode_return"
+        tensors = {name.lstrip("_"): getattr(self, name).detach().clone() for name in names}
+        return {"task": self.task.name, **tensors, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a state_dict of an environment of the same task, size and dtype; call `detach` next.
@@ -353,10 +346,8 @@ class DiffEnv(VectorEnv):
         for name, value in own.items():
             if isinstance(value, Tensor) and (state[name].shape, state[name].dtype) != (value.shape, value.dtype):
                 raise ValueError(f"{name} of the state is of another shape or type")
-        self.qpos, self.qvel = state["qpos"].to(self.device), state["qvel"].to(self.device)
-        self._obs = state["obs"].to(self.device)
+        self._put(state[name.lstrip("_")].to(self.device) for name in self._parts)
         self.episode_step.copy_(state["episode_step"])
-        self.memory = state.get("memory", self.memory).to(self.device)
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
         self._time = self.horizon
