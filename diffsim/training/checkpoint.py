@@ -53,17 +53,11 @@ class Learner(Protocol):
 
 @dataclass
 class SavedPolicy:
-    """A checkpoint's deterministic policy, with where it comes from.
+    """A checkpoint's deterministic policy, with where it comes from."""
 
-    Attributes:
-        network: observations (..., obs_dim) -> actions (..., nu).
-        script, args, iteration: which script trained it, with which arguments (env among them), for how long.
-        simulator: in which it was trained.
-    """
-
-    network: nn.Sequential
-    script: str
-    args: dict[str, Any]
+    network: nn.Sequential  # observations (..., obs_dim) -> actions (..., nu)
+    script: str  # that trained it
+    args: dict[str, Any]  # with which arguments, env among them
     iteration: int
     simulator: str = HOME
 
@@ -82,11 +76,7 @@ def parts(learner: Learner) -> dict[str, Any]:
 def save(path: Path, script: str, learner: Learner, state: Mapping[str, Any]) -> None:
     """Replace the file in one step: whoever reads it finds the old one or the new one, whole.
 
-    Args:
-        path: the file.
-        script: name of the learner's script.
-        learner: whose parts and policy are saved.
-        state: what else continues the run: args and iteration at least.
+    With the learner's parts and policy it holds the state, what else continues the run: args and iteration at least.
     """
     modules = {name: part.state_dict() for name, part in parts(learner).items()}
     policy = {"layers": _describe(learner.policy), "weights": learner.policy.state_dict()}

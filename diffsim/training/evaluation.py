@@ -37,28 +37,17 @@ ENOUGH = 0.97  # of the return, kept there
 
 @dataclass
 class Evaluation:
-    """One episode each of n environments.
+    """One episode each of n environments."""
 
-    Attributes:
-        returns: (n,) undiscounted.
-        lengths: (n,) control steps.
-        speed: mean forward speed, m/s; None for a robot that does not travel.
-        qpos: (T, n, nq) before each step; valid up to an episode's length.
-        action: (T, n, nu) of each step.
-        scene, control_dt: what the episodes are of, to draw them; of several terrains episode i has number i % M.
-        others: what else a script measured, by name.
-        forward: the task's way forward, see Task.
-    """
-
-    returns: Tensor
-    lengths: Tensor
-    speed: float | None
-    qpos: Tensor
-    action: Tensor
-    scene: Scene
-    control_dt: float
-    others: dict[str, float] = field(default_factory=dict)
-    forward: int | None = 0
+    returns: Tensor  # (n,) undiscounted
+    lengths: Tensor  # (n,) control steps
+    speed: float | None  # mean forward speed, m/s; None for a robot that does not travel
+    qpos: Tensor  # (T, n, nq) before each step; valid up to an episode's length
+    action: Tensor  # (T, n, nu) of each step
+    scene: Scene  # to draw the episodes; of several terrains episode i has number i % M
+    control_dt: float  # s
+    others: dict[str, float] = field(default_factory=dict)  # what else a script measured, by name
+    forward: int | None = 0  # the task's way forward, see Task
 
     @property
     def length(self) -> float:
