@@ -257,12 +257,7 @@ def recovery(solref: Sequence[float] | Array) -> Recovery:
 
 
 def contact_constants(mass: float, mobility: Array, solref: Sequence[float]) -> dict[str, float]:
-    """k_n, k_d and k_t.
-
-    Args:
-        mass: kg, of the robot.
-        mobility: (points,) 1/kg, of the contact points, see mobilities.
-        solref: of the contact, MJCF's.
+    """k_n, k_d and k_t of a robot's mass [kg], the mobility (points,) [1/kg] of its contact points, and their solref.
 
     k_n carries its share of the mass as solref asks, but never more than the lightest point stays stable on; k_t halves
     that point's slip in one substep.
@@ -300,11 +295,7 @@ def mass_matrix(m: mujoco.MjModel) -> Array:
 
 
 def mobilities(m: mujoco.MjModel, points: Sequence[tuple[int, Array]]) -> Array:
-    """(points,) 1/kg: acceleration per force of points of the robot, in the direction of least inertia.
-
-    Args:
-        points: (body, position in the world).
-    """
+    """(points,) 1/kg: acceleration per force of points (body, world position), in the direction of least inertia."""
     data = at_rest(m)
     jacobians = np.zeros((len(points), 3, m.nv))
     for jacobian, (body, position) in zip(jacobians, points, strict=True):

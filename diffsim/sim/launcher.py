@@ -38,10 +38,6 @@ class Launcher:
 
     On a CPU some threads take a share of the environments each; on a GPU a launch goes to torch's current stream.
 
-    Args:
-        scene, num_envs: see Simulator.
-        options: checked ones.
-
     Attributes:
         spec: what the kernels were generated for.
         num_blocks: how many blocks of spec.block environments there are, the last of which may not be full.

@@ -40,13 +40,7 @@ class ControlStep(torch.autograd.Function):
 
 
 class Stepper:
-    """Control steps by the kernels; see Simulator.
-
-    Args:
-        launcher: runs the kernels.
-        integration: semi-implicit or implicit, as the launcher's kernels.
-        control_dt, horizon: see Simulator.
-    """
+    """Control steps by the launcher's kernels, which are those of the integration; see Simulator."""
 
     def __init__(self, launcher: Launcher, integration: Integration, control_dt: float, horizon: int) -> None:
         spec, n, slots = launcher.spec, launcher.num_envs, horizon + 1  # the last slot serves steps without gradient

@@ -158,10 +158,6 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     Defaults that depend on the task, its preset and the device fill what is not given. With --resume and --evaluate
     the arguments of the checkpoint take their place.
 
-    Args:
-        kind: the script's dataclass of arguments.
-        argv: in place of the process's.
-
     Raises:
         ValueError: an argument out of range, or one that does not fit to the others or to the checkpoint.
         SystemExit: --help, or what tyro cannot parse.

@@ -11,10 +11,8 @@ from diffsim.training import distributed
 class ObsNormalizer(nn.Module):
     """Normalizes by the running mean and variance of what it has seen; constant between updates.
 
-    The statistics are buffers, so they are saved with the policy that depends on them.
-
-    Args:
-        size: numbers of an observation; None: what is normalized are scalars.
+    The statistics are buffers, so they are saved with the policy that depends on them. Without a size of observations
+    what is normalized are scalars.
     """
 
     count: Tensor

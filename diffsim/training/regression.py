@@ -14,9 +14,8 @@ KINDS = nn.Linear, nn.ELU, nn.LayerNorm
 class Regression:
     """Descends the mean squared error of a network. With autograd the numbers would be the same, bit for bit.
 
-    Args:
-        network: a chain of Linear, ELU and LayerNorm, first a Linear, with one output.
-        optimizer: of all of its parameters.
+    The network is a chain of Linear, ELU and LayerNorm, first a Linear, with one output; all of its parameters are the
+    optimizer's.
     """
 
     def __init__(self, network: nn.Sequential, optimizer: ClippedAdam) -> None:

@@ -23,10 +23,6 @@ class ReplayBuffer(nn.Module):
 
     A checkpoint holds the rows that are filled and no others.
 
-    Args:
-        size: how many transitions it keeps.
-        obs_dim, action_dim: sizes of an observation and of an action.
-
     Attributes:
         rows: (size, obs_dim + action_dim + 1 + obs_dim + 1) transitions; the oldest are overwritten first.
         count: () of transitions ever added.

@@ -57,7 +57,6 @@ class Variation:
         env: made with factors.
         ranges: of random factors, by their names in VARIED.
         redraw: iterations between drawings.
-        seed: of the drawings.
     """
 
     def __init__(self, env: DiffEnv, ranges: Mapping[str, Range], redraw: int, seed: int) -> None:

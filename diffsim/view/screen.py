@@ -31,12 +31,7 @@ SPACE, ENTER, MINUS, EQUALS = 32, 257, 45, 61
 
 
 class Screen:
-    """Shows configurations of a scene.
-
-    Args:
-        scene: what is shown.
-        mode: "rgb_array" returns frames; "human" shows the first configuration in a Window.
-        fps: frames per second of the window at true speed.
+    """Shows configurations of a scene: "rgb_array" returns frames, "human" shows the first one in a Window.
 
     Raises:
         ValueError: another mode.
@@ -74,9 +69,7 @@ class Screen:
 class Window:
     """MuJoCo's window on a scene, which shows pictures at true speed and knows how keys and the mouse push the robot.
 
-    Args:
-        scene: what is shown.
-        control_dt: s of simulation from one picture to the next.
+    Pictures are control_dt [s] of simulation apart.
 
     Attributes:
         speed, paused: of the pictures; keys change them.

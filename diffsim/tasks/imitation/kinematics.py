@@ -36,10 +36,6 @@ def matrix(quat: Tensor) -> Tensor:
 class Kinematics:
     """Of a robot whose bodies hang by hinges on a root that floats freely, as ant and humanoid do.
 
-    Args:
-        model: of the robot.
-        device, dtype: of the tensors.
-
     Raises:
         ValueError: another joint, or one that is not at its body's origin.
     """
