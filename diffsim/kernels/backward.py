@@ -125,7 +125,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         gtau = wp.zeros(shape=SLOTS, dtype=T)
         lam = wp.zeros(shape=SLOTS, dtype=T)
         u = wp.zeros(shape=SLOTS, dtype=T)
-        law = law_of(m, factors, e)
+        law = law_of(m, h, theta, factors, e)
         if wp.static(CLAMP):
             driven = wp.zeros(shape=SLOTS, dtype=T)
             joint.drive(m, law, lane, n, ctrl, e, driven)
@@ -283,12 +283,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     adj_d[i] = vec6()
                     adj_w1[i] = vec6()
             for i in range(FIRST, n):
-                la, lv, lw, lp = link.link_adjoint(
-                    m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, h, theta, adj_factors
-                )
+                la, lv, lw, lp = link.link_adjoint(m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, adj_factors)
                 if wp.static(CONSTRAINED and CONTACT):
                     lv, lw, lp, l_twist = constraint.add_contacts_adjoint(
-                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, h, lv, lw, lp, adj_factors
+                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, lv, lw, lp, adj_factors
                     )
                     adj_b[i] = l_twist
                 adj_a[i] = la

@@ -11,7 +11,6 @@ from functools import cache
 
 import warp as wp
 
-from diffsim.kernels.base import base_inertia
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.factors import environment_law
@@ -21,6 +20,7 @@ from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
+from diffsim.kernels.solve import base_inertia
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import MAX_SPEED, KernelSpec
 from diffsim.kernels.wide import blocks, module_options
@@ -186,7 +186,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         q = wp.zeros(shape=SLOTS, dtype=T)
         qd = wp.zeros(shape=SLOTS, dtype=T)
         motor = wp.zeros(shape=SLOTS, dtype=T)
-        law = law_of(m, factors, e)
+        law = law_of(m, h, theta, factors, e)
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
             muscle.activate(m, law, lane, ctrl, e, pull)
@@ -271,7 +271,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 Id[i] = mat3()
                 P[i] = vec6()
             for i in range(FIRST, n):
-                ia, ib, id, f = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place, h, theta)
+                ia, ib, id, f = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place)
                 Ia[i] = ia
                 Ib[i] = ib
                 Id[i] = id

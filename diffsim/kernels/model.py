@@ -111,6 +111,8 @@ def types(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.struct
     class Law:
+        h: T  # s, of a substep
+        theta: T  # how implicit it is
         k_n: T
         k_d: T
         k_t: T
