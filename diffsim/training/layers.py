@@ -15,19 +15,14 @@ class ObsNormalizer(nn.Module):
     what is normalized are scalars.
     """
 
-    count: Tensor
-    mean: Tensor
-    var: Tensor
-    std: Tensor
-
     def __init__(self, size: int | None = None) -> None:
         super().__init__()
         self.size = size
         shape = () if size is None else (size,)
-        self.register_buffer("count", torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
-        self.register_buffer("mean", torch.zeros(shape))
-        self.register_buffer("var", torch.ones(shape))
-        self.register_buffer("std", torch.ones(shape))
+        self.count: Tensor = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
+        self.mean: Tensor = nn.Buffer(torch.zeros(shape))
+        self.var: Tensor = nn.Buffer(torch.ones(shape))
+        self.std: Tensor = nn.Buffer(torch.ones(shape))
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self.mean) / self.std
@@ -62,12 +57,10 @@ class Likeliest(nn.Module):
         loc: (m, n) the locations, if shared.
     """
 
-    loc: nn.Parameter | None
-
     def __init__(self, actions: int, components: int, shared: bool = True) -> None:
         super().__init__()
         self.actions, self.components, self.shared = actions, components, shared
-        self.register_parameter("loc", nn.Parameter(torch.zeros(actions, components)) if shared else None)
+        self.loc = nn.Parameter(torch.zeros(actions, components)) if shared else None
 
     def forward(self, x: Tensor) -> Tensor:
         parts = x.unflatten(-1, (-1, self.actions, self.components))

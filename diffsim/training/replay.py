@@ -28,14 +28,11 @@ class ReplayBuffer(nn.Module):
         count: () of transitions ever added.
     """
 
-    rows: Tensor
-    count: Tensor
-
     def __init__(self, size: int, obs_dim: int, action_dim: int) -> None:
         super().__init__()
         self.size, self.widths = size, (obs_dim, action_dim, 1, obs_dim, 1)
-        self.register_buffer("rows", torch.zeros(size, sum(self.widths)), persistent=False)
-        self.register_buffer("count", torch.zeros((), dtype=torch.int64))
+        self.rows: Tensor = nn.Buffer(torch.zeros(size, sum(self.widths)), persistent=False)
+        self.count: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def add(self, transitions: Transition) -> None:
         """Store B transitions.
