@@ -76,6 +76,14 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                 q[i + 2] = r[2]
 
     @wp.func
+    def carrier_place(m: Model, x: T, z: T):
+        """Of a floating base at x and z, or at 0 and 0 of a fixed base, on which slides may carry it on."""
+        if wp.static(TERRAIN):
+            return vec2(T(m.carrier_along) + x, T(m.carrier_height) + z)
+        else:
+            return T(m.carrier_height) + z
+
+    @wp.func
     def place_links(m: Model, at: int, n: int, q: array, R: mat3s, x: vec3s, S: vec6s, place: Place):
         """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's place.
 
@@ -114,4 +122,4 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             S[i] = Si
         return place
 
-    return by_name(load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, place_links)
+    return by_name(load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, carrier_place, place_links)
