@@ -52,12 +52,20 @@ class Launcher:
             division = default_division(scene, num_envs) if cuda else divide(scene)
         elif division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
-        implicit = options.integration.integrator == "implicit"
         block = options.block or default_block(num_envs, options)
         how = options.integration
         constrained = how.integrator == "mujoco"
         self.spec = kernel_spec(
-            scene, division, real, implicit, cuda, options.factors, options.forces, block, constrained, how.touchdown
+            scene,
+            division,
+            real,
+            options.forces,
+            implicit=how.integrator == "implicit",
+            constrained=constrained,
+            touchdown=how.touchdown and constrained,
+            varied=options.factors,
+            env_last=cuda,
+            block=block,
         )
         self.num_blocks = -(-num_envs // block)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
