@@ -102,16 +102,9 @@ def make(
     if penalty and integration.integrator == "mujoco":
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
     scene = scene.with_penalty(penalty or {})
+    scene = scene if terrain is None else scene.with_terrain(terrain)
     return DiffEnv(
-        task,
-        scene if terrain is None else scene.with_terrain(terrain),
-        num_envs,
-        integration=integration,
-        seed=seed,
-        horizon=horizon,
-        device=device,
-        dtype=dtype,
-        **others,
+        task, scene, num_envs, integration=integration, seed=seed, horizon=horizon, device=device, dtype=dtype, **others
     )
 
 
