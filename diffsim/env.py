@@ -228,11 +228,7 @@ class DiffEnv(VectorEnv):
         return self._obs
 
     def masked(self, options: dict[str, Any] | None) -> Tensor:
-        """(k,) int64, the environments that reset's options ask for: all, or those of "reset_mask" (N,).
-
-        Raises:
-            ValueError: a mask of another shape, or not bool; unknown options.
-        """
+        """(k,) int64, the environments that reset's options ask for, or all; raises ValueError for other options."""
         options = {} if options is None else options
         if not isinstance(options, Mapping) or options.keys() - {"reset_mask"}:
             raise ValueError(f"options are {options!r}, must be a dictionary of reset_mask alone")
@@ -331,11 +327,7 @@ class DiffEnv(VectorEnv):
         return {"task": self.task.name, **tensors, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a state_dict of an environment of the same task, size and dtype; call `detach` next.
-
-        Raises:
-            ValueError: it is of another task, size or dtype, or no state_dict of an environment.
-        """
+        """Continue from a state_dict of the same task, size and dtype (else ValueError); call `detach` next."""
         own = self.state_dict()
         if not isinstance(state, Mapping) or state.keys() != own.keys():
             has = ", ".join(state) if isinstance(state, Mapping) else type(state).__name__

@@ -85,11 +85,7 @@ def nvidia_driver() -> bool:
 
 
 def check_kernel_cache() -> Path:
-    """Start Warp; the folder where it keeps compiled kernels.
-
-    Raises:
-        KernelCacheError: it cannot be written.
-    """
+    """Start Warp; the folder where it keeps compiled kernels. Raises KernelCacheError if it cannot be written."""
     global _started
     wanted = wp.config.kernel_cache_dir
     try:

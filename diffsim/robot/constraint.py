@@ -32,11 +32,7 @@ class Constraints(NamedTuple):
 
 
 def constrained(scene: Scene, seconds: float) -> Scene:
-    """A copy of the scene with MuJoCo's constraints in substeps of that length, and all contact points that it has.
-
-    Raises:
-        SceneError: what the file asks for and these constraints are not.
-    """
+    """A copy with MuJoCo's constraints in substeps of that length; raises SceneError for what of the file they lack."""
     m = scene.mj_model
     if found := list(_obstacles(scene)):
         raise SceneError(f"{scene.name}: with the integrator mujoco {'; '.join(found)}")

@@ -85,11 +85,7 @@ class Task:
 
     @property
     def mirror(self) -> Mirror:
-        """How the task looks with left and right exchanged.
-
-        Raises:
-            ValueError: the task has none, as its robot has no left and right or tracks a motion.
-        """
+        """How the task looks with left and right exchanged; raises ValueError if it has no mirror image."""
         raise ValueError(f"task {self.name!r} has no mirror image")
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:

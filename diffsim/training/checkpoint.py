@@ -107,11 +107,7 @@ def find_nonfinite(learner: Learner) -> str | None:
 
 
 def load(path: Path, script: str | None = None) -> dict[str, Any]:
-    """The checkpoint at path, of the given script if one is named.
-
-    Raises:
-        ValueError: there is none, it is damaged, or it is of another script or format.
-    """
+    """The checkpoint at path, of a script if one is named; raises ValueError if there is none that is whole."""
     if not path.is_file():
         fail(f"no such checkpoint: {path}")
     try:
@@ -180,11 +176,7 @@ POLICY = [*HELD][:4]
 
 
 def load_policy(path: Path) -> SavedPolicy:
-    """The policy of any script's checkpoint, on the CPU in float32.
-
-    Raises:
-        ValueError: see `load`; or its weights do not fit its layers.
-    """
+    """The policy of any script's checkpoint, on the CPU in float32; raises ValueError as `load` does."""
     state = load(path)
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
@@ -242,11 +234,7 @@ def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
 
 
 def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:
-    """Load the weights and statistics of a checkpoint into a learner, and what it holds of an environment into that.
-
-    Raises:
-        ValueError: they are of other sizes.
-    """
+    """Load a checkpoint into a learner and, if given, an environment; raises ValueError if it is of other sizes."""
     try:
         for name, part in parts(learner).items():
             part.load_state_dict(state["modules"][name])

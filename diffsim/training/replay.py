@@ -35,11 +35,7 @@ class ReplayBuffer(nn.Module):
         self.count: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def add(self, transitions: Transition) -> None:
-        """Store B transitions.
-
-        Raises:
-            ValueError: they are more than the buffer keeps.
-        """
+        """Store B transitions; raises ValueError if they are more than the buffer keeps."""
         columns = [tensor if tensor.dim() > 1 else tensor.unsqueeze(1) for tensor in transitions]
         if (number := len(columns[0])) > self.size:
             raise ValueError(f"{number} transitions at once do not fit into a replay buffer of {self.size}")

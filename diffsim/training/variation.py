@@ -30,11 +30,7 @@ class Range(NamedTuple):
 
 
 def parse_ranges(items: Sequence[str]) -> dict[str, Range]:
-    """Of the flag --randomise friction=0.7:1.3 mass=0.9:1.1, by name.
-
-    Raises:
-        ValueError: anything else.
-    """
+    """Of the flag --randomise friction=0.7:1.3 mass=0.9:1.1, by name; raises ValueError for anything else."""
     ranges = {}
     for item in items:
         name, _, text = item.partition("=")

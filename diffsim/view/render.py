@@ -369,11 +369,7 @@ def check_display() -> bool:
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """A current OpenGL context of MuJoCo's, from MUJOCO_GL or, on Linux, from EGL, which needs no display.
-
-    Raises:
-        RuntimeError: there is none, with the remedy.
-    """
+    """A current OpenGL context of MuJoCo's, from MUJOCO_GL or, on Linux, EGL; raises RuntimeError with the remedy."""
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     platform = os.environ.get("PYOPENGL_PLATFORM", "egl").lower()
     if wanted in ("disable", "disabled", "off", "false", "0"):

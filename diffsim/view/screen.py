@@ -31,11 +31,7 @@ SPACE, ENTER, MINUS, EQUALS = 32, 257, 45, 61
 
 
 class Screen:
-    """Shows configurations of a scene: "rgb_array" returns frames, "human" shows the first one in a Window.
-
-    Raises:
-        ValueError: another mode.
-    """
+    """Shows a scene: "rgb_array" returns frames, "human" has the first in a Window; raises ValueError for others."""
 
     def __init__(self, scene: Scene, mode: RenderMode, fps: float) -> None:
         if mode not in get_args(RenderMode):
@@ -44,11 +40,7 @@ class Screen:
         self._drawer: Any = None  # a Renderer or a Window
 
     def show(self, qpos: NDArray[np.floating[Any]]) -> Frames | None:
-        """Frames of the configurations qpos (N, nq), or None once the first one is in the window.
-
-        Raises:
-            RuntimeError: the machine has no OpenGL, or no display for a window.
-        """
+        """Frames of qpos (N, nq), or None once the first is in the window; raises RuntimeError if nothing can draw."""
         if self._mode == "rgb_array":
             self._drawer = self._drawer or render.Renderer(self._scene, *render.VIDEO_SIZE)
             return tuple(self._drawer.draw(row, profile=k) for k, row in enumerate(qpos))
