@@ -5,8 +5,6 @@ episode. A clock moves the legs' reference: in the air they fold, on the ground 
 command asks. Robots are data: GO1, GO2, G1. Their figures are those of MuJoCo Menagerie's files.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
