@@ -124,8 +124,7 @@ def _any(m: mujoco.MjModel, fields: str) -> Mask:
 
 def _finite(values: ArrayLike) -> Mask:
     """Elementwise, in the single precision of the kernels."""
-    within: Mask = np.abs(values) <= GREATEST
-    return within
+    return np.abs(values) <= GREATEST
 
 
 def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
