@@ -153,11 +153,9 @@ def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     """The scene's numbers as a Warp struct on a device."""
     writer = _Writer(scene, division, dtype, device)
     writer.put_tree()
-    writer.put_masses()
-    writer.put_joints()
+    writer.put_links()
     writer.put_motors_and_muscles()
-    writer.put_contacts()
-    writer.put_bodies()
+    writer.put_contacts_and_bodies()
     return writer.model
 
 
@@ -224,8 +222,8 @@ class _Writer:
             frame = frame @ r[i]
         self.put(carrier_along=place[0], carrier_height=place[2] - scene.ground_height, gravity=scene.gravity)
 
-    def put_masses(self) -> None:
-        """Inertia and drag of each link, on the one lane that carries it."""
+    def put_links(self) -> None:
+        """Each link's joint, and its inertia and drag, which one lane carries."""
         scene, link = self.scene, self.link
         weighs = self.division.weighs
         carried = np.array([i in weighs[lane] for lane, i in zip(self.lane, link, strict=True)], float)[:, None]
@@ -239,12 +237,9 @@ class _Writer:
             drag_force=force[link] * carried,
             drag_torque=torque[link] * carried,
         )
-
-    def put_joints(self) -> None:
-        """What every lane has of a link as it is."""
         names = "com lift_position armature damping stiffness spring_ref lower upper k_limit d_limit servo_stiffness"
         names += " servo_damping servo_ref force_low force_high"
-        self.put(**{name: getattr(self.scene, name)[self.link] for name in names.split()})
+        self.put(**{name: getattr(scene, name)[link] for name in names.split()})
 
     def put_motors_and_muscles(self) -> None:
         scene, muscles = self.scene, self.division.muscles
@@ -272,8 +267,8 @@ class _Writer:
             hill=scene.hill,
         )
 
-    def put_contacts(self) -> None:
-        """Spheres by lane, then by slot, and the constants of contact."""
+    def put_contacts_and_bodies(self) -> None:
+        """Both by lane, then by slot: a body is on the lane that carries its link's mass; and the ground."""
         scene, d = self.scene, self.division
         begin, sphere = self.by_entry(d.spheres, scene.contact_link)
         self.put(
@@ -292,12 +287,9 @@ class _Writer:
         along = np.diff(vertices, axis=1, append=vertices[:, -1:])
         along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), np.finfo(float).tiny)
         self.put(terrain=np.concatenate([vertices, along], 2))
-
-    def put_bodies(self) -> None:
-        """Bodies by lane, then by slot; each is on the lane that carries its link's mass."""
-        link = self.scene.body_link
-        begin, body = self.by_entry([np.flatnonzero(np.isin(link, row)) for row in self.division.weighs], link)
-        self.put(body_begin=begin, body=body, body_com=self.scene.body_com[body])
+        link = scene.body_link
+        begin, body = self.by_entry([np.flatnonzero(np.isin(link, row)) for row in d.weighs], link)
+        self.put(body_begin=begin, body=body, body_com=scene.body_com[body])
 
     def by_entry(self, hands: Sequence[Iterable[int]], link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where each entry begins, and the things themselves, of things on links that are dealt to the lanes."""

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from diffsim.kernels.lanes import Division
-from diffsim.robot.scene import FACTORS, Scene
+from diffsim.robot.scene import Scene
 
 MAX_SPEED = 1e5  # m/s and rad/s; what is faster has blown up, and its squares would soon leave float32
 
@@ -59,11 +59,6 @@ class KernelSpec:
     def damped(self) -> bool:
         """Whether damping follows the constraints."""
         return self.constrained and "damping" in self.features
-
-    @property
-    def nfactors(self) -> int:
-        """Columns of the array `factors`."""
-        return len(FACTORS) if self.varied else 0
 
     @property
     def nfactor(self) -> int:

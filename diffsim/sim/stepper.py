@@ -9,6 +9,7 @@ import torch.nn.functional as F
 import warp as wp
 
 from diffsim.kernels.model import types
+from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.launcher import Launcher, check_memory
 
@@ -54,7 +55,7 @@ class Stepper:
         self._passes = integration.passes
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step.
-        self._widths = (spec.nq, spec.nv, spec.nu, spec.nfactors, 6 * spec.forced)
+        self._widths = (spec.nq, spec.nv, spec.nu, len(FACTORS) * spec.varied, 6 * spec.forced)
         self._end_widths = (spec.nq, spec.nv + int(spec.constrained))  # with constraints a column for the residual
         self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, sum(self._end_widths))
         self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
