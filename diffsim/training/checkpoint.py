@@ -74,7 +74,7 @@ def parts(learner: Learner) -> dict[str, Any]:
 def save(path: Path, script: str, learner: Learner, state: Mapping[str, Any]) -> None:
     """Replace the file in one step: whoever reads it finds the old one or the new one, whole.
 
-    With the learner's parts and policy it holds the state, what else continues the run: args and iteration at least.
+    It holds the learner's parts and policy, and the state: what else continues the run, args and iteration at least.
     """
     modules = {name: part.state_dict() for name, part in parts(learner).items()}
     policy = {"layers": _describe(learner.policy), "weights": learner.policy.state_dict()}

@@ -131,7 +131,7 @@ def column(scalar: str) -> str:
 class ProgressLog:
     """The three of them for one run. Opened late, so that a run that fails at its start leaves nothing behind.
 
-    It goes on after iteration and control_steps, 0 at the start of a run, of `total` iterations.
+    A resumed run goes on after iteration and control_steps, which are 0 otherwise; total counts all iterations.
     """
 
     def __init__(

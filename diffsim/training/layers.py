@@ -9,8 +9,8 @@ from diffsim.training import distributed
 class ObsNormalizer(nn.Module):
     """Normalizes by the running mean and variance of what it has seen; constant between updates.
 
-    The statistics are buffers, so they are saved with the policy that depends on them. Without a size of observations
-    what is normalized are scalars.
+    The statistics are buffers, so they are saved with the policy that depends on them. Without the size of an
+    observation it normalizes scalars.
     """
 
     def __init__(self, size: int | None = None) -> None:
