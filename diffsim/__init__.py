@@ -1,7 +1,5 @@
 """Parallel differentiable simulation of articulated robots, and the tasks of the SHAC paper on it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -97,20 +95,14 @@ def make(
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
     scene = load_scene(robot(task))
-    integration = task.integration(accuracy, contact).replaced(integrator, substeps, theta, passes, touchdown)
+    asked = dict(substeps=substeps, theta=theta, passes=passes, touchdown=touchdown)
+    integration = task.integration(accuracy, contact).replaced(integrator, **asked)
     if penalty and integration.integrator == "mujoco":
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
     scene = scene.with_penalty(penalty or {})
+    scene = scene if terrain is None else scene.with_terrain(terrain)
     return DiffEnv(
-        task,
-        scene if terrain is None else scene.with_terrain(terrain),
-        num_envs,
-        integration=integration,
-        seed=seed,
-        horizon=horizon,
-        device=device,
-        dtype=dtype,
-        **others,
+        task, scene, num_envs, integration=integration, seed=seed, horizon=horizon, device=device, dtype=dtype, **others
     )
 
 

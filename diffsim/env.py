@@ -1,7 +1,5 @@
 """DiffEnv: a task on the simulator, as a gymnasium.vector.VectorEnv on torch tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from numbers import Integral
 from typing import Any
@@ -228,11 +226,7 @@ class DiffEnv(VectorEnv):
         return self._obs
 
     def masked(self, options: dict[str, Any] | None) -> Tensor:
-        """(k,) int64, the environments that reset's options ask for: all, or those of "reset_mask" (N,).
-
-        Raises:
-            ValueError: a mask of another shape, or not bool; unknown options.
-        """
+        """(k,) int64, the environments that reset's options ask for, or all; raises ValueError for other options."""
         options = {} if options is None else options
         if not isinstance(options, Mapping) or options.keys() - {"reset_mask"}:
             raise ValueError(f"options are {options!r}, must be a dictionary of reset_mask alone")
@@ -326,23 +320,12 @@ class DiffEnv(VectorEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
-        return {
-            "task": self.task.name,
-            "qpos": self.qpos.detach().clone(),
-            "qvel": self.qvel.detach().clone(),
-            "obs": self._obs.detach().clone(),
-            "episode_step": self.episode_step.clone(),
-            "episode_return": self._episode_return.clone(),
-            "generator": self.generator.get_state(),
-            **({"memory": self.memory.detach().clone()} if self.task.num_memory else {}),
-        }
+        names = *self._parts, "episode_step", "_episode_return"
+        tensors = {name.lstrip("_"): getattr(self, name).detach().clone() for name in names}
+        return {"task": self.task.name, **tensors, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a state_dict of an environment of the same task, size and dtype; call `detach` next.
-
-        Raises:
-            ValueError: it is of another task, size or dtype, or no state_dict of an environment.
-        """
+        """Continue from a state_dict of the same task, size and dtype (else ValueError); call `detach` next."""
         own = self.state_dict()
         if not isinstance(state, Mapping) or state.keys() != own.keys():
             has = ", ".join(state) if isinstance(state, Mapping) else type(state).__name__
@@ -353,10 +336,8 @@ class DiffEnv(VectorEnv):
         for name, value in own.items():
             if isinstance(value, Tensor) and (state[name].shape, state[name].dtype) != (value.shape, value.dtype):
                 raise ValueError(f"{name} of the state is of another shape or type")
-        self.qpos, self.qvel = state["qpos"].to(self.device), state["qvel"].to(self.device)
-        self._obs = state["obs"].to(self.device)
+        self._put(state[name.lstrip("_")].to(self.device) for name in self._parts)
         self.episode_step.copy_(state["episode_step"])
-        self.memory = state.get("memory", self.memory).to(self.device)
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
         self._time = self.horizon

@@ -1,7 +1,5 @@
 """NumpyEnv and NumpyVectorEnv: DiffEnv in NumPy, as gymnasium's wrappers and other libraries expect it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from numbers import Integral
 from typing import Any
@@ -25,11 +23,8 @@ class NumpyEnv(gymnasium.Env[Array, Array]):
 
     Start states are drawn from `np_random`, which `reset(seed=...)` seeds. After an episode's end, `reset` must follow.
 
-    Args:
-        env: of one environment, which from now on belongs to this one.
-
     Attributes:
-        env: the environment on tensors, with qpos, qvel, set_state, scene and task.
+        env: the environment on tensors, with qpos, qvel, set_state, scene and task; it belongs to this one.
     """
 
     def __init__(self, env: DiffEnv) -> None:
@@ -67,13 +62,10 @@ class NumpyVectorEnv(VectorEnv[Array, Array, NDArray[Any]]):
     and `reset(seed=[...])` with the numbers given, where None leaves one as it is.
 
     Args:
-        env: what is stepped, which from now on belongs to this one.
+        env: what is stepped, on tensors, which from now on belongs to this one.
         autoreset_mode: SAME_STEP: a step that ends an episode returns the first observation of the next one;
             NEXT_STEP: the step after it does, and ignores that action; DISABLED: reset(options={"reset_mask": ...})
             must follow. Names like "NextStep" are understood, too.
-
-    Attributes:
-        env: the environment on tensors.
     """
 
     def __init__(self, env: DiffEnv, autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP) -> None:

@@ -1,7 +1,5 @@
 """MuJoCo and Warp, started without noise. The package imports this before everything else; its host stays as it was."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import gc
@@ -85,11 +83,7 @@ def nvidia_driver() -> bool:
 
 
 def check_kernel_cache() -> Path:
-    """Start Warp; the folder where it keeps compiled kernels.
-
-    Raises:
-        KernelCacheError: it cannot be written.
-    """
+    """Start Warp; the folder where it keeps compiled kernels. Raises KernelCacheError if it cannot be written."""
     global _started
     wanted = wp.config.kernel_cache_dir
     try:

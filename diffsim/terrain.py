@@ -6,10 +6,9 @@ all environments or, stacked to (num_envs, K, 2), one for each:
 
     env = diffsim.make("walker", num_envs=8, terrain=np.stack([rough(seed) for seed in range(8)]))
 
-All functions here leave the ground at z = 0 up to x = `start`, so that a robot can start at x = 0.
+All functions here leave the ground at z = 0 up to x = `start` [m], so that a robot can start at x = 0. They raise a
+ValueError, with what is allowed, for what is not finite or not within the bounds that they name.
 """
-
-from __future__ import annotations
 
 import math
 
@@ -24,39 +23,26 @@ MOST_SEGMENTS = 10_000  # of rough ground
 
 
 def incline(degrees: float, start: float = 1.0) -> Array:
-    """(3, 2) a slope without end, upward if positive, from x = start [m].
-
-    Raises:
-        ValueError: a slope that is not within -90 and 90 degrees, or start not finite.
-    """
+    """(3, 2) a slope without end between -90 and 90 degrees, upward if positive."""
     _check("start", start, "be finite")
     return np.array([[start - 1.0, 0.0], [start, 0.0], [start + 1.0, _slope(degrees)]])
 
 
 def step(height: float, start: float = 1.0) -> Array:
-    """(4, 2) a wall of this height [m] at x = start [m], upward if positive; level before and after.
-
-    Raises:
-        ValueError: an argument that is not finite, or no height.
-    """
+    """(4, 2) a wall of this height [m], not 0, at x = start, upward if positive; level before and after."""
     _check("height", height, "be finite and not 0", but=0)
     _check("start", start, "be finite")
     return np.array([[start - 1.0, 0.0], [start, 0.0], [start, height], [start + 1.0, height]], np.float64)
 
 
 def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float = 50.0, start: float = 1.0) -> Array:
-    """(K, 2) segments of random slope from x = start, then level; K = 3 + length / segment, rounded.
+    """(K, 2) segments of random slope, then level; K = 3 + length / segment, rounded.
 
     Args:
         seed: of the slopes, an integer of at least 0; each has another profile.
-        segment: length of each segment along x [m].
-        degrees: the steepest slope; they are uniform between it and its opposite.
-        length: of all segments together, along x [m].
-        start: where they begin [m].
-
-    Raises:
-        ValueError: lengths that are not positive and finite, less than one segment or more than MOST_SEGMENTS, a slope
-            of 90 degrees or more, or another seed.
+        segment: length of each segment along x [m], positive.
+        degrees: the steepest slope, below 90; they are uniform between it and its opposite.
+        length: of all segments together, along x [m]: one to MOST_SEGMENTS segments.
     """
     if not is_real(seed) or not float(seed).is_integer() or seed < 0:
         raise ValueError(f"seed is {seed!r}, must be an integer of at least 0")
@@ -77,10 +63,6 @@ class Elevation:
     """Carries a task, which knows a plane at z = 0 only, to a terrain and back: by the height of the ground below.
 
     The root is raised by the terrain's z at the root's own x. A robot whose root cannot be raised stays where it is.
-
-    Args:
-        scene: with a terrain.
-        device, dtype: of the tensors.
     """
 
     def __init__(self, scene: Scene, device: torch.device | str, dtype: torch.dtype) -> None:

@@ -32,10 +32,8 @@ def test_what_cannot_be_integrated_is_said(integration: Integration, message: st
 
 def test_what_is_given_replaces_the_presets() -> None:
     preset = Integration("implicit", 8, 0.5)
-    assert preset.replaced(None, None, None) == preset
-    assert preset.replaced("implicit", None, None) == preset
-    assert preset.replaced(None, 4, 0.0) == Integration("implicit", 4, 0.0)
-    assert preset.replaced("semi_implicit", None, None) == Integration(
-        "semi_implicit", 8
-    )  # theta is the implicit's own
-    assert preset.replaced("semi_implicit", None, 0.5).theta == 0.5  # asked for: an error, not dropped
+    assert preset.replaced(None, substeps=None, theta=None) == preset
+    assert preset.replaced("implicit") == preset
+    assert preset.replaced(substeps=4, theta=0.0) == Integration("implicit", 4, 0.0)
+    assert preset.replaced("semi_implicit") == Integration("semi_implicit", 8)  # theta is the implicit's own
+    assert preset.replaced("semi_implicit", theta=0.5).theta == 0.5  # asked for: an error, not dropped

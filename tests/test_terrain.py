@@ -21,7 +21,7 @@ from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.terrain import Elevation, incline, rough, step
 from diffsim.view import render, web
-from diffsim.view.slabs import slabs
+from diffsim.view.render import slabs
 
 IMPLICIT = Integration("implicit", 8, 0.5)  # of the ball; the hopper is explicit, so that two kernels do for all
 # A valley, a ridge, a wall and a short segment; a ball of 0.1 m fits between all of them.

@@ -45,8 +45,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint = muscle_law(spec, adjoint=True), constraint_law(spec)
     CONSTRAINED, SOLVES, DAMPED, NV = spec.constrained, spec.solves, spec.damped, spec.nv
-    CONTACT, TERRAIN, DRIVEN, CLAMP, MUSCLE, HILL, LIMIT = (
-        name in spec.features for name in ("contact", "terrain", "motor", "clamp", "muscle", "hill", "limit")
+    CONTACT, DRIVEN, CLAMP, MUSCLE, HILL, LIMIT = (
+        name in spec.features for name in ("contact", "motor", "clamp", "muscle", "hill", "limit")
     )
     LIMIT = LIMIT and not spec.constrained  # the penalty law
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
@@ -125,7 +125,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         gtau = wp.zeros(shape=SLOTS, dtype=T)
         lam = wp.zeros(shape=SLOTS, dtype=T)
         u = wp.zeros(shape=SLOTS, dtype=T)
-        law = law_of(m, factors, e)
+        law = law_of(m, h, theta, factors, e)
         if wp.static(CLAMP):
             driven = wp.zeros(shape=SLOTS, dtype=T)
             joint.drive(m, law, lane, n, ctrl, e, driven)
@@ -187,10 +187,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         for sub in range(substeps):
             row = row0 + substeps - 1 - sub
             # 1. the state of this substep, and the adjoint of the integrator
-            if wp.static(TERRAIN):
-                place = vec2(T(m.carrier_along), T(m.carrier_height))
-            else:
-                place = T(m.carrier_height)
+            place = kin.carrier_place(m, T(0.0), T(0.0))
             A[0] = join(vec3(), -vec3(m.gravity))
             for i in range(1, n):
                 q[i] = load(ck_q, row, qpos_adr(m, at + i), e)
@@ -218,10 +215,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 gv = gv + h * gp
                 gw = gw + h * g_turn
                 gr = gr_start
-                if wp.static(TERRAIN):
-                    place = place + vec2(load(ck_q, row, 0, e), load(ck_q, row, 2, e))
-                else:
-                    place = place + load(ck_q, row, 2, e)
+                place = kin.carrier_place(m, load(ck_q, row, 0, e), load(ck_q, row, 2, e))
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
                 if wp.static(DAMPED):
@@ -283,12 +277,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     adj_d[i] = vec6()
                     adj_w1[i] = vec6()
             for i in range(FIRST, n):
-                la, lv, lw, lp = link.link_adjoint(
-                    m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, h, theta, adj_factors
-                )
+                la, lv, lw, lp = link.link_adjoint(m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, adj_factors)
                 if wp.static(CONSTRAINED and CONTACT):
                     lv, lw, lp, l_twist = constraint.add_contacts_adjoint(
-                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, h, lv, lw, lp, adj_factors
+                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, lv, lw, lp, adj_factors
                     )
                     adj_b[i] = l_twist
                 adj_a[i] = la

@@ -30,7 +30,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.factors import K_D, K_N, MU
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -190,11 +190,10 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         B: vec6,
         W: vec6,
         height: T,
-        h: T,
         adj_v: vec6,
         adj_w: vec6,
         adj_p: vec6,
-        adj_factors: t.array,  # written if varied only
+        adj_factors: t.array,
     ):
         """The adjoints of link k with its contacts' part of phi added, and the adjoint of B."""
         adj_b = vec6()
@@ -208,7 +207,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
                 if wp.static(spec.touchdown):
                     numbers = m.contact_numbers[c]
-                    sinks = wp.max(-h * point_velocity(V, p)[2], T(LEAST_SINKING))
+                    sinks = wp.max(-law.h * point_velocity(V, p)[2], T(LEAST_SINKING))
                     jump = wp.dot(f, w + T(numbers[4]) * g_jar) / sinks
                     g_r = g_r + pick(T(numbers[10]) - distance, sinks, jump, T(0.0))
                 if wp.static(VARIED):
@@ -287,10 +286,4 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
         return gain
 
-    return SimpleNamespace(
-        add_contacts=add_contacts,
-        contacts_along=contacts_along,
-        add_contacts_adjoint=add_contacts_adjoint,
-        joint_constraint=joint_constraint,
-        joint_gain=joint_gain,
-    )
+    return by_name(add_contacts, contacts_along, add_contacts_adjoint, joint_constraint, joint_gain)

@@ -19,8 +19,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.factors import K_D, K_N, K_T, MU
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
@@ -31,19 +30,19 @@ from diffsim.kernels.wide import blocks
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
     T, vec3, vec4, vec6, mat3, Model, Law = t.T, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
-    Place, force_at, point_velocity, pick = kinematics(spec).Place, sp.force_at, sp.point_velocity, block.pick
+    Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
     sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, VARIED = spec.implicit, spec.varied
 
     @wp.func
-    def sphere_state(m: Model, k: int, R: mat3, x: vec3, V: vec6, height: T, h: T, theta: T):
+    def sphere_state(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, height: T):
         """Lowest point p, its velocity, and the depth (predicted theta h ahead if implicit) of contact sphere k."""
         p = x + R * vec3(m.contact_position[k])
         depth = height + p[2] - T(m.contact_radius[k])
         p = p - vec3(T(0.0), T(0.0), T(m.contact_radius[k]))
         v = point_velocity(V, p)
         if wp.static(IMPLICIT):
-            depth = depth + theta * h * v[2]
+            depth = depth + law.theta * law.h * v[2]
         return p, v, depth
 
     @wp.func
@@ -67,12 +66,12 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(-c * v[0], -c * v[1], f_n, c)
 
     @wp.func
-    def contact_resistance(law: Law, d: T, c: T, h: T, theta: T):
+    def contact_resistance(law: Law, d: T, c: T):
         """The diagonal of B."""
-        return vec3(h * c, h * c, theta * h * h * law.k_n - h * law.k_d * d)
+        return vec3(law.h * c, law.h * c, law.theta * law.h * law.h * law.k_n - law.h * law.k_d * d)
 
     @wp.func
-    def contact_adjoint(law: Law, d: T, v: vec3, a: vec3, g: vec3, h: T, theta: T):
+    def contact_adjoint(law: Law, d: T, v: vec3, a: vec3, g: vec3, h: T):
         """(adjoint of v, adjoint of d at the start of the step) of g . f(d + theta h v_z, v, a); h = 0 if explicit."""
         s = law.k_d * v[2] - law.k_n
         f_n = s * d
@@ -87,10 +86,10 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         gx = gx - g_c * c * v[0] / speed2
         gy = gy - g_c * c * v[1] / speed2
         g_d = g_n * s + g[2] * h * law.k_d * a[2]
-        return vec4(gx, gy, g_n * law.k_d * d + theta * h * g_d, g_d)
+        return vec4(gx, gy, g_n * law.k_d * d + law.theta * h * g_d, g_d)
 
     @wp.func
-    def contact_constants_adjoint(law: Law, d: T, v: vec3, a: vec3, g: vec3, h: T, theta: T):
+    def contact_constants_adjoint(law: Law, d: T, v: vec3, a: vec3, g: vec3, h: T):
         """The adjoints of (k_n, k_d, k_t, mu); arguments as of contact_adjoint."""
         f_n = (law.k_d * v[2] - law.k_n) * d
         c, sliding = friction_viscosity(law, f_n, v)
@@ -99,31 +98,19 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         g_n = g[2] + sliding * g_c * law.mu / speed
         g_mu = sliding * g_c * f_n / speed
         g_c = (T(1.0) - sliding) * g_c
-        g_kn = -g_n * d - g[2] * theta * h * h * a[2]
+        g_kn = -g_n * d - g[2] * law.theta * h * h * a[2]
         return vec4(g_kn, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
     @wp.func
     def add_contacts(
-        m: Model,
-        law: Law,
-        k: int,
-        R: mat3,
-        x: vec3,
-        V: vec6,
-        place: Place,
-        h: T,
-        theta: T,
-        Ia: mat3,
-        Ib: mat3,
-        Id: mat3,
-        F: vec6,
+        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, Ia: mat3, Ib: mat3, Id: mat3, F: vec6
     ):
         """Inertia blocks and bias force of link k with its contacts added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, _ = sphere_on_terrain(m, law.block, c, R, x, V, place, h, theta)
+                p, v, depth, E, _ = sphere_on_terrain(m, law, c, R, x, V, place)
             else:
-                p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
+                p, v, depth = sphere_state(m, law, c, R, x, V, place)
             on = touches(law, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
@@ -132,7 +119,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 if wp.static(TERRAIN):
                     f = E * f
                 if wp.static(IMPLICIT):
-                    B = on * contact_resistance(law, depth, fc[3], h, theta)
+                    B = on * contact_resistance(law, depth, fc[3])
                     if wp.static(TERRAIN):
                         D = E * wp.diag(B) * wp.transpose(E)
                         f = f - D * vec3(m.gravity)
@@ -157,20 +144,18 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         A: vec6,
         W: vec6,
         place: Place,
-        h: T,
-        theta: T,
         adj_a: vec6,
         adj_v: vec6,
         adj_w: vec6,
         adj_p: vec6,
-        adj_factors: t.array,  # written if varied only
+        adj_factors: t.array,
     ):
         """The adjoints of link k with its contacts' part of phi added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, curvature = sphere_on_terrain(m, law.block, c, R, x, V, place, h, theta)
+                p, v, depth, E, curvature = sphere_on_terrain(m, law, c, R, x, V, place)
             else:
-                p, v, depth = sphere_state(m, c, R, x, V, place, h, theta)
+                p, v, depth = sphere_state(m, law, c, R, x, V, place)
             on = touches(law, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
@@ -182,15 +167,15 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 a = vec3()
                 hi = T(0.0)
                 if wp.static(IMPLICIT):
-                    hi = h
+                    hi = law.h
                     a = point_velocity(A, p) + vec3(m.gravity)
                     if wp.static(TERRAIN):
                         a = wp.transpose(E) * a
-                    B = on * contact_resistance(law, depth, fc[3], h, theta)
+                    B = on * contact_resistance(law, depth, fc[3])
                     f = f - wp.cw_mul(B, a)
-                g = contact_adjoint(law, depth, v, a, g_f, hi, theta)
+                g = contact_adjoint(law, depth, v, a, g_f, hi)
                 if wp.static(VARIED):
-                    gk = contact_constants_adjoint(law, depth, v, a, g_f, hi, theta)
+                    gk = contact_constants_adjoint(law, depth, v, a, g_f, hi)
                     adj_factors[K_N] = adj_factors[K_N] + T(m.k_n) * gk[0]
                     adj_factors[K_D] = adj_factors[K_D] + T(m.k_d) * gk[1]
                     adj_factors[K_T] = adj_factors[K_T] + T(m.k_t) * gk[2]
@@ -230,4 +215,4 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
         return adj_a, adj_v, adj_w, adj_p
 
-    return SimpleNamespace(add_contacts=add_contacts, add_contacts_adjoint=add_contacts_adjoint)
+    return by_name(add_contacts, add_contacts_adjoint)

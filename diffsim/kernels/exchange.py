@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spec import KernelSpec
 
 
@@ -67,7 +67,7 @@ def lane_sums(spec: KernelSpec) -> SimpleNamespace:
             for i in range(begin, last + 1):
                 a[i] = add_vec6(a[i])
 
-        return SimpleNamespace(add=add, add_inertias=add_inertias, add_vectors=add_vectors)
+        return by_name(add, add_inertias, add_vectors)
 
     powers = [2**k for k in range(threads.bit_length() - 1)]
     return SimpleNamespace(

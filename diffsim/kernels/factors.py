@@ -23,8 +23,10 @@ def environment_law(spec: KernelSpec) -> wp.Function:
     CONSTRAINED = spec.constrained
 
     @wp.func
-    def law_of(m: Model, factors: t.array2, e: int):
+    def law_of(m: Model, h: T, theta: T, factors: t.array2, e: int):
         law = Law()
+        law.h = h
+        law.theta = theta
         if wp.static(CONTACT and CONSTRAINED and VARIED):
             law.k_n = read(factors, e, K_N)  # of the time constant's inverse square
             law.k_d = read(factors, e, K_D)  # of D, and so of all of a contact's force for one motion

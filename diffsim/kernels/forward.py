@@ -11,7 +11,6 @@ from functools import cache
 
 import warp as wp
 
-from diffsim.kernels.base import base_inertia
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.factors import environment_law
@@ -21,6 +20,7 @@ from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
+from diffsim.kernels.solve import base_inertia
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import MAX_SPEED, KernelSpec
 from diffsim.kernels.wide import blocks, module_options
@@ -38,8 +38,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, base, constraint = muscle_law(spec, adjoint=False), base_inertia(spec), constraint_law(spec)
-    CONTACT, TERRAIN, MOTOR, CLAMP, MUSCLE, HILL = (
-        name in spec.features for name in ("contact", "terrain", "motor", "clamp", "muscle", "hill")
+    CONTACT, MOTOR, CLAMP, MUSCLE, HILL = (
+        name in spec.features for name in ("contact", "motor", "clamp", "muscle", "hill")
     )
     NU, FLOATING, IMPLICIT, FORCED = spec.nu, spec.floating, spec.implicit, spec.forced > 0
     # With MuJoCo's constraints a substep takes several solves.
@@ -186,7 +186,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         q = wp.zeros(shape=SLOTS, dtype=T)
         qd = wp.zeros(shape=SLOTS, dtype=T)
         motor = wp.zeros(shape=SLOTS, dtype=T)
-        law = law_of(m, factors, e)
+        law = law_of(m, h, theta, factors, e)
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
             muscle.activate(m, law, lane, ctrl, e, pull)
@@ -226,17 +226,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
 
         for sub in range(substeps):
             row = row0 + sub
-            if wp.static(TERRAIN):
-                place = vec2(T(m.carrier_along), T(m.carrier_height))
-            else:
-                place = T(m.carrier_height)
+            place = kin.carrier_place(m, T(0.0), T(0.0))
             if wp.static(FLOATING):
                 R[0] = wp.quat_to_matrix(rot)
                 V[0] = join(R[0] * w, v)
-                if wp.static(TERRAIN):
-                    place = place + vec2(pos[0], pos[2])
-                else:
-                    place = place + pos[2]
+                place = kin.carrier_place(m, pos[0], pos[2])
                 if record == 1:
                     for k in range(3):
                         store(ck_q, row, k, e, pos[k])
@@ -271,7 +265,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 Id[i] = mat3()
                 P[i] = vec6()
             for i in range(FIRST, n):
-                ia, ib, id, f = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place, h, theta)
+                ia, ib, id, f = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place)
                 Ia[i] = ia
                 Ib[i] = ib
                 Id[i] = id

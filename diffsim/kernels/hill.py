@@ -7,7 +7,6 @@ muscle's whole path. Both are in units in which f_L(1) = f_V(0) = 1 are the curv
 """
 
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -17,7 +16,7 @@ from diffsim.kernels.wide import blocks
 
 
 @cache
-def hill_law(spec: KernelSpec) -> SimpleNamespace:
+def hill_law(spec: KernelSpec) -> wp.Function:
     t = types(spec)
     T, U, vec4, Model, pick = t.T, t.U, t.vec4, t.Model, blocks(spec).pick
     zero, one = T(0.0), T(1.0)
@@ -52,4 +51,4 @@ def hill_law(spec: KernelSpec) -> SimpleNamespace:
         s_p = T(p[8] * p[6]) * wp.min(x, one) / high
         return vec4(u * f * f_v + passive, f * f_v, (u * s * f_v + s_p) * T(p[1]), u * f * s_v * T(p[3]))
 
-    return SimpleNamespace(hill=hill)
+    return hill

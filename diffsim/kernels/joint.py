@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
@@ -156,13 +156,4 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         by_k = T(m.k_limit[i]) * (way - lead * (end_rate - qd))
         return on * vec2(by_k, -T(m.d_limit[i]) * wp.abs(way) * end_rate)
 
-    return SimpleNamespace(
-        drive=drive,
-        actuation=actuation,
-        actuation_free=actuation_free,
-        damping=damping,
-        passive_force=passive_force,
-        resistance=resistance,
-        gain=gain,
-        limit_constants_gain=limit_constants_gain,
-    )
+    return by_name(drive, actuation, actuation_free, damping, passive_force, resistance, gain, limit_constants_gain)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -17,15 +17,13 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
     Model, array = t.Model, t.array
     sp, read = spatial(spec), blocks(spec).read
-    join, log_quat, quat_of = sp.join, sp.log_quat, sp.quat_of
+    join, log_quat = sp.join, sp.log_quat
     mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
     NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
     BALL, STIFFNESS = "ball" in spec.features, "stiffness" in spec.features
     HINGE, SLIDE = "hinge" in spec.features, "slide" in spec.features
     ENV_LAST, THREADS_PER_ENV = spec.env_last, spec.threads_per_env
-    # Where the carrier is: its height over the ground, or with a terrain (x, z).
-    TERRAIN = "terrain" in spec.features
-    Place = vec2 if TERRAIN else T
+    TERRAIN, Place = "terrain" in spec.features, t.Place
 
     @wp.func
     def load(a: t.array3, row: int, k: int, e: int):
@@ -53,6 +51,11 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
         return QADR + link_of(m, k)
 
     @wp.func
+    def quat_of(w: T, x: T, y: T, z: T):
+        """From MuJoCo's order of a quaternion to Warp's."""
+        return quat(x, y, z, w)
+
+    @wp.func
     def load_quat(a: t.array2, e: int, k: int):
         return quat_of(read(a, e, k), read(a, e, k + 1), read(a, e, k + 2), read(a, e, k + 3))
 
@@ -71,6 +74,14 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                 q[i] = r[0]
                 q[i + 1] = r[1]
                 q[i + 2] = r[2]
+
+    @wp.func
+    def carrier_place(m: Model, x: T, z: T):
+        """Of a floating base at x and z, or at 0 and 0 of a fixed base, on which slides may carry it on."""
+        if wp.static(TERRAIN):
+            return vec2(T(m.carrier_along) + x, T(m.carrier_height) + z)
+        else:
+            return T(m.carrier_height) + z
 
     @wp.func
     def place_links(m: Model, at: int, n: int, q: array, R: mat3s, x: vec3s, S: vec6s, place: Place):
@@ -111,14 +122,4 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             S[i] = Si
         return place
 
-    return SimpleNamespace(
-        load=load,
-        store=store,
-        Place=Place,
-        link_of=link_of,
-        qpos_adr=qpos_adr,
-        load_quat=load_quat,
-        load_quat_row=load_quat_row,
-        place_balls=place_balls,
-        place_links=place_links,
-    )
+    return by_name(load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, carrier_place, place_links)

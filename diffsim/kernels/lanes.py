@@ -24,22 +24,14 @@ POWERS = (1, 2, 4, 8, 16)
 
 @dataclasses.dataclass(frozen=True)
 class Division:
-    """How the links, masses, contact spheres and muscles of one environment are divided among its lanes.
+    """How the links, masses, contact spheres and muscles of one environment are divided among its lanes."""
 
-    Attributes:
-        threads_per_env: number of lanes.
-        sharers: neighbouring lanes that have the same limbs.
-        trunk: number of links, without the base, that all lanes have.
-        links: of each lane, the links that it simulates, in the order of the tree: the base, the trunk, its limbs.
-        weighs, spheres, muscles: of each lane, the links whose mass it carries, its contact spheres and its muscles.
-            Each is dealt to one lane.
-    """
-
-    threads_per_env: int
-    sharers: int
-    trunk: int
-    links: list[list[int]]
-    weighs: list[list[int]]
+    threads_per_env: int  # number of lanes
+    sharers: int  # neighbouring lanes that have the same limbs
+    trunk: int  # number of links, without the base, that all lanes have
+    links: list[list[int]]  # of each lane, those that it simulates, in the tree's order: the base, the trunk, its limbs
+    # Each of these is dealt to one lane:
+    weighs: list[list[int]]  # of each lane, the links whose mass it carries
     spheres: list[list[int]]
     muscles: list[list[int]]
 
@@ -52,13 +44,8 @@ class Division:
 def divide(scene: Scene, threads_per_env: int = 1, sharers: int = 1) -> Division:
     """Deals a scene's tree to lanes so that none gets many links; a muscle finds all links that it joins on one lane.
 
-    Args:
-        scene: the tree.
-        threads_per_env: number of lanes, a power of two up to 16.
-        sharers: how many of them have the same limbs, a power of two up to threads_per_env.
-
     Raises:
-        ValueError: another number of lanes or sharers.
+        ValueError: numbers of lanes or of sharers that are not powers of two up to 16, or more sharers than lanes.
     """
     if threads_per_env not in POWERS or sharers not in POWERS or sharers > threads_per_env:
         raise ValueError(

@@ -8,8 +8,7 @@ import warp as wp
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
 from diffsim.kernels.factors import MASS
-from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 
@@ -18,7 +17,7 @@ from diffsim.kernels.spec import KernelSpec
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, vec6, mat3, Model, Law = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law
-    momentum, Place, VARIED = sp.momentum, kinematics(spec).Place, spec.varied
+    momentum, Place, VARIED = sp.momentum, t.Place, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
     LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
     DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
@@ -31,7 +30,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         return p, f, sp.force_at(p, f)
 
     @wp.func
-    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, h: T, theta: T):
+    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place):
         """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
         com = x + R * vec3(m.com[k])
         inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
@@ -53,25 +52,17 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(DRAG):
             F = F - drag.drag_wrench(m, k, R, com, V)
         if wp.static(CONTACT):
-            Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, h, theta, Ia, Ib, Id, F)
+            Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, Ia, Ib, Id, F)
         return Ia, Ib, Id, F
 
     @wp.func
     def link_adjoint(
-        m: Model,
-        law: Law,
-        k: int,
-        R: mat3,
-        x: vec3,
-        V: vec6,
-        A: vec6,
-        W: vec6,
-        place: Place,
-        h: T,
-        theta: T,
-        adj_factors: t.array,  # written if varied only
+        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, A: vec6, W: vec6, place: Place, adj_factors: t.array
     ):
-        """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position."""
+        """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position.
+
+        adj_factors, here and in all laws, are written if varied only.
+        """
         com = x + R * vec3(m.com[k])
         inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
         Iv = momentum(T(m.mass[k]), com, inertia, V)
@@ -100,7 +91,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             adj_v = adj_v + drag.drag_adjoint(m, k, R, com, V, W)
         if wp.static(CONTACT):
             adj_a, adj_v, adj_w, adj_p = contact.add_contacts_adjoint(
-                m, law, k, R, x, V, A, W, place, h, theta, adj_a, adj_v, adj_w, adj_p, adj_factors
+                m, law, k, R, x, V, A, W, place, adj_a, adj_v, adj_w, adj_p, adj_factors
             )
         return adj_a, adj_v, adj_w, adj_p
 
@@ -117,4 +108,4 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             adj_w = law.mass * adj_w
         return adj_d, adj_w
 
-    return SimpleNamespace(link_inertia=link_inertia, link_adjoint=link_adjoint, damping_adjoint=damping_adjoint)
+    return by_name(link_inertia, link_adjoint, damping_adjoint)

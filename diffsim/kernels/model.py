@@ -111,6 +111,8 @@ def types(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.struct
     class Law:
+        h: T  # s, of a substep
+        theta: T  # how implicit it is
         k_n: T
         k_d: T
         k_t: T
@@ -132,6 +134,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         mat3=wp.types.matrix((3, 3), T),
         mat6=wp.types.matrix((6, 6), T),
         quat=wp.types.quaternion(T),
+        Place=wp.types.vector(2, T) if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
         array=wp.array(dtype=T),
         array2=wp.array2d(dtype=U),  # a row for each environment
         array3=wp.array3d(dtype=T),  # checkpoints
@@ -141,15 +144,18 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     )
 
 
+def by_name(*functions: wp.Function) -> SimpleNamespace:
+    """What a module of the kernels offers to others."""
+    return SimpleNamespace(**{function.func.__name__: function for function in functions})
+
+
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     """The scene's numbers as a Warp struct on a device."""
     writer = _Writer(scene, division, dtype, device)
     writer.put_tree()
-    writer.put_masses()
-    writer.put_joints()
+    writer.put_links()
     writer.put_motors_and_muscles()
-    writer.put_contacts()
-    writer.put_bodies()
+    writer.put_contacts_and_bodies()
     return writer.model
 
 
@@ -157,9 +163,9 @@ class _Writer:
     """Fills a Model: of each lane's links a row of `slots` entries, of which the last ones may be of no use."""
 
     def __init__(self, scene: Scene, division: Division, dtype: type, device: str) -> None:
-        self.scene, self.division, self.dtype, self.device = scene, division, dtype, device
-        self.t = scene_types(dtype)
-        self.model = self.t.Model()
+        self.scene, self.division, self.device = scene, division, device
+        self.model_type = scene_types(dtype).Model
+        self.model = self.model_type()
         threads, slots = division.threads_per_env, division.slots
         self.link = padded(division.links, slots)  # of each entry, and
         self.lane = np.repeat(np.arange(threads), slots)
@@ -167,17 +173,21 @@ class _Writer:
         for lane, row in enumerate(division.links):
             self.slot[lane, row] = np.arange(len(row))
 
-    def put(self, **arrays: tuple[Any, type]) -> None:
-        """Sets fields of the model to (values, Warp's type)."""
-        for name, (values, kind) in arrays.items():
-            values = np.ascontiguousarray(values, np.int32 if kind is int else float)
-            # Warp gives an empty array no address; one unread element keeps the struct uniform.
-            values = values if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)
-            setattr(self.model, name, wp.array(values, dtype=kind, device=self.device))
+    def put(self, **fields: Any) -> None:
+        """Sets fields of the model, with the types that it declares."""
+        for name, values in fields.items():
+            kind = self.model_type.vars[name].type
+            if isinstance(kind, wp.array):
+                values = np.ascontiguousarray(values, np.int32 if kind.dtype is wp.int32 else float)
+                # Warp gives an empty array no address; one unread element keeps the struct uniform.
+                values = values if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)
+                setattr(self.model, name, wp.array(values, dtype=kind.dtype, device=self.device))
+            else:
+                setattr(self.model, name, kind(values))
 
     def put_tree(self) -> None:
         """Which links are whose, and where their frames are."""
-        scene, t, link = self.scene, self.t, self.link
+        scene, link = self.scene, self.link
         skew = np.cross(np.eye(3)[None], scene.axis[:, None])  # skew(a) b = a x b
         hinge = np.where(scene.slide | (scene.ball >= 0), 0.0, 1.0)[:, None, None]
         r, square = scene.rotation, skew @ skew
@@ -185,62 +195,54 @@ class _Writer:
         axis = np.einsum("nij,nj->ni", r, scene.axis)
         position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * axis
         self.put(
-            count=([len(row) for row in self.division.links], int),
-            link=(link, int),
-            parent=(self.slot[self.lane, scene.parent[link]], int),
-            slide=(scene.slide[link], int),
+            count=[len(row) for row in self.division.links],
+            link=link,
+            parent=self.slot[self.lane, scene.parent[link]],
+            qpos_adr=scene.qpos_adr[link],
+            slide=scene.slide[link],
             # Rodrigues for the angle q - ref, expanded by the sum formulas: the kernels then need no reference.
-            turn0=((r @ (np.eye(3) + hinge * square))[link], t.mat3),
-            turn1=((hinge * (r @ (skew * cos - square * sin)))[link], t.mat3),
-            turn2=((-hinge * (r @ (square * cos + skew * sin)))[link], t.mat3),
-            position=(position[link], t.vec3),
-            axis=(axis[link], t.vec3),
+            turn0=(r @ (np.eye(3) + hinge * square))[link],
+            turn1=(hinge * (r @ (skew * cos - square * sin)))[link],
+            turn2=(-hinge * (r @ (square * cos + skew * sin)))[link],
+            position=position[link],
+            axis=axis[link],
         )
         first, last = (np.arange(scene.nlink) + np.where(scene.ball < 0, 0, k - scene.ball) for k in (0, 2))
         balls = [np.flatnonzero(scene.ball[row] == 0).tolist() for row in self.division.links]
         self.put(
-            ball_count=([len(row) for row in balls], int),
-            ball_slot=(padded(balls, scene.nball), int),
-            qpos_adr=(scene.qpos_adr[link], int),
-            inboard=(self.slot[self.lane, scene.parent[first][link]], int),
-            outboard=(self.slot[self.lane, last[link]], int),
+            ball_count=[len(row) for row in balls],
+            ball_slot=padded(balls, scene.nball),
+            inboard=self.slot[self.lane, scene.parent[first][link]],
+            outboard=self.slot[self.lane, last[link]],
         )
         # Along the chain of slides that ends at the carrier nothing turns, so the offsets add up as they are.
         frame, place = np.eye(3), np.zeros(3)
         for i in range(1, scene.carrier + 1):
             place += frame @ position[i]
             frame = frame @ r[i]
-        self.model.carrier_along = self.dtype(place[0])
-        self.model.carrier_height = self.dtype(place[2] - scene.ground_height)
-        self.model.gravity = t.vec3(*scene.gravity)
+        self.put(carrier_along=place[0], carrier_height=place[2] - scene.ground_height, gravity=scene.gravity)
 
-    def put_masses(self) -> None:
-        """Inertia and drag of each link, on the one lane that carries it."""
-        scene, t, link = self.scene, self.t, self.link
+    def put_links(self) -> None:
+        """Each link's joint, and its inertia and drag, which one lane carries."""
+        scene, link = self.scene, self.link
         weighs = self.division.weighs
         carried = np.array([i in weighs[lane] for lane, i in zip(self.lane, link, strict=True)], float)[:, None]
         frame, viscous, force, torque = scene.drag
         self.put(
-            carried=(carried[:, 0], int),
-            mass=(scene.mass[link] * carried[:, 0], self.dtype),
-            com=(scene.com[link], t.vec3),
-            lift=(scene.lift[link] * carried[:, 0], self.dtype),
-            lift_position=(scene.lift_position[link], t.vec3),
-            base_damping=(scene.base_damping[link] * carried[:, 0], self.dtype),
-            inertia=(scene.inertia[link] * carried[:, None], t.mat3),
-            drag_frame=(frame[link], t.mat3),
-            drag_viscous=(viscous[link] * carried, t.vec3),
-            drag_force=(force[link] * carried, t.vec3),
-            drag_torque=(torque[link] * carried, t.vec3),
+            carried=carried[:, 0],
+            **{name: getattr(scene, name)[link] * carried[:, 0] for name in ("mass", "lift", "base_damping")},
+            inertia=scene.inertia[link] * carried[:, None],
+            drag_frame=frame[link],
+            drag_viscous=viscous[link] * carried,
+            drag_force=force[link] * carried,
+            drag_torque=torque[link] * carried,
         )
-
-    def put_joints(self) -> None:
-        names = ["armature", "damping", "stiffness", "spring_ref", "lower", "upper", "k_limit", "d_limit"]
-        names += ["servo_stiffness", "servo_damping", "servo_ref", "force_low", "force_high"]
-        self.put(**{name: (getattr(self.scene, name)[self.link], self.dtype) for name in names})
+        names = "com lift_position armature damping stiffness spring_ref lower upper k_limit d_limit servo_stiffness"
+        names += " servo_damping servo_ref force_low force_high"
+        self.put(**{name: getattr(scene, name)[link] for name in names.split()})
 
     def put_motors_and_muscles(self) -> None:
-        scene, t, muscles = self.scene, self.t, self.division.muscles
+        scene, muscles = self.scene, self.division.muscles
         motor_slot = self.slot[:, scene.motor_link]
         lane = (motor_slot > 0).argmax(0)  # of each motor and muscle
         for k, hand in enumerate(muscles):
@@ -250,48 +252,44 @@ class _Writer:
         order = np.lexsort(key.T[::-1])
         pairs, start = np.unique(key[order], axis=0, return_index=True)
         self.put(
-            gear=(scene.gear, self.dtype),
-            motor_bias=(scene.motor_bias, self.dtype),
-            motor_slot=(motor_slot.flatten(), int),
-            motor_lane=(lane, int),
-            muscle_begin=(np.cumsum([0, *map(len, muscles)]), int),
-            muscle=(sum(muscles, []), int),
-            lane_begin=(np.searchsorted(pairs[:, 0], np.arange(len(muscles) + 1)), int),
-            pair_link=(self.slot[pairs[:, :1], pairs[:, 1:]].flatten(), int),
-            pair_begin=(np.append(start, len(order)), int),
-            segment_a=(scene.segment_position[order, 0], t.vec3),
-            segment_b=(scene.segment_position[order, 1], t.vec3),
-            segment_muscle=(scene.segment_muscle[order], int),
-            hill=(scene.hill, t.vec9),
+            gear=scene.gear,
+            motor_bias=scene.motor_bias,
+            motor_slot=motor_slot.flatten(),
+            motor_lane=lane,
+            muscle_begin=np.cumsum([0, *map(len, muscles)]),
+            muscle=sum(muscles, []),
+            lane_begin=np.searchsorted(pairs[:, 0], np.arange(len(muscles) + 1)),
+            pair_link=self.slot[pairs[:, :1], pairs[:, 1:]].flatten(),
+            pair_begin=np.append(start, len(order)),
+            segment_a=scene.segment_position[order, 0],
+            segment_b=scene.segment_position[order, 1],
+            segment_muscle=scene.segment_muscle[order],
+            hill=scene.hill,
         )
 
-    def put_contacts(self) -> None:
-        """Spheres by lane, then by slot, and the constants of contact."""
+    def put_contacts_and_bodies(self) -> None:
+        """Both by lane, then by slot: a body is on the lane that carries its link's mass; and the ground."""
         scene, d = self.scene, self.division
         begin, sphere = self.by_entry(d.spheres, scene.contact_link)
         self.put(
-            contact_begin=(begin, int),
-            contact_position=(scene.contact_position[sphere], self.t.vec3),
-            contact_radius=(scene.contact_radius[sphere], self.dtype),
+            contact_begin=begin,
+            contact_position=scene.contact_position[sphere],
+            contact_radius=scene.contact_radius[sphere],
+            **{name: getattr(scene, name) for name in ("k_n", "k_d", "k_t", "mu")},
         )
         if scene.constraints is not None:
             self.put(
-                contact_numbers=(scene.constraints.contact[sphere], self.t.vec11),
-                limit_numbers=(scene.constraints.limit[self.link], self.t.vec11),
-                joint_loss=(scene.constraints.loss[self.link], self.t.vec3),
+                contact_numbers=scene.constraints.contact[sphere],
+                limit_numbers=scene.constraints.limit[self.link],
+                joint_loss=scene.constraints.loss[self.link],
             )
-        for name in ("k_n", "k_d", "k_t", "mu"):
-            setattr(self.model, name, self.dtype(getattr(scene, name)))
         vertices = np.zeros((1, 1, 2)) if scene.terrain is None else scene.terrain
         along = np.diff(vertices, axis=1, append=vertices[:, -1:])
         along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), np.finfo(float).tiny)
-        self.model.terrain = wp.array(np.concatenate([vertices, along], 2), dtype=self.t.vec4, device=self.device)
-
-    def put_bodies(self) -> None:
-        """Bodies by lane, then by slot; each is on the lane that carries its link's mass."""
-        link = self.scene.body_link
-        begin, body = self.by_entry([np.flatnonzero(np.isin(link, row)) for row in self.division.weighs], link)
-        self.put(body_begin=(begin, int), body=(body, int), body_com=(self.scene.body_com[body], self.t.vec3))
+        self.put(terrain=np.concatenate([vertices, along], 2))
+        link = scene.body_link
+        begin, body = self.by_entry([np.flatnonzero(np.isin(link, row)) for row in d.weighs], link)
+        self.put(body_begin=begin, body=body, body_com=scene.body_com[body])
 
     def by_entry(self, hands: Sequence[Iterable[int]], link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where each entry begins, and the things themselves, of things on links that are dealt to the lanes."""

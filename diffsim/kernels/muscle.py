@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.hill import hill_law
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -31,7 +31,7 @@ SHORTEST = 1e-6  # m
 
 @cache
 def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
-    t, sp, hill = types(spec), spatial(spec), hill_law(spec).hill
+    t, sp, hill = types(spec), spatial(spec), hill_law(spec)
     T, vec3, vec6, Model, Law, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.array
     join, point_velocity = sp.join, sp.point_velocity
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
@@ -64,26 +64,6 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         return join(wp.transpose(R) * wp.spatial_top(v), wp.transpose(R) * point_velocity(v, x))
 
     @wp.func
-    def add_pull(m: Model, lane: int, tension: array, R: mat3s, x: vec3s, P: vec6s):
-        """Adds the muscles to the links' bias forces P."""
-        for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
-            i = m.pair_link[2 * pair]
-            j = m.pair_link[2 * pair + 1]
-            turn = wp.transpose(R[i]) * R[j]
-            shift = wp.transpose(R[i]) * (x[j] - x[i])
-            force = vec3()
-            torque = vec3()
-            for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
-                a = vec3(m.segment_a[s])
-                d = shift + turn * vec3(m.segment_b[s]) - a
-                f = d * (tension[m.segment_muscle[s]] / length_of(d))
-                force = force + f
-                torque = torque + wp.cross(a, f)
-            wrench = outward(R[i], x[i], torque, force)
-            P[i] = P[i] - wrench
-            P[j] = P[j] + wrench
-
-    @wp.func
     def measure(
         m: Model, lane: int, R: mat3s, x: vec3s, V: vec6s, W: vec6s, lengths: array, rates: array, powers: array
     ):
@@ -113,12 +93,51 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
                     powers[k] = powers[k] + wp.dot(n, point_velocity(w, b))
 
     @wp.func
-    def add_pull_adjoint(
+    def add_muscles(
         m: Model,
         lane: int,
-        tension: array,
+        pull: array,
+        tension: array,  # pull itself, unless hill
+        lengths: array,
+        rates: array,
+        R: mat3s,
+        x: vec3s,
+        V: vec6s,
+        P: vec6s,
+    ):
+        """Adds the muscles to the links' bias forces P."""
+        if wp.static(HILL):
+            measure(m, lane, R, x, V, V, lengths, rates, rates)
+            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                k = m.muscle[entry]
+                tension[k] = hill(m, k, pull[k], lengths[k], rates[k])[0]
+        for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
+            i = m.pair_link[2 * pair]
+            j = m.pair_link[2 * pair + 1]
+            turn = wp.transpose(R[i]) * R[j]
+            shift = wp.transpose(R[i]) * (x[j] - x[i])
+            force = vec3()
+            torque = vec3()
+            for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
+                a = vec3(m.segment_a[s])
+                d = shift + turn * vec3(m.segment_b[s]) - a
+                f = d * (tension[m.segment_muscle[s]] / length_of(d))
+                force = force + f
+                torque = torque + wp.cross(a, f)
+            wrench = outward(R[i], x[i], torque, force)
+            P[i] = P[i] - wrench
+            P[j] = P[j] + wrench
+
+    @wp.func
+    def add_muscles_adjoint(
+        m: Model,
+        lane: int,
+        pull: array,
+        tension: array,  # pull itself, unless hill
         g_length: array,  # L dT/dl and
-        g_rate: array,  # L dT/dl' of each muscle: read by hill only
+        g_rate: array,  # L dT/dl' of each muscle; these two to power are of use to hill only
+        path: array,
+        power: array,
         R: mat3s,
         x: vec3s,
         V: vec6s,
@@ -126,9 +145,18 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         adj_v: vec6s,
         adj_w: vec6s,
         adj_p: vec6s,
-        adj_pull: array,  # the adjoint of u: written by linear only
+        adj_pull: array,
     ):
-        """Adds the muscles' part of phi to the links' adjoints."""
+        """Adds the muscles' part of phi to the adjoints of the links and of pull."""
+        if wp.static(HILL):
+            measure(m, lane, R, x, V, W, path, g_rate, power)
+            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+                k = m.muscle[entry]
+                curve = hill(m, k, pull[k], path[k], g_rate[k])
+                tension[k] = curve[0]
+                adj_pull[k] = adj_pull[k] + power[k] * curve[1]
+                g_length[k] = power[k] * curve[2]
+                g_rate[k] = power[k] * curve[3]
         for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
             i = m.pair_link[2 * pair]
             j = m.pair_link[2 * pair + 1]
@@ -177,56 +205,4 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
             adj_p[i] = adj_p[i] - gp
             adj_p[j] = adj_p[j] + gp
 
-    @wp.func
-    def add_muscles(
-        m: Model,
-        lane: int,
-        pull: array,
-        tension: array,  # pull itself, unless hill
-        lengths: array,
-        rates: array,
-        R: mat3s,
-        x: vec3s,
-        V: vec6s,
-        P: vec6s,
-    ):
-        """Adds the muscles to the links' bias forces P."""
-        if wp.static(HILL):
-            measure(m, lane, R, x, V, V, lengths, rates, rates)
-            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
-                k = m.muscle[entry]
-                tension[k] = hill(m, k, pull[k], lengths[k], rates[k])[0]
-        add_pull(m, lane, tension, R, x, P)
-
-    @wp.func
-    def add_muscles_adjoint(
-        m: Model,
-        lane: int,
-        pull: array,
-        tension: array,  # pull itself, unless hill
-        by_length: array,  # by_length to power: of use to hill only
-        by_rate: array,
-        path: array,
-        power: array,
-        R: mat3s,
-        x: vec3s,
-        V: vec6s,
-        W: vec6s,
-        adj_v: vec6s,
-        adj_w: vec6s,
-        adj_p: vec6s,
-        adj_pull: array,
-    ):
-        """Adds the muscles' part of phi to the adjoints of the links and of pull."""
-        if wp.static(HILL):
-            measure(m, lane, R, x, V, W, path, by_rate, power)
-            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
-                k = m.muscle[entry]
-                curve = hill(m, k, pull[k], path[k], by_rate[k])
-                tension[k] = curve[0]
-                adj_pull[k] = adj_pull[k] + power[k] * curve[1]
-                by_length[k] = power[k] * curve[2]
-                by_rate[k] = power[k] * curve[3]
-        add_pull_adjoint(m, lane, tension, by_length, by_rate, R, x, V, W, adj_v, adj_w, adj_p, adj_pull)
-
-    return SimpleNamespace(activate=activate, add_muscles=add_muscles, add_muscles_adjoint=add_muscles_adjoint)
+    return by_name(activate, add_muscles, add_muscles_adjoint)

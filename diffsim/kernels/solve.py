@@ -1,14 +1,81 @@
-"""The linear system M lambda = -h g, with the factor that the forward kernel stored."""
+"""The factorisation of the mass matrix that the forward kernel stores, and M lambda = -h g, solved with it."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.base import base_inertia
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spec import KernelSpec
+
+
+@cache
+def base_inertia(spec: KernelSpec) -> SimpleNamespace:
+    """Of the floating base: the Cholesky factor of its articulated inertia."""
+    t, kin = types(spec), kinematics(spec)
+    T, vec6, mat3, mat6 = t.T, t.vec6, t.mat3, t.mat6
+    load, store = kin.load, kin.store
+    BASE = 7 * (spec.nlink - 1)  # where the base's factor begins, packed by rows
+
+    @wp.func
+    def factor_base(Ia: mat3, Ib: mat3, Id: mat3, b: vec6):
+        """Cholesky factor (reciprocal diagonal) of the base's articulated inertia, and the solution of I a = b."""
+        L = mat6()
+        for r in range(3):
+            for c in range(3):
+                L[r, c] = Ia[r, c]
+                L[3 + r, c] = Ib[c, r]
+                L[3 + r, 3 + c] = Id[r, c]
+        a = vec6()
+        for r in range(6):
+            for c in range(r):
+                s = L[r, c]
+                for k in range(c):
+                    s = s - L[r, k] * L[c, k]
+                L[r, c] = s * L[c, c]
+            s = L[r, r]
+            y = b[r]
+            for k in range(r):
+                s = s - L[r, k] * L[r, k]
+                y = y - L[r, k] * a[k]
+            L[r, r] = T(1.0) / wp.sqrt(s)
+            a[r] = y * L[r, r]
+        for rr in range(6):
+            r = 5 - rr
+            y = a[r]
+            for k in range(r + 1, 6):
+                y = y - L[k, r] * a[k]
+            a[r] = y * L[r, r]
+        return L, a
+
+    @wp.func
+    def store_base(ck_f: t.array3, row: int, e: int, L: mat6):
+        k = int(BASE)
+        for r in range(6):
+            for c in range(r + 1):
+                store(ck_f, row, k, e, L[r, c])
+                k = k + 1
+
+    @wp.func
+    def solve_base(ck_f: t.array3, row: int, e: int, b: vec6):
+        """I^-1 b with the base's stored Cholesky factor."""
+        a = b
+        for r in range(6):
+            y = a[r]
+            for k in range(r):
+                y = y - load(ck_f, row, BASE + r * (r + 1) / 2 + k, e) * a[k]
+            a[r] = y * load(ck_f, row, BASE + r * (r + 1) / 2 + r, e)
+        for rr in range(6):
+            r = 5 - rr
+            y = a[r]
+            for k in range(r + 1, 6):
+                y = y - load(ck_f, row, BASE + k * (k + 1) / 2 + r, e) * a[k]
+            a[r] = y * load(ck_f, row, BASE + r * (r + 1) / 2 + r, e)
+        return a
+
+    return by_name(factor_base, store_base, solve_base)
 
 
 @cache

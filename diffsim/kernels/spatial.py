@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import types
+from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
@@ -74,11 +74,6 @@ def spatial(spec: KernelSpec) -> SimpleNamespace:
         return g - T(0.5) * rg + k2 * wp.cross(r, rg)
 
     @wp.func
-    def quat_of(w: T, x: T, y: T, z: T):
-        """From MuJoCo's order of a quaternion to Warp's."""
-        return quat(x, y, z, w)
-
-    @wp.func
     def to_tangent(q: quat, g: quat):
         """Of a unit quaternion q, turned by the body-frame rotation vector d: dq = q (d, 0) / 2. Its transpose on g."""
         turn = wp.quat_inverse(q) * g
@@ -89,16 +84,6 @@ def spatial(spec: KernelSpec) -> SimpleNamespace:
         """The gradient with respect to a quaternion that is normalised before use: tangent, and scaled by 1/|q|."""
         return (wp.normalize(q) * quat(g[0], g[1], g[2], T(0.0))) * (T(2.0) / wp.length(q))
 
-    return SimpleNamespace(
-        join=join,
-        force_at=force_at,
-        point_velocity=point_velocity,
-        momentum=momentum,
-        exp_quat=exp_quat,
-        exp_adjoint=exp_adjoint,
-        log_quat=log_quat,
-        log_adjoint=log_adjoint,
-        quat_of=quat_of,
-        to_tangent=to_tangent,
-        from_tangent=from_tangent,
+    return by_name(
+        join, force_at, point_velocity, momentum, exp_quat, exp_adjoint, log_quat, log_adjoint, to_tangent, from_tangent
     )

@@ -1,14 +1,15 @@
 """What the generated code of the kernels depends on; the numbers that it does not depend on are in model.py."""
 
 import dataclasses
+from typing import Any
 
 from diffsim.kernels.lanes import Division
-from diffsim.robot.scene import FACTORS, Scene
+from diffsim.robot.scene import Scene
 
 MAX_SPEED = 1e5  # m/s and rad/s; what is faster has blown up, and its squares would soon leave float32
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class KernelSpec:
     """Everything the generated code depends on. Scenes of equal specification share their compiled kernels."""
 
@@ -18,9 +19,9 @@ class KernelSpec:
     nball: int
     features: frozenset[str]
     dtype: type  # of the scene's numbers
-    block: int  # environments that one thread steps at once (wide.py)
+    block: int = 1  # environments that one thread steps at once (wide.py)
     implicit: bool
-    varied: bool  # constants are multiplied by factors of each environment (factors.py)
+    varied: bool = False  # constants are multiplied by factors of each environment (factors.py)
     forced: int  # number of bodies that external forces act on (force.py), 0 without
     env_last: bool  # checkpoints as [row, component, environment] (coalesced on a GPU) or [row, block, component]
     # how threads share an environment (lanes.py); slots: the most links that one of them has
@@ -29,8 +30,8 @@ class KernelSpec:
     trunk: int
     slots: int
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
-    constrained: bool  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
-    touchdown: bool  # see Integration
+    constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
+    touchdown: bool = True  # see Integration; False without constraints, where it would compile the same kernels anew
 
     @property
     def floating(self) -> bool:
@@ -60,46 +61,19 @@ class KernelSpec:
         return self.constrained and "damping" in self.features
 
     @property
-    def nfactors(self) -> int:
-        """Columns of the array `factors`."""
-        return len(FACTORS) if self.varied else 0
-
-    @property
     def nfactor(self) -> int:
         """Numbers of the cached factorisation: U and 1/d of each joint, the base's packed Cholesky factor."""
         return 7 * (self.nlink - 1) + (21 if self.floating else 0)
 
 
-def kernel_spec(
-    scene: Scene,
-    division: Division,
-    dtype: type,
-    implicit: bool,
-    env_last: bool,
-    varied: bool = False,
-    forced: bool = False,
-    block: int = 1,
-    constrained: bool = False,
-    touchdown: bool = True,
-) -> KernelSpec:
+def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = False, **asked: Any) -> KernelSpec:
+    """Of a scene whose environments are divided so; asked: fields that neither decides."""
     limbs = division.threads_per_env > division.sharers  # which differ, so that only the trunk's links are everyone's
     return KernelSpec(
-        nlink=scene.nlink,
-        nu=scene.nu,
-        carrier=scene.carrier,
-        nball=scene.nball,
-        features=scene.features,
+        **{name: getattr(scene, name) for name in ("nlink", "nu", "carrier", "nball", "features")},
+        **{name: getattr(division, name) for name in ("threads_per_env", "sharers", "trunk", "slots")},
         dtype=dtype,
-        block=block,
-        implicit=implicit,
-        varied=varied,
         forced=scene.nbody if forced else 0,
-        env_last=env_last,
-        threads_per_env=division.threads_per_env,
-        sharers=division.sharers,
-        trunk=division.trunk,
-        slots=division.slots,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
-        constrained=constrained,
-        touchdown=touchdown and constrained,
+        **asked,
     )

@@ -1,7 +1,5 @@
 """A recorded trajectory: how it is read, and how a system follows it."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 from collections.abc import Iterable, Sequence
@@ -75,8 +73,7 @@ def _read(archive: zipfile.ZipFile, name: str, kinds: str) -> NDArray[Any]:
     if dtype.kind not in kinds or math.prod(shape) * dtype.itemsize > MOST:
         raise ValueError(f"{name} has shape {shape} of {dtype}, must be {MOST:,} bytes of real numbers at most")
     with archive.open(f"{name}.npy") as file:
-        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
-    return array
+        return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def save_demonstration(

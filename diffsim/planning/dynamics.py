@@ -1,7 +1,5 @@
 """Dynamics: a robot as a discrete-time system of states on a manifold, with the Jacobians that planning needs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -28,12 +26,7 @@ class Dynamics:
     Differences of states are tangent vectors of nd = 2 nv numbers. A vector v of the body's frame moves a quaternion q
     to q (1, v / 2), normalised, which is the exponential map to second order. Its inverse is 2 vec / w for q and -q.
 
-    Args:
-        scene: the robot.
-        integration, control_dt, device, threads: see Simulator.
-
-    Raises:
-        ValueError: see Simulator.
+    Arguments and errors are those of Simulator.
 
     Attributes:
         steps: control steps simulated so far, over all copies.

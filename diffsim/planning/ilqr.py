@@ -5,8 +5,6 @@ With Gauss-Newton's second derivatives (none of the dynamics), the state regular
 line search in one batch.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
@@ -144,10 +142,7 @@ def ilqr(
 ) -> Plan:
     """Optimises R trajectories of the system, x (R, T + 1, nx) and u (R, T, nu), side by side.
 
-    Args:
-        iterations: at most so many.
-        mu: initial regularisation; each trajectory has its own.
-        show: called after each iteration.
+    mu is the initial regularisation; each trajectory has its own. `show` is called after each iteration.
     """
     total = cost.value(x.unsqueeze(1), u.unsqueeze(1)).sum(-1).squeeze(1)
     mus, delta = torch.full_like(total, mu), torch.ones_like(total)

@@ -1,7 +1,5 @@
 """L-BFGS: maximise a deterministic function of one vector."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

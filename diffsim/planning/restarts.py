@@ -1,7 +1,5 @@
 """Trajectory optimisation from nothing: many random action sequences, of which the best are kept and continued."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -36,10 +34,9 @@ def best_of_random_starts(
 
     Args:
         actions: (R, T, nu) where to start from, see starting_actions; those that diverge are left out.
-        keep: at most so many trajectories are returned.
 
     Returns:
-        x (keep, T + 1, nx), u (keep, T, nu), the cheapest first.
+        x (keep, T + 1, nx), u (keep, T, nu), the cheapest first; fewer if fewer are left.
 
     Raises:
         ValueError: all of them diverged.

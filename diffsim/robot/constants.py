@@ -6,8 +6,6 @@ Where a file names no constants, they follow from the robot's inertia and the fi
 itself; FIRMNESS makes up for that as well as one number can (measured over gymnasium's robots).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -67,8 +65,7 @@ def text(m: mujoco.MjModel, name: str, default: str) -> str:
 def numeric(m: mujoco.MjModel, name: str) -> Array:
     """The numbers of the <custom><numeric> of that name; none if the file has no such element."""
     index = mujoco.mj_name2id(m, Kind.mjOBJ_NUMERIC, name)
-    values: Array = m.numeric_data[m.numeric_adr[index] :][: m.numeric_size[index]] if index >= 0 else np.zeros(0)
-    return values
+    return m.numeric_data[m.numeric_adr[index] :][: m.numeric_size[index]] if index >= 0 else np.zeros(0)
 
 
 def floating(m: mujoco.MjModel) -> bool:
@@ -79,15 +76,13 @@ def floating(m: mujoco.MjModel) -> bool:
 def motors(m: mujoco.MjModel) -> NDArray[np.bool_]:
     """(actuators,) whose force is their control times a constant."""
     still, unbiased = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
-    found: NDArray[np.bool_] = still & unbiased & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
-    return found
+    return still & unbiased & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
 
 
 def servos(m: mujoco.MjModel) -> NDArray[np.bool_]:
     """(actuators,) whose force besides is a spring and a damper on what they move: <position>, <velocity>."""
     still, affine = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE, m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-    found: NDArray[np.bool_] = still & affine & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
-    return found
+    return still & affine & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
 
 
 def control_range(m: mujoco.MjModel) -> tuple[Array, Array]:
@@ -137,8 +132,7 @@ def base_geoms(m: mujoco.MjModel) -> NDArray[np.bool_]:
     """(ngeom,) of bodies that are fixed to the world and carry moving ones, planes and height fields aside."""
     carries = np.isin(m.body_rootid, m.body_rootid[m.body_weldid > 0])
     flat = (m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (m.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
-    mask: NDArray[np.bool_] = carries[m.geom_bodyid] & (m.body_weldid[m.geom_bodyid] == 0) & (m.geom_bodyid > 0) & ~flat
-    return mask
+    return carries[m.geom_bodyid] & (m.body_weldid[m.geom_bodyid] == 0) & (m.geom_bodyid > 0) & ~flat
 
 
 def declared_pairs(m: mujoco.MjModel) -> dict[tuple[int, int], int]:
@@ -168,8 +162,7 @@ def _collide(m: mujoco.MjModel, a: int, b: NDArray[np.int64]) -> NDArray[np.bool
     masks = (m.geom_contype[a] & m.geom_conaffinity[b]) | (m.geom_contype[b] & m.geom_conaffinity[a])
     bodies = m.geom_bodyid[a], m.geom_bodyid[b]
     excluded = np.isin((np.minimum(*bodies) << 16) + np.maximum(*bodies), m.exclude_signature)
-    touch: NDArray[np.bool_] = (masks != 0) & ~excluded
-    return touch
+    return (masks != 0) & ~excluded
 
 
 def pair_law(m: mujoco.MjModel, a: int, b: int) -> PairLaw:
@@ -257,12 +250,7 @@ def recovery(solref: Sequence[float] | Array) -> Recovery:
 
 
 def contact_constants(mass: float, mobility: Array, solref: Sequence[float]) -> dict[str, float]:
-    """k_n, k_d and k_t.
-
-    Args:
-        mass: kg, of the robot.
-        mobility: (points,) 1/kg, of the contact points, see mobilities.
-        solref: of the contact, MJCF's.
+    """k_n, k_d and k_t of a robot's mass [kg], the mobility (points,) [1/kg] of its contact points, and their solref.
 
     k_n carries its share of the mass as solref asks, but never more than the lightest point stays stable on; k_t halves
     that point's slip in one substep.
@@ -300,15 +288,10 @@ def mass_matrix(m: mujoco.MjModel) -> Array:
 
 
 def mobilities(m: mujoco.MjModel, points: Sequence[tuple[int, Array]]) -> Array:
-    """(points,) 1/kg: acceleration per force of points of the robot, in the direction of least inertia.
-
-    Args:
-        points: (body, position in the world).
-    """
+    """(points,) 1/kg: acceleration per force of points (body, world position), in the direction of least inertia."""
     data = at_rest(m)
     jacobians = np.zeros((len(points), 3, m.nv))
     for jacobian, (body, position) in zip(jacobians, points, strict=True):
         mujoco.mj_jac(m, data, jacobian, None, position, body)
     response = jacobians @ np.linalg.inv(mass_matrix(m)) @ jacobians.transpose(0, 2, 1)
-    mobility: Array = np.linalg.eigvalsh(response)[:, -1]
-    return mobility
+    return np.linalg.eigvalsh(response)[:, -1]

@@ -3,8 +3,6 @@
 Nothing here is fitted; MuJoCo's documentation, "Computation", has the law, kernels/constraint.py the equations.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from functools import cache
@@ -22,26 +20,17 @@ LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
 
 
 class Constraints(NamedTuple):
-    """Numbers of MuJoCo's constraints, for one length of a substep.
+    """Numbers of MuJoCo's constraints, for one length of a substep."""
 
-    Attributes:
-        contact: (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends,
-            width [m], midpoint and power; margin [m].
-        limit: (nlink, 11) the same of each joint's limit, in the joint's units; friction and impratio are of no use.
-        loss: (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s].
-    """
-
+    # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
+    # midpoint and power; margin [m]
     contact: Array
-    limit: Array
-    loss: Array
+    limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
+    loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
 
 
 def constrained(scene: Scene, seconds: float) -> Scene:
-    """A copy of the scene with MuJoCo's constraints in substeps of that length, and all contact points that it has.
-
-    Raises:
-        SceneError: what the file asks for and these constraints are not.
-    """
+    """A copy with MuJoCo's constraints in substeps of that length; raises SceneError for what of the file they lack."""
     m = scene.mj_model
     if found := list(_obstacles(scene)):
         raise SceneError(f"{scene.name}: with the integrator mujoco {'; '.join(found)}")

@@ -1,7 +1,5 @@
 """MJCF -> Scene, by way of MuJoCo's compiler; refuse.py names what is not simulated."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import os

@@ -3,8 +3,6 @@
 Each check lists reasons with a mask of the elements that they hold for.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -126,8 +124,7 @@ def _any(m: mujoco.MjModel, fields: str) -> Mask:
 
 def _finite(values: ArrayLike) -> Mask:
     """Elementwise, in the single precision of the kernels."""
-    within: Mask = np.abs(values) <= GREATEST
-    return within
+    return np.abs(values) <= GREATEST
 
 
 def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:

@@ -1,7 +1,5 @@
 """What the simulator makes of an MJCF file: used, approximated, told. `python -m diffsim check robot.xml`"""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import mujoco
@@ -74,9 +72,6 @@ def _parts(scene: Scene) -> Iterator[str]:
     yield f"state      nq {scene.nq}, nv {scene.nv}"
     yield f"mass       {scene.mass.sum():.4g} kg"
     yield f"controls   {', '.join(f'{n} {what}' for what, n in shares.items() if n) or 'none'}"
-    ground = (
-        f"ground at z = {scene.ground_height:g} m" if scene.ncontact else "the file has no ground that it may touch"
-    )
     ground = f"ground at z = {scene.ground_height:g} m" if scene.ncontact else "no ground that it may touch"
     yield f"contact    {scene.ncontact} points, {ground}"
     yield f"features   {', '.join(sorted(scene.features))}"

@@ -266,11 +266,7 @@ class Scene:
         return dataclasses.replace(self, terrain=_check_terrain(vertices), ground_height=0.0)
 
     def without(self, *features: str) -> Scene:
-        """A copy of the scene that lacks some of "contact", "limit", "stiffness", "damping", "muscle", "drag".
-
-        Raises:
-            ValueError: a feature that cannot be left out.
-        """
+        """A copy without "contact", "limit", "stiffness", "damping", "muscle" or "drag"; else raises ValueError."""
         n = self.nlink
         points = "contact_link", "contact_position", "contact_radius"
         segments = "segment_link", "segment_position", "segment_muscle"

@@ -31,20 +31,11 @@ class Integration(NamedTuple):
     passes: int = PASSES
     touchdown: bool = True
 
-    def replaced(
-        self,
-        integrator: str | None,
-        substeps: int | None,
-        theta: float | None,
-        passes: int | None = None,
-        touchdown: bool | None = None,
-    ) -> Integration:
+    def replaced(self, integrator: str | None = None, **others: Any) -> Integration:
         """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
-        new = self
-        if integrator is not None and integrator != self.integrator:
-            new = Integration(integrator, self.substeps)
-        given: dict[str, Any] = {"substeps": substeps, "theta": theta, "passes": passes, "touchdown": touchdown}
-        return new._replace(**{name: value for name, value in given.items() if value is not None})
+        same = integrator is None or integrator == self.integrator
+        new = self if same else Integration(str(integrator), self.substeps)
+        return new._replace(**{name: value for name, value in others.items() if value is not None})
 
     def check(self) -> Integration:
         """Itself, with substeps a plain int; raises ValueError, with what is allowed, if it cannot be integrated so."""

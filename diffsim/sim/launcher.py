@@ -1,7 +1,5 @@
 """Launcher: a scene's two kernels, and the threads that run them."""
 
-from __future__ import annotations
-
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -38,10 +36,6 @@ class Launcher:
 
     On a CPU some threads take a share of the environments each; on a GPU a launch goes to torch's current stream.
 
-    Args:
-        scene, num_envs: see Simulator.
-        options: checked ones.
-
     Attributes:
         spec: what the kernels were generated for.
         num_blocks: how many blocks of spec.block environments there are, the last of which may not be full.
@@ -56,12 +50,20 @@ class Launcher:
             division = default_division(scene, num_envs) if cuda else divide(scene)
         elif division.threads_per_env > 1 and not cuda:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
-        implicit = options.integration.integrator == "implicit"
         block = options.block or default_block(num_envs, options)
         how = options.integration
         constrained = how.integrator == "mujoco"
         self.spec = kernel_spec(
-            scene, division, real, implicit, cuda, options.factors, options.forces, block, constrained, how.touchdown
+            scene,
+            division,
+            real,
+            options.forces,
+            implicit=how.integrator == "implicit",
+            constrained=constrained,
+            touchdown=how.touchdown and constrained,
+            varied=options.factors,
+            env_last=cuda,
+            block=block,
         )
         self.num_blocks = -(-num_envs // block)
         self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)

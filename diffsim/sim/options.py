@@ -62,11 +62,7 @@ def check_dtype(dtype: torch.dtype) -> torch.dtype:
 
 
 def check_device(device: str | torch.device) -> torch.device:
-    """The device, with an index if it is a GPU.
-
-    Raises:
-        ValueError: neither the CPU nor a CUDA device that is there.
-    """
+    """The device, with an index if it is a GPU; raises ValueError unless it is the CPU or a GPU that is there."""
     try:
         result = torch.device(device)
     except (RuntimeError, TypeError) as error:

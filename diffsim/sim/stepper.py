@@ -9,6 +9,7 @@ import torch.nn.functional as F
 import warp as wp
 
 from diffsim.kernels.model import types
+from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.launcher import Launcher, check_memory
 
@@ -40,13 +41,7 @@ class ControlStep(torch.autograd.Function):
 
 
 class Stepper:
-    """Control steps by the kernels; see Simulator.
-
-    Args:
-        launcher: runs the kernels.
-        integration: semi-implicit or implicit, as the launcher's kernels.
-        control_dt, horizon: see Simulator.
-    """
+    """Control steps by the launcher's kernels, which are those of the integration; see Simulator."""
 
     def __init__(self, launcher: Launcher, integration: Integration, control_dt: float, horizon: int) -> None:
         spec, n, slots = launcher.spec, launcher.num_envs, horizon + 1  # the last slot serves steps without gradient
@@ -60,7 +55,7 @@ class Stepper:
         self._passes = integration.passes
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step.
-        self._widths = (spec.nq, spec.nv, spec.nu, spec.nfactors, 6 * spec.forced)
+        self._widths = (spec.nq, spec.nv, spec.nu, len(FACTORS) * spec.varied, 6 * spec.forced)
         self._end_widths = (spec.nq, spec.nv + int(spec.constrained))  # with constraints a column for the residual
         self._start, self._end = tensor(slots, n, sum(self._widths)), tensor(n, sum(self._end_widths))
         self._g_start, self._g_end = tensor(n, sum(self._widths)), tensor(n, spec.nq + spec.nv)
@@ -103,11 +98,7 @@ class Stepper:
         return self._end[:, : sum(self._widths[:2])].clone()
 
     def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The adjoints of qpos, qvel, ctrl, factors and forces from that of the state (N, nq + nv) after the step.
-
-        Raises:
-            RuntimeError: the checkpoint serves another step by now.
-        """
+        """The adjoints of qpos, qvel, ctrl, factors and forces from that of the state (N, nq + nv) after the step."""
         if self._version[checkpoint.slot] != checkpoint.version:
             raise RuntimeError(
                 f"backward through a control step whose checkpoint was overwritten: at most {self._horizon} "

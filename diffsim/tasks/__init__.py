@@ -1,7 +1,5 @@
 """The tasks, one file each."""
 
-from __future__ import annotations
-
 from diffsim.tasks.ant import Ant
 from diffsim.tasks.base import Accuracy, Contact, Task
 from diffsim.tasks.cartpole import CartPole

@@ -5,8 +5,6 @@ wait for the device, so they can be captured into a CUDA graph. Equations and ta
 al. 2022, appendix A.3); what it leaves open (start states, substeps) follows its public benchmark. World frame, z up.
 """
 
-from __future__ import annotations
-
 import os
 from typing import ClassVar, Literal, TypeAlias, get_args
 
@@ -85,11 +83,7 @@ class Task:
 
     @property
     def mirror(self) -> Mirror:
-        """How the task looks with left and right exchanged.
-
-        Raises:
-            ValueError: the task has none, as its robot has no left and right or tracks a motion.
-        """
+        """How the task looks with left and right exchanged; raises ValueError if it has no mirror image."""
         raise ValueError(f"task {self.name!r} has no mirror image")
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:

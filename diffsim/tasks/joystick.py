@@ -5,8 +5,6 @@ episode. A clock moves the legs' reference: in the air they fold, on the ground 
 command asks. Robots are data: GO1, GO2, G1. Their figures are those of MuJoCo Menagerie's files.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -29,43 +27,25 @@ JOINT_NOISE, RATE_NOISE, GYRO_NOISE, VELOCITY_NOISE, GRAVITY_NOISE = 0.03, 0.5, 
 
 
 class Leg(NamedTuple):
-    """A leg, and where it is in the gait.
+    """A leg, and where it is in the gait."""
 
-    Attributes:
-        joints: (pitch, roll) names of the joints that move the foot along x and y.
-        folds: of joints in the middle of the swing [rad].
-        place: x and y of the hip from the root [m].
-        phase: share of the cycle by which it is ahead.
-    """
-
-    joints: tuple[str, str]
-    folds: dict[str, float]
-    place: tuple[float, float]
-    phase: float
+    joints: tuple[str, str]  # (pitch, roll) names of those that move the foot along x and y
+    folds: dict[str, float]  # of joints in the middle of the swing [rad]
+    place: tuple[float, float]  # x and y of the hip from the root [m]
+    phase: float  # share of the cycle by which it is ahead
 
 
 class Robot(NamedTuple):
-    """What the task knows of a robot.
+    """What the task knows of a robot."""
 
-    Attributes:
-        legs: of it; joints of no leg stay near the keyframe's.
-        joints: names in order of qpos.
-        home: (joints,) [rad] of the keyframe.
-        height: m, of the root there.
-        length: m, of a leg, from hip to foot there.
-        cycle: Hz, of the gait; legs of the two sides are half a cycle apart.
-        sides: (right, left) beginnings of the joints' names.
-        command: largest vx, vy [m/s] and yaw rate [rad/s].
-    """
-
-    joints: tuple[str, ...]
-    home: tuple[float, ...]
-    height: float
-    legs: tuple[Leg, ...]
-    length: float
-    cycle: float
-    sides: Sides
-    command: tuple[float, float, float] = (1.0, 0.6, 1.0)
+    joints: tuple[str, ...]  # names in order of qpos
+    home: tuple[float, ...]  # (joints,) [rad] of the keyframe
+    height: float  # m, of the root there
+    legs: tuple[Leg, ...]  # joints of no leg stay near the keyframe's
+    length: float  # m, of a leg, from hip to foot there
+    cycle: float  # Hz, of the gait; legs of the two sides are half a cycle apart
+    sides: Sides  # (right, left) beginnings of the joints' names
+    command: tuple[float, float, float] = (1.0, 0.6, 1.0)  # largest vx, vy [m/s] and yaw rate [rad/s]
 
 
 def quadruped(order: Sequence[str]) -> Robot:

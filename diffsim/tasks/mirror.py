@@ -24,15 +24,10 @@ Sides = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class Reflection:
-    """A permutation with signs, its own inverse: one gather and one product, differentiable.
+    """A permutation with signs, its own inverse: one gather and one product, differentiable."""
 
-    Attributes:
-        index: (n,) int64, from where each number comes.
-        sign: (n,) 1 or -1, of each number after the permutation.
-    """
-
-    index: Tensor
-    sign: Tensor
+    index: Tensor  # (n,) int64, from where each number comes
+    sign: Tensor  # (n,) 1 or -1, of each number after the permutation
 
     def __call__(self, x: Tensor) -> Tensor:
         """The mirror image (..., n) of x (..., n)."""
@@ -71,7 +66,6 @@ def reflections(
     Args:
         model: of which left and right are mirror images in the reference configuration. This is not checked.
         sides: (right, left) beginnings or ends of names, which a mirror exchanges.
-        device, dtype: of the tensors.
 
     Raises:
         ValueError: a joint or an actuator has no partner of the other side's name, or its axis is another one.

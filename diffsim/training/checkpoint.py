@@ -1,7 +1,5 @@
 """Checkpoints: one file that continues a run exactly, and whose policy anyone can load without the script."""
 
-from __future__ import annotations
-
 import io
 import logging
 import math
@@ -53,17 +51,11 @@ class Learner(Protocol):
 
 @dataclass
 class SavedPolicy:
-    """A checkpoint's deterministic policy, with where it comes from.
+    """A checkpoint's deterministic policy, with where it comes from."""
 
-    Attributes:
-        network: observations (..., obs_dim) -> actions (..., nu).
-        script, args, iteration: which script trained it, with which arguments (env among them), for how long.
-        simulator: in which it was trained.
-    """
-
-    network: nn.Sequential
-    script: str
-    args: dict[str, Any]
+    network: nn.Sequential  # observations (..., obs_dim) -> actions (..., nu)
+    script: str  # that trained it
+    args: dict[str, Any]  # with which arguments, env among them
     iteration: int
     simulator: str = HOME
 
@@ -82,11 +74,7 @@ def parts(learner: Learner) -> dict[str, Any]:
 def save(path: Path, script: str, learner: Learner, state: Mapping[str, Any]) -> None:
     """Replace the file in one step: whoever reads it finds the old one or the new one, whole.
 
-    Args:
-        path: the file.
-        script: name of the learner's script.
-        learner: whose parts and policy are saved.
-        state: what else continues the run: args and iteration at least.
+    It holds the learner's parts and policy, and the state: what else continues the run, args and iteration at least.
     """
     modules = {name: part.state_dict() for name, part in parts(learner).items()}
     policy = {"layers": _describe(learner.policy), "weights": learner.policy.state_dict()}
@@ -117,11 +105,7 @@ def find_nonfinite(learner: Learner) -> str | None:
 
 
 def load(path: Path, script: str | None = None) -> dict[str, Any]:
-    """The checkpoint at path, of the given script if one is named.
-
-    Raises:
-        ValueError: there is none, it is damaged, or it is of another script or format.
-    """
+    """The checkpoint at path, of a script if one is named; raises ValueError if there is none that is whole."""
     if not path.is_file():
         fail(f"no such checkpoint: {path}")
     try:
@@ -148,10 +132,11 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
 
 def _check_structure(state: Mapping[str, Any]) -> None:
     """Raise a ValueError unless all that a checkpoint of this format holds is there, and of the right type."""
-    for name, kind in (HELD if "modules" in state else POLICY).items():
+    for name in HELD if "modules" in state else POLICY:
+        kind, holds = HELD[name]
         if name not in state:
             raise ValueError(f"{name} is missing")
-        if not fits(kind, state[name]) or not HOLDS[name](state[name]):
+        if not fits(kind, state[name]) or not holds(state[name]):
             raise ValueError(f"{name} is not what a checkpoint holds")
 
 
@@ -160,56 +145,43 @@ def _is_count(number: int) -> bool:
 
 
 def _is_policy(policy: dict[str, Any]) -> bool:
-    if not fits(list[list[Any]], policy.get("layers")) or not fits(dict[str, Tensor], policy.get("weights")):
+    layers: Any = policy.get("layers")
+    weights: Any = policy.get("weights")
+    if not fits(list[list[Any]], layers) or not fits(dict[str, Tensor], weights):
         return False
-    known = all(layer and layer[0] in LAYERS for layer in policy["layers"])
-    return known and all(w.layout == torch.strided and w.device.type == "cpu" for w in policy["weights"].values())
+    plain = (w.layout == torch.strided and w.device.type == "cpu" and w.is_floating_point() for w in weights.values())
+    return all(layer and layer[0] in LAYERS for layer in layers) and all(plain)
 
 
 def _is_rank(rank: dict[str, Any]) -> bool:
     return fits(Tensor, rank.get("rng")) and rank["rng"].dtype == torch.uint8 and "env" in rank
 
 
-# What a checkpoint holds, of which type, and what more must be true of it. An exported policy holds less.
-POLICY: dict[str, Any] = {"script": str, "args": dict[str, Any], "iteration": int, "policy": dict[str, Any]}
-HELD: dict[str, Any] = POLICY | {
-    "modules": dict[str, Any],
-    "control_steps": int,
-    "seconds": float,
-    "totals": dict[str, int],
-    "episodes": list[tuple[float, float, float]],
-    "ranks": list[dict[str, Any]],
+# What a checkpoint holds: of which type, and what more must be true of it. An exported policy has the first four.
+HELD: dict[str, tuple[Any, Callable[[Any], bool]]] = {
+    "script": (str, str.isprintable),
+    "args": (dict[str, Any], lambda args: isinstance(args.get("env"), str)),
+    "iteration": (int, _is_count),
+    "policy": (dict[str, Any], _is_policy),
+    "modules": (dict[str, Any], lambda _: True),
+    "control_steps": (int, _is_count),
+    "seconds": (float, lambda seconds: 0 <= seconds < math.inf),
+    "totals": (dict[str, int], lambda _: True),
+    "episodes": (list[tuple[float, float, float]], lambda rows: all(math.isfinite(x) for row in rows for x in row)),
+    "ranks": (list[dict[str, Any]], lambda ranks: bool(ranks) and all(map(_is_rank, ranks))),
 }
-HOLDS: dict[str, Callable[[Any], bool]] = {
-    "script": str.isprintable,
-    "args": lambda args: isinstance(args.get("env"), str),
-    "iteration": _is_count,
-    "policy": _is_policy,
-    "modules": lambda _: True,
-    "control_steps": _is_count,
-    "seconds": lambda seconds: 0 <= seconds < math.inf,
-    "totals": lambda _: True,
-    "episodes": lambda rows: all(math.isfinite(number) for row in rows for number in row),
-    "ranks": lambda ranks: bool(ranks) and all(map(_is_rank, ranks)),
-}
+POLICY = [*HELD][:4]
 
 
 def load_policy(path: Path) -> SavedPolicy:
-    """The policy of any script's checkpoint, on the CPU in float32.
-
-    Raises:
-        ValueError: see `load`; or its weights do not fit its layers.
-    """
+    """The policy of any script's checkpoint, on the CPU in float32; raises ValueError as `load` does."""
     state = load(path)
     try:
         with torch.device("meta"):  # sizes alone: they are compared before anything is allocated
             network = nn.Sequential(*(LAYERS[name][0](*arguments) for name, *arguments in state["policy"]["layers"]))
             kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
-        weights = state["policy"]["weights"]
-        if any(w.layout != torch.strided or w.is_meta or not w.is_floating_point() for w in weights.values()):
-            raise TypeError
-        # A searched policy is in float64.
-        network.load_state_dict({name: w.to(kinds[name]) for name, w in weights.items()}, assign=True)
+        weights = {name: w.to(kinds[name]) for name, w in state["policy"]["weights"].items()}  # searched in float64
+        network.load_state_dict(weights, assign=True)
         if task := TASKS.get(state["args"]["env"]):
             network(torch.zeros(1, task.obs_dim))  # on the device meta this would take seconds, of torch's imports
     except (IndexError, KeyError, RuntimeError, TypeError, ValueError):
@@ -260,11 +232,7 @@ def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
 
 
 def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:
-    """Load the weights and statistics of a checkpoint into a learner, and what it holds of an environment into that.
-
-    Raises:
-        ValueError: they are of other sizes.
-    """
+    """Load a checkpoint into a learner and, if given, an environment; raises ValueError if it is of other sizes."""
     try:
         for name, part in parts(learner).items():
             part.load_state_dict(state["modules"][name])

@@ -1,7 +1,5 @@
 """The directory of a run: who may write there; progress.csv, tensorboard and a progress bar."""
 
-from __future__ import annotations
-
 import csv
 import math
 import os
@@ -87,9 +85,7 @@ class EpisodeStatistics:
 class ProgressFile:
     """progress.csv: a row per iteration, a column per scalar. Columns may join later; older rows leave them empty.
 
-    Args:
-        path: the file.
-        iteration: of a resumed run; rows of later iterations are dropped. 0 begins a new file.
+    A resumed run goes on after its iteration, and rows of later ones are dropped; iteration 0 begins a new file.
     """
 
     def __init__(self, path: Path, iteration: int) -> None:
@@ -135,12 +131,7 @@ def column(scalar: str) -> str:
 class ProgressLog:
     """The three of them for one run. Opened late, so that a run that fails at its start leaves nothing behind.
 
-    Args:
-        directory: where the files go.
-        iteration, control_steps: where a resumed run goes on; 0 at the start.
-        hyperparameters: logged as a table.
-        total: iterations in all.
-        quiet: no progress bar, no messages.
+    A resumed run goes on after iteration and control_steps, which are 0 otherwise; total counts all iterations.
     """
 
     def __init__(

@@ -37,28 +37,17 @@ ENOUGH = 0.97  # of the return, kept there
 
 @dataclass
 class Evaluation:
-    """One episode each of n environments.
+    """One episode each of n environments."""
 
-    Attributes:
-        returns: (n,) undiscounted.
-        lengths: (n,) control steps.
-        speed: mean forward speed, m/s; None for a robot that does not travel.
-        qpos: (T, n, nq) before each step; valid up to an episode's length.
-        action: (T, n, nu) of each step.
-        scene, control_dt: what the episodes are of, to draw them; of several terrains episode i has number i % M.
-        others: what else a script measured, by name.
-        forward: the task's way forward, see Task.
-    """
-
-    returns: Tensor
-    lengths: Tensor
-    speed: float | None
-    qpos: Tensor
-    action: Tensor
-    scene: Scene
-    control_dt: float
-    others: dict[str, float] = field(default_factory=dict)
-    forward: int | None = 0
+    returns: Tensor  # (n,) undiscounted
+    lengths: Tensor  # (n,) control steps
+    speed: float | None  # mean forward speed, m/s; None for a robot that does not travel
+    qpos: Tensor  # (T, n, nq) before each step; valid up to an episode's length
+    action: Tensor  # (T, n, nu) of each step
+    scene: Scene  # to draw the episodes; of several terrains episode i has number i % M
+    control_dt: float  # s
+    others: dict[str, float] = field(default_factory=dict)  # what else a script measured, by name
+    forward: int | None = 0  # the task's way forward, see Task
 
     @property
     def length(self) -> float:
@@ -168,26 +157,12 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 
 def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **options: Any) -> DiffEnv:
     """The task as the flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
-    options = {"control_dt": getattr(args, "control_dt", None)} | options  # a flag of gps.py alone
+    names = "integrator substeps theta passes touchdown contact early_termination clip".split()
+    flags = {name: getattr(args, name) for name in names}
+    flags |= dict(penalty=parse_penalty(args.penalty), threads=args.threads or None)
+    flags["control_dt"] = getattr(args, "control_dt", None)  # a flag of gps.py alone
     try:
-        return diffsim.make(
-            args.env,
-            num_envs,
-            args.device,
-            seed,
-            horizon,
-            substeps=args.substeps,
-            integrator=args.integrator,
-            theta=args.theta,
-            passes=args.passes,
-            touchdown=args.touchdown,
-            contact=args.contact,
-            penalty=parse_penalty(args.penalty),
-            threads=args.threads or None,
-            early_termination=args.early_termination,
-            clip=args.clip,
-            **options,
-        )
+        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **flags | options)
     except ValueError as error:
         fail(error)
 

@@ -1,7 +1,5 @@
 """The flags that scripts share, and how a command line becomes complete, checked arguments."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import time
@@ -32,36 +30,6 @@ ClipFile = Annotated[
     ),
 ]
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
-
-
-@dataclass
-class SimulatorFlags:
-    """The task and how it is simulated."""
-
-    env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
-    """task, one of diffsim.TASKS, or the file of your own: my_task.py or my_task.py:Class (docs/own_robot.md)"""
-    accuracy: Literal["fast", "default", "accurate"] = "default"
-    """preset of integrator, substeps and theta (docs/accuracy.md); default is the paper's"""
-    integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
-    """time integration (per task, --accuracy and --contact); mujoco has MuJoCo's own contact and limits"""
-    substeps: Count = 16
-    """simulation steps per control step (per task and --accuracy)"""
-    theta: Fraction = 0.0
-    """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
-    passes: Count = PASSES
-    """of Newton's method on the constraints in each substep, with --integrator mujoco"""
-    touchdown: bool = True
-    """with --integrator mujoco, gradients count that a contact begins with a jump (docs/physics.md)"""
-    contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
-    """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
-    penalty: tuple[str, ...] = ()
-    """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
-    early_termination: bool = True
-    """end episodes where the robot falls, as the task says; otherwise only their time ends them"""
-    clip: ClipFile = None
-    """motion that humanoid_imitation tracks (docs/imitation.md): an .npz file, or the name of a shipped one"""
-    threads: Natural = 0
-    """CPU threads of the simulator, which change no result (0: as many as have work)"""
 
 
 @dataclass
@@ -99,8 +67,8 @@ class RunFlags:
 
 
 @dataclass
-class Flags(SimulatorFlags, RunFlags):
-    """What every script takes. Each extends it by its hyperparameters."""
+class Flags(RunFlags):
+    """What every script takes: the task and how it is simulated as well. Each extends it by its hyperparameters."""
 
     # What may change when a run goes on or is evaluated; the checkpoint decides everything else.
     MAY_CHANGE: ClassVar[tuple[str, ...]] = (
@@ -108,6 +76,31 @@ class Flags(SimulatorFlags, RunFlags):
         *("early_termination", "threads"),
         *(field.name for field in dataclasses.fields(RunFlags) if field.name != "seed"),
     )
+
+    env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
+    """task, one of diffsim.TASKS, or the file of your own: my_task.py or my_task.py:Class (docs/own_robot.md)"""
+    accuracy: Literal["fast", "default", "accurate"] = "default"
+    """preset of integrator, substeps and theta (docs/accuracy.md); default is the paper's"""
+    integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
+    """time integration (per task, --accuracy and --contact); mujoco has MuJoCo's own contact and limits"""
+    substeps: Count = 16
+    """simulation steps per control step (per task and --accuracy)"""
+    theta: Fraction = 0.0
+    """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
+    passes: Count = PASSES
+    """of Newton's method on the constraints in each substep, with --integrator mujoco"""
+    touchdown: bool = True
+    """with --integrator mujoco, gradients count that a contact begins with a jump (docs/physics.md)"""
+    contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
+    """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
+    penalty: tuple[str, ...] = ()
+    """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
+    early_termination: bool = True
+    """end episodes where the robot falls, as the task says; otherwise only their time ends them"""
+    clip: ClipFile = None
+    """motion that humanoid_imitation tracks (docs/imitation.md): an .npz file, or the name of a shipped one"""
+    threads: Natural = 0
+    """CPU threads of the simulator, which change no result (0: as many as have work)"""
 
     def task_defaults(self) -> dict[str, Any]:
         """Defaults that depend on other flags, such as the task, the device or the preset."""
@@ -157,10 +150,6 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 
     Defaults that depend on the task, its preset and the device fill what is not given. With --resume and --evaluate
     the arguments of the checkpoint take their place.
-
-    Args:
-        kind: the script's dataclass of arguments.
-        argv: in place of the process's.
 
     Raises:
         ValueError: an argument out of range, or one that does not fit to the others or to the checkpoint.

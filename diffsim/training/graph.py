@@ -1,7 +1,5 @@
 """Capture a function into a CUDA graph; on the CPU there is nothing to capture."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeVar
 from weakref import WeakSet
@@ -27,10 +25,7 @@ def capture(
     window to its end: the environment's state and random start states are carried from call to call. What it returns
     lives in the same memory every time, so copy what is to outlast the next call.
 
-    Args:
-        function: what is called.
-        device: where its tensors live; anything but a CUDA device gives the function back as it is.
-        env: the environment that the function steps, if any.
+    If its tensors are on the CPU, the function comes back as it is.
     """
     if torch.device(device).type != "cuda":
         return function

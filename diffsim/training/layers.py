@@ -1,7 +1,5 @@
 """Layers of policies that torch lacks: a checkpoint's policy is loaded with them, without its script."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 
@@ -11,25 +9,18 @@ from diffsim.training import distributed
 class ObsNormalizer(nn.Module):
     """Normalizes by the running mean and variance of what it has seen; constant between updates.
 
-    The statistics are buffers, so they are saved with the policy that depends on them.
-
-    Args:
-        size: numbers of an observation; None: what is normalized are scalars.
+    The statistics are buffers, so they are saved with the policy that depends on them. Without the size of an
+    observation it normalizes scalars.
     """
-
-    count: Tensor
-    mean: Tensor
-    var: Tensor
-    std: Tensor
 
     def __init__(self, size: int | None = None) -> None:
         super().__init__()
         self.size = size
         shape = () if size is None else (size,)
-        self.register_buffer("count", torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
-        self.register_buffer("mean", torch.zeros(shape))
-        self.register_buffer("var", torch.ones(shape))
-        self.register_buffer("std", torch.ones(shape))
+        self.count: Tensor = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
+        self.mean: Tensor = nn.Buffer(torch.zeros(shape))
+        self.var: Tensor = nn.Buffer(torch.ones(shape))
+        self.std: Tensor = nn.Buffer(torch.ones(shape))
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self.mean) / self.std
@@ -64,12 +55,10 @@ class Likeliest(nn.Module):
         loc: (m, n) the locations, if shared.
     """
 
-    loc: nn.Parameter | None
-
     def __init__(self, actions: int, components: int, shared: bool = True) -> None:
         super().__init__()
         self.actions, self.components, self.shared = actions, components, shared
-        self.register_parameter("loc", nn.Parameter(torch.zeros(actions, components)) if shared else None)
+        self.loc = nn.Parameter(torch.zeros(actions, components)) if shared else None
 
     def forward(self, x: Tensor) -> Tensor:
         parts = x.unflatten(-1, (-1, self.actions, self.components))

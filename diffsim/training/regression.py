@@ -1,7 +1,5 @@
 """Fit a small network to values without autograd, whose bookkeeping on a CPU costs nearly as much as the arithmetic."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -14,9 +12,8 @@ KINDS = nn.Linear, nn.ELU, nn.LayerNorm
 class Regression:
     """Descends the mean squared error of a network. With autograd the numbers would be the same, bit for bit.
 
-    Args:
-        network: a chain of Linear, ELU and LayerNorm, first a Linear, with one output.
-        optimizer: of all of its parameters.
+    The network is a chain of Linear, ELU and LayerNorm, first a Linear, with one output; all of its parameters are the
+    optimizer's.
     """
 
     def __init__(self, network: nn.Sequential, optimizer: ClippedAdam) -> None:

@@ -1,7 +1,5 @@
 """The replay buffer of off-policy learners."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
@@ -23,30 +21,19 @@ class ReplayBuffer(nn.Module):
 
     A checkpoint holds the rows that are filled and no others.
 
-    Args:
-        size: how many transitions it keeps.
-        obs_dim, action_dim: sizes of an observation and of an action.
-
     Attributes:
         rows: (size, obs_dim + action_dim + 1 + obs_dim + 1) transitions; the oldest are overwritten first.
         count: () of transitions ever added.
     """
 
-    rows: Tensor
-    count: Tensor
-
     def __init__(self, size: int, obs_dim: int, action_dim: int) -> None:
         super().__init__()
         self.size, self.widths = size, (obs_dim, action_dim, 1, obs_dim, 1)
-        self.register_buffer("rows", torch.zeros(size, sum(self.widths)), persistent=False)
-        self.register_buffer("count", torch.zeros((), dtype=torch.int64))
+        self.rows: Tensor = nn.Buffer(torch.zeros(size, sum(self.widths)), persistent=False)
+        self.count: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def add(self, transitions: Transition) -> None:
-        """Store B transitions.
-
-        Raises:
-            ValueError: they are more than the buffer keeps.
-        """
+        """Store B transitions; raises ValueError if they are more than the buffer keeps."""
         columns = [tensor if tensor.dim() > 1 else tensor.unsqueeze(1) for tensor in transitions]
         if (number := len(columns[0])) > self.size:
             raise ValueError(f"{number} transitions at once do not fit into a replay buffer of {self.size}")

@@ -84,17 +84,10 @@ class Run:
     `log` neither waits for the device nor writes: on a GPU an iteration is written while the next one is computed. Of
     several ranks only the first writes anything.
 
-    Args:
-        args: the script's arguments, complete. Random numbers are seeded by args.seed here.
-
-    Attributes:
-        iteration: the present one.
-        directory: where it writes.
-        device: where it computes.
-        simulator: which one its environments have, see SavedPolicy.
+    The script's arguments must be complete. Random numbers are seeded by args.seed here.
     """
 
-    simulator = checkpoint.HOME
+    simulator = checkpoint.HOME  # which its environments have
 
     def __init__(self, args: Flags) -> None:
         assert args.run_dir

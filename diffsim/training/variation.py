@@ -1,7 +1,5 @@
 """Constants that differ between environments, drawn at random, so that no policy lives on one robot's or ground's."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -30,11 +28,7 @@ class Range(NamedTuple):
 
 
 def parse_ranges(items: Sequence[str]) -> dict[str, Range]:
-    """Of the flag --randomise friction=0.7:1.3 mass=0.9:1.1, by name.
-
-    Raises:
-        ValueError: anything else.
-    """
+    """Of the flag --randomise friction=0.7:1.3 mass=0.9:1.1, by name; raises ValueError for anything else."""
     ranges = {}
     for item in items:
         name, _, text = item.partition("=")
@@ -57,7 +51,6 @@ class Variation:
         env: made with factors.
         ranges: of random factors, by their names in VARIED.
         redraw: iterations between drawings.
-        seed: of the drawings.
     """
 
     def __init__(self, env: DiffEnv, ranges: Mapping[str, Range], redraw: int, seed: int) -> None:

@@ -20,13 +20,13 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.scene import Scene
-from diffsim.view.slabs import slabs
+from diffsim.robot.scene import Array, Scene
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
 
 AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.1, 1.0])  # colours of a muscle
 GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
+DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
 VIDEO_FPS = 30.0  # at most
@@ -133,9 +133,24 @@ def drawable(scene: Scene) -> tuple[mujoco.MjModel, int]:
     return model, material
 
 
-def add_terrain(scene: mujoco.MjvScene, profile: NDArray[np.float64], material: int) -> None:
+def slabs(profile: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """Boxes whose upper faces are the segments of a profile (K, 2): half sizes (3,), centre (3,), rotation (3, 3)."""
+    for k, (start, end) in enumerate(itertools.pairwise(profile)):
+        length = float(np.linalg.norm(end - start))
+        along = (end - start) / length
+        if k == 0:
+            start, length = start - DRAWN_END * along, length + DRAWN_END
+        if k == len(profile) - 2:
+            length += DRAWN_END
+        t, n = np.array([along[0], 0.0, along[1]]), np.array([-along[1], 0.0, along[0]])
+        size = np.array([length / 2, *DRAWN_SIZE])
+        centre = np.array([start[0], 0.0, start[1]]) + size[0] * t - size[2] * n
+        yield size, centre, np.stack([t, [0.0, 1.0, 0.0], n], 1)
+
+
+def add_terrain(scene: mujoco.MjvScene, profile: Array, material: int) -> None:
     """Add a terrain (K, 2) to what is drawn, of this material of the model, or plain if it is -1."""
-    for size, centre, rotation in slabs(profile)[: scene.maxgeom - scene.ngeom]:
+    for size, centre, rotation in itertools.islice(slabs(profile), scene.maxgeom - scene.ngeom):
         box = scene.geoms[scene.ngeom]
         mujoco.mjv_initGeom(box, mujoco.mjtGeom.mjGEOM_BOX, size, centre, rotation.ravel(), GROUND)
         box.matid = material
@@ -354,11 +369,7 @@ def check_display() -> bool:
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """A current OpenGL context of MuJoCo's, from MUJOCO_GL or, on Linux, from EGL, which needs no display.
-
-    Raises:
-        RuntimeError: there is none, with the remedy.
-    """
+    """A current OpenGL context of MuJoCo's, from MUJOCO_GL or, on Linux, EGL; raises RuntimeError with the remedy."""
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     platform = os.environ.get("PYOPENGL_PLATFORM", "egl").lower()
     if wanted in ("disable", "disabled", "off", "false", "0"):

@@ -1,7 +1,5 @@
 """Screen: what `render_mode` makes of an environment's configurations, frames or a window; and the window itself."""
 
-from __future__ import annotations
-
 import os
 import sys
 import threading
@@ -31,16 +29,7 @@ SPACE, ENTER, MINUS, EQUALS = 32, 257, 45, 61
 
 
 class Screen:
-    """Shows configurations of a scene.
-
-    Args:
-        scene: what is shown.
-        mode: "rgb_array" returns frames; "human" shows the first configuration in a Window.
-        fps: frames per second of the window at true speed.
-
-    Raises:
-        ValueError: another mode.
-    """
+    """Shows a scene: "rgb_array" returns frames, "human" has the first in a Window; raises ValueError for others."""
 
     def __init__(self, scene: Scene, mode: RenderMode, fps: float) -> None:
         if mode not in get_args(RenderMode):
@@ -49,11 +38,7 @@ class Screen:
         self._drawer: Any = None  # a Renderer or a Window
 
     def show(self, qpos: NDArray[np.floating[Any]]) -> Frames | None:
-        """Frames of the configurations qpos (N, nq), or None once the first one is in the window.
-
-        Raises:
-            RuntimeError: the machine has no OpenGL, or no display for a window.
-        """
+        """Frames of qpos (N, nq), or None once the first is in the window; raises RuntimeError if nothing can draw."""
         if self._mode == "rgb_array":
             self._drawer = self._drawer or render.Renderer(self._scene, *render.VIDEO_SIZE)
             return tuple(self._drawer.draw(row, profile=k) for k, row in enumerate(qpos))
@@ -74,9 +59,7 @@ class Screen:
 class Window:
     """MuJoCo's window on a scene, which shows pictures at true speed and knows how keys and the mouse push the robot.
 
-    Args:
-        scene: what is shown.
-        control_dt: s of simulation from one picture to the next.
+    Pictures are control_dt [s] of simulation apart.
 
     Attributes:
         speed, paused: of the pictures; keys change them.

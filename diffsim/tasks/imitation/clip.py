@@ -80,11 +80,7 @@ class Clip:
         return 0.5 * (torch.cat((before, step)) + torch.cat((step, after))) / control_dt
 
     def check(self, model: mujoco.MjModel) -> None:
-        """That it can be a motion of a robot.
-
-        Raises:
-            ValueError: qpos of another width, or a joint angle far beyond the joint's limits.
-        """
+        """That a robot can follow it; raises ValueError for another width or joints far beyond their limits."""
         if self.qpos.shape[1] != model.nq:
             raise ValueError(f"clip {self}: qpos has {self.qpos.shape[1]} columns, the robot has {model.nq}")
         hinges = model.jnt_qposadr[1:]

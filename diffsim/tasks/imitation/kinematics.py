@@ -1,7 +1,5 @@
 """Forward kinematics in torch: where a robot's bodies are, batched and differentiable in qpos."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import torch
@@ -34,15 +32,7 @@ def matrix(quat: Tensor) -> Tensor:
 
 
 class Kinematics:
-    """Of a robot whose bodies hang by hinges on a root that floats freely, as ant and humanoid do.
-
-    Args:
-        model: of the robot.
-        device, dtype: of the tensors.
-
-    Raises:
-        ValueError: another joint, or one that is not at its body's origin.
-    """
+    """Of a robot with a free root and hinges at their bodies' origins, as ant and humanoid; else raises ValueError."""
 
     def __init__(self, model: mujoco.MjModel, device: torch.device | str, dtype: torch.dtype) -> None:
         free, *others = model.jnt_type
