@@ -1,5 +1,7 @@
 """Parallel differentiable simulation of articulated robots, and the tasks of the SHAC paper on it."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

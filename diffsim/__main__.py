@@ -1,5 +1,7 @@
 """What is installed and what is missing, without a command: tasks, devices, versions, hints about usual troubles."""
 
+from __future__ import annotations
+
 import os
 import platform
 import runpy

@@ -1,5 +1,7 @@
 """DiffEnv: a task on the simulator, as a gymnasium.vector.VectorEnv on torch tensors."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from numbers import Integral
 from typing import Any

@@ -1,5 +1,7 @@
 """NumpyEnv and NumpyVectorEnv: DiffEnv in NumPy, as gymnasium's wrappers and other libraries expect it."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from numbers import Integral
 from typing import Any

@@ -1,5 +1,7 @@
 """MuJoCo and Warp, started without noise. The package imports this before everything else; its host stays as it was."""
 
+from __future__ import annotations
+
 import ctypes
 import errno
 import gc

@@ -10,6 +10,8 @@ All functions here leave the ground at z = 0 up to x = `start` [m], so that a ro
 ValueError, with what is allowed, for what is not finite or not within the bounds that they name.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -3,6 +3,8 @@
 The physics knows nothing of this package, and it knows nothing of training.
 """
 
+from __future__ import annotations
+
 from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers, nearest_feedback
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration

@@ -1,5 +1,7 @@
 """What trajectories cost, with a quadratic model that is positive semidefinite: terms, and their sum. See ilqr.Cost."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import NamedTuple
 

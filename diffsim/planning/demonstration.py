@@ -1,5 +1,7 @@
 """A recorded trajectory: how it is read, and how a system follows it."""
 
+from __future__ import annotations
+
 import math
 import zipfile
 from collections.abc import Iterable, Sequence

@@ -1,5 +1,7 @@
 """Dynamics: a robot as a discrete-time system of states on a manifold, with the Jacobians that planning needs."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

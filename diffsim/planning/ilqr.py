@@ -5,6 +5,8 @@ With Gauss-Newton's second derivatives (none of the dynamics), the state regular
 line search in one batch.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol

@@ -1,5 +1,7 @@
 """L-BFGS: maximise a deterministic function of one vector."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 

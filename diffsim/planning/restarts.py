@@ -1,5 +1,7 @@
 """Trajectory optimisation from nothing: many random action sequences, of which the best are kept and continued."""
 
+from __future__ import annotations
+
 import math
 
 import torch

@@ -1,5 +1,7 @@
 """System: the robot of an environment as planning takes it, with what its task observes and rewards."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import torch

@@ -1,5 +1,7 @@
 """Terrains by their names, as the flags of commands have them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 
 import numpy as np

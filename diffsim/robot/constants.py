@@ -6,6 +6,8 @@ Where a file names no constants, they follow from the robot's inertia and the fi
 itself; FIRMNESS makes up for that as well as one number can (measured over gymnasium's robots).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 

@@ -3,6 +3,8 @@
 Nothing here is fitted; MuJoCo's documentation, "Computation", has the law, kernels/constraint.py the equations.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Iterator
 from functools import cache

@@ -1,5 +1,7 @@
 """MJCF -> Scene, by way of MuJoCo's compiler; refuse.py names what is not simulated."""
 
+from __future__ import annotations
+
 import copy
 import dataclasses
 import os

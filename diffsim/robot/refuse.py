@@ -3,6 +3,8 @@
 Each check lists reasons with a mask of the elements that they hold for.
 """
 
+from __future__ import annotations
+
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple

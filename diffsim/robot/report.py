@@ -1,5 +1,7 @@
 """What the simulator makes of an MJCF file: used, approximated, told. `python -m diffsim check robot.xml`"""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 
 import mujoco

@@ -1,5 +1,7 @@
 """Launcher: a scene's two kernels, and the threads that run them."""
 
+from __future__ import annotations
+
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor

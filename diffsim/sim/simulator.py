@@ -1,5 +1,7 @@
 """Simulator: a batch of environments of one scene, and what may be asked of it."""
 
+from __future__ import annotations
+
 import math
 from typing import Any, NoReturn
 

@@ -1,5 +1,7 @@
 """The tasks, one file each."""
 
+from __future__ import annotations
+
 from diffsim.tasks.ant import Ant
 from diffsim.tasks.base import Accuracy, Contact, Task
 from diffsim.tasks.cartpole import CartPole

@@ -1,5 +1,7 @@
 """Ant, appendix A.3.4: a four-legged robot runs forward."""
 
+from __future__ import annotations
+
 from torch import Tensor
 
 from diffsim.sim.integration import Integration

@@ -5,6 +5,8 @@ wait for the device, so they can be captured into a CUDA graph. Equations and ta
 al. 2022, appendix A.3); what it leaves open (start states, substeps) follows its public benchmark. World frame, z up.
 """
 
+from __future__ import annotations
+
 import os
 from typing import ClassVar, Literal, TypeAlias, get_args
 

@@ -1,5 +1,7 @@
 """CartPole swing up, appendix A.3.1: a motor on the cart swings the hanging pole up and holds it there."""
 
+from __future__ import annotations
+
 import math
 
 import torch

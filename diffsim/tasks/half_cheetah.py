@@ -1,5 +1,7 @@
 """HalfCheetah, appendix A.3.2: a two-legged robot in the plane y = 0 runs forward."""
 
+from __future__ import annotations
+
 from torch import Tensor
 
 from diffsim.sim.integration import Integration

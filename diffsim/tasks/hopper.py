@@ -1,5 +1,7 @@
 """Hopper, appendix A.3.3: a one-legged robot in the plane y = 0 hops forward."""
 
+from __future__ import annotations
+
 import math
 
 from torch import Tensor

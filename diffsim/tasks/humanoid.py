@@ -1,5 +1,7 @@
 """Humanoid, appendix A.3.5: a two-legged robot with arms runs forward."""
 
+from __future__ import annotations
+
 from torch import Tensor
 
 from diffsim.sim.integration import Integration

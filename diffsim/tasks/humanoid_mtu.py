@@ -1,5 +1,7 @@
 """HumanoidMTU, appendix A.3.6: the lower body of a human, pulled by 152 muscle-tendon units, runs forward."""
 
+from __future__ import annotations
+
 from torch import Tensor
 
 from diffsim.sim.integration import Integration

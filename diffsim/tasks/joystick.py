@@ -5,6 +5,8 @@ episode. A clock moves the legs' reference: in the air they fold, on the ground 
 command asks. Robots are data: GO1, GO2, G1. Their figures are those of MuJoCo Menagerie's files.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from functools import cached_property

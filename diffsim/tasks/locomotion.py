@@ -1,5 +1,7 @@
 """What ant and the humanoids share: a robot with a free root that runs along x. Appendix A.3.4 to A.3.6."""
 
+from __future__ import annotations
+
 import math
 from functools import cached_property
 from typing import ClassVar

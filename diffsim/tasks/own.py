@@ -1,5 +1,7 @@
 """Tasks of a user's own: where they and their robots come from, what they may leave out, whether their numbers fit."""
 
+from __future__ import annotations
+
 import functools
 import os
 import re

@@ -3,6 +3,8 @@
 It has no reward of its own here but the paper's: the squared error of velocity, and a cost of torque.
 """
 
+from __future__ import annotations
+
 from torch import Tensor
 
 from diffsim.tasks.base import Planar

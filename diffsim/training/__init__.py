@@ -3,6 +3,8 @@
 The physics knows nothing of this package.
 """
 
+from __future__ import annotations
+
 from diffsim.training import distributed
 from diffsim.training.checkpoint import Learner, SavedPolicy, export_onnx, export_policy, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam

@@ -1,5 +1,7 @@
 """Checkpoints: one file that continues a run exactly, and whose policy anyone can load without the script."""
 
+from __future__ import annotations
+
 import io
 import logging
 import math

@@ -1,5 +1,7 @@
 """The directory of a run: who may write there; progress.csv, tensorboard and a progress bar."""
 
+from __future__ import annotations
+
 import csv
 import math
 import os

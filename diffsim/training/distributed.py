@@ -1,5 +1,7 @@
 """Data-parallel training by torchrun: the same code runs as one process alone or as one of several ranks."""
 
+from __future__ import annotations
+
 import os
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Errors of a script's user, and the end of a script in one line."""
 
+from __future__ import annotations
+
 import functools
 import gc
 import os

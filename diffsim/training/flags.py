@@ -1,5 +1,7 @@
 """The flags that scripts share, and how a command line becomes complete, checked arguments."""
 
+from __future__ import annotations
+
 import dataclasses
 import sys
 import time

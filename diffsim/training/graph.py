@@ -1,5 +1,7 @@
 """Capture a function into a CUDA graph; on the CPU there is nothing to capture."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, TypeVar
 from weakref import WeakSet

@@ -1,5 +1,7 @@
 """Layers of policies that torch lacks: a checkpoint's policy is loaded with them, without its script."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor, nn
 

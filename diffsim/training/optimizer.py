@@ -1,5 +1,7 @@
 """Adam on clipped gradients, without waiting for the device."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,5 +1,7 @@
 """What values on a command line may be, said in the types of a dataclass of flags."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

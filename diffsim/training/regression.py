@@ -1,5 +1,7 @@
 """Fit a small network to values without autograd, whose bookkeeping on a CPU costs nearly as much as the arithmetic."""
 
+from __future__ import annotations
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn

@@ -1,5 +1,7 @@
 """The replay buffer of off-policy learners."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import torch

@@ -1,5 +1,7 @@
 """Constants that differ between environments, drawn at random, so that no policy lives on one robot's or ground's."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

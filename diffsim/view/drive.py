@@ -4,6 +4,8 @@ Python's own web server shows the page of view/web.py. Each picture comes to it 
 user asks for goes back as a POST. Several pages show one robot; their commands add up.
 """
 
+from __future__ import annotations
+
 import base64
 import functools
 import itertools

@@ -5,6 +5,8 @@ Robotics Research 3(2)): a foot's duty factor is the share of the time in which 
 the time of its touch-down after that of the first foot, as a share of the stride.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice

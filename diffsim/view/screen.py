@@ -1,5 +1,7 @@
 """Screen: what `render_mode` makes of an environment's configurations, frames or a window; and the window itself."""
 
+from __future__ import annotations
+
 import os
 import sys
 import threading

@@ -1,5 +1,7 @@
 """A motion as one web page, which plays in any browser without network access; the page itself is assets/web.html."""
 
+from __future__ import annotations
+
 import base64
 import html
 import json

@@ -1,5 +1,7 @@
 """Forward kinematics in torch: where a robot's bodies are, batched and differentiable in qpos."""
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 import torch

@@ -1,5 +1,7 @@
 """Humanoid imitation, after DeepMimic (Peng et al. 2018, https://arxiv.org/abs/1804.02717): track a recorded motion."""
 
+from __future__ import annotations
+
 import math
 from typing import ClassVar
 
