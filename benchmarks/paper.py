@@ -17,7 +17,7 @@ import json
 import math
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
@@ -27,6 +27,7 @@ import common
 import tables
 import transfer
 from common import load_case, run
+from groups import Cells, middle, numbers
 from learning import CASES, LEARNERS, RETURNS
 from runner import Case, Runner, ScriptFlags, checked, curve, evaluation, finer, passing
 from tables import ROOT, Row, markdown, read_csv
@@ -107,7 +108,7 @@ def same_code(revision: str) -> bool:
     return subprocess.run(call, cwd=ROOT, capture_output=True).returncode == 0
 
 
-def done(rows: Sequence[Mapping[str, str]], cell: Cell) -> bool:
+def done(rows: Sequence[Cells], cell: Cell) -> bool:
     own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
     return any(same_code(row["revision"]) for row in own)
 
@@ -167,25 +168,16 @@ def measure(runner: Runner, cell: Cell, case: Case) -> Row:
     return row
 
 
-def number(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
-    return [float(row[name]) for row in rows if row.get(name)]
-
-
-def line(cell: Cell, rows: Sequence[Mapping[str, str]]) -> Row:
+def line(cell: Cell, rows: Sequence[Cells]) -> Row:
     """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
-    returns = number(rows, "return")
+    returns = numbers(rows, "return")
     shown: dict[str, object] = {"task": cell.task, "learner": cell.learner, "machine": cell.machine, "seeds": len(rows)}
     shown["return"] = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
-    for name in ("training (s)", "in all (s)"):
-        values = number(rows, name)
-        shown[name] = f"{median(values):.0f}" if values else ""
-    shown["falls"] = f"{max(number(rows, 'falls')):.2f}"
-    shown["kept"] = f"{median(number(rows, 'kept')):.3f}"
-    for name in ("speed", "speed in MuJoCo"):
-        values = number(rows, name)
-        shown[name] = f"{median(values):.2f}" if values else ""
+    shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
+    shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}", "kept": middle(rows, "kept", ".3f")}
+    shown |= {name: middle(rows, name, ".2f") for name in ("speed", "speed in MuJoCo")}
     target = RETURNS[cell.task].target
-    seconds, steps = (median(number(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
+    seconds, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
     passed = f"{seconds:.0f} s, {steps / 1e6:.3g} M" if seconds < math.inf else "never"
     return shown | {"target": target, "passes it after": passed}
 
