@@ -150,7 +150,7 @@ ORIGIN = re.compile(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python 
 # This list may only shrink.
 WITHOUT_ORIGIN = {
     "cpu": """
-        bptt_cartpole learning ppo_baseline_cartpole time tradeoff
+        bptt_cartpole learning ppo_baseline_cartpole time
     """,
     "h100": """
         learning ppo_baseline_ant ppo_baseline_hopper ppo_baseline_humanoid shac_general_ant shac_h16_ant shac_h4_ant
@@ -167,7 +167,7 @@ OF_OTHER_COMMITS = (
     "cpu/robustness",
     "cpu/robustness_curves",
 )
-OF_OLDER_COMMANDS = "cpu/learning", "cpu/tradeoff", "h100/learning"
+OF_OLDER_COMMANDS = "cpu/learning", "h100/learning"
 
 
 def test_every_csv_file_is_of_a_commit() -> None:
