@@ -150,7 +150,7 @@ ORIGIN = re.compile(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python 
 # This list may only shrink.
 WITHOUT_ORIGIN = {
     "cpu": """
-        bptt_cartpole learning ppo_baseline_cartpole
+        learning
     """,
     "h100": """
         learning ppo_baseline_ant ppo_baseline_hopper ppo_baseline_humanoid shac_general_ant shac_h16_ant shac_h4_ant
