@@ -21,8 +21,8 @@ pytest.importorskip("mujoco_warp")
 
 @pytest.mark.slow
 @torch.no_grad()
-@pytest.mark.parametrize(("name", "share"), [("hopper", 0.95), ("go2", 0.5)])
-def test_a_step_is_mujoco_s_and_ours(name: peer.Name, share: float) -> None:
+@pytest.mark.parametrize(("name", "share", "tolerance"), [("hopper", 0.95, 1e-4), ("go2", 0.5, 1e-3)])
+def test_a_step_is_mujoco_s_and_ours(name: peer.Name, share: float, tolerance: float) -> None:
     """Through a fall to the ground, with a reset; and a robot that is lost stays where it was."""
     env = diffsim.make(name, 2, seed=0, contact="mujoco", max_episode_steps=40)
     other = peer.MuJoCoWarp(env.sim, name)
@@ -36,7 +36,7 @@ def test_a_step_is_mujoco_s_and_ours(name: peer.Name, share: float) -> None:
         errors.append([[np.abs(x.numpy() - y).max() for x, y in zip(f, expected, strict=True)] for f in found])
         touching += sum(data.ncon for data in world.data)
         env.step(action)
-    assert (np.quantile(errors, share, axis=0) < 1e-4).all()  # rounding decides when a contact begins or slips
+    assert (np.quantile(errors, share, axis=0) < tolerance).all()  # rounding decides when a contact begins or slips
     assert touching and other.lost() == 0 and not other.nonfinite.any()
     qvel = torch.tensor([0.0, 2e5])[:, None] * torch.eye(env.scene.nv)[0]
     assert (other.step(env.qpos, qvel, action)[0][1] == env.qpos[1]).all() and other.nonfinite.tolist() == [False, True]
