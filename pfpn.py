@@ -396,7 +396,8 @@ class Resampling(nn.Module):
         self.seen.copy_(torch.stack((every[:, 0].mean(0), every[:, 1].amax(0))))  # ranks decide and resume alike
         weight = self.seen[0] / self.seen[0].sum(-1, keepdim=True)  # where nothing was recorded not a number
         least, largest = self.args.dead / head.shape[1], torch.maximum(weight, self.seen[1])
-        dead = (below := {"mean": weight < least, "max": largest < least})[self.args.dead_by]  # Eq. 8 has the second
+        below = {"mean": weight < least, "max": largest < least}  # Eq. 8 has the second
+        dead = below[self.args.dead_by]
         if self.args.resampling != "none":
             chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
             self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))

@@ -47,6 +47,7 @@ PER_TASK = {
 # How --accuracy default integrates, where that is not as in the paper.
 INTEGRATION = {name: TASKS[name].integration("fast") for name in ("hopper", "half_cheetah", "ant")}
 INTEGRATION |= {name: Integration("implicit", 16) for name in ("humanoid", "humanoid_mtu")}
+BALANCING = {"g1": {"horizon": 16}}  # it falls before it learns to walk
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
 ON_CPU = {
     "ant": {"iterations": 1500},
@@ -133,12 +134,12 @@ class Args(ParallelFlags):
             values |= {name: min(values.get(name, most), most) for name, most in CPU.items()}
             values |= ON_CPU.get(self.env, {})
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
-            values["horizon"] = 16 if self.env == "g1" else 8
+            values["horizon"] = 8
             if self.device == "cpu":
                 values["num_envs"] = 4 * values["num_envs"]
         if (self.accuracy, self.contact) == ("default", "soft") and self.env in INTEGRATION:
             values |= INTEGRATION[self.env]._asdict()
-        return values
+        return values | BALANCING.get(self.env, {})
 
     def check(self) -> None:
         super().check()

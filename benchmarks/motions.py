@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 import diffsim
 from diffsim import Integration, Simulator
+from diffsim.__main__ import POLICIES
 from diffsim.training import Count, fail, load_policy
 
 sys.path.append(str(ROOT))
 import shac as shac  # noqa: E402
 
-POLICIES = ROOT / "diffsim" / "policies"
 CONTROL_DT = 1 / 60
 Array = np.ndarray
 
@@ -47,7 +47,7 @@ class PolicyFlags(CommonFlags):
         """Observations -> actions in float64, and what to call it."""
         if self.checkpoint and len(self.env) != 1:
             fail("--checkpoint is of one task: name it with --env")
-        saved = load_policy(path := self.checkpoint or POLICIES / f"{name}.pt")
+        saved = load_policy(path := self.checkpoint or Path(str(POLICIES / f"{name}.pt")))
         if saved.args["env"] != name:
             fail(f"{path} was trained on {saved.args['env']}, not {name}")
         return saved.network.double(), f"{path.name}, iteration {saved.iteration}"

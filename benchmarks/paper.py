@@ -57,16 +57,15 @@ class Cell(NamedTuple):
     seed: int
 
     def case(self, runs: Path) -> Case:
-        script, *flags = LEARNERS.get(self.learner, self.learner).split()
-        return Case(
-            runs / self.machine / self.learner / f"{self.task}__{self.seed}", self.task, self.seed, script, (*flags,)
-        )
+        folder = runs / self.machine / self.learner / f"{self.task}__{self.seed}"
+        script, *flags = LEARNERS[self.learner].split()
+        return Case(folder, self.task, self.seed, script, (*flags,))
 
     @property
     def command(self) -> str:
+        _, task, seed, script, flags = self.case(Path())
         device = "cpu" if self.machine == "cpu" else "cuda"
-        script, *flags = LEARNERS.get(self.learner, self.learner).split()
-        return " ".join((f"python {script}.py --env {self.task} --seed {self.seed} --device {device}", *flags))
+        return " ".join((f"python {script}.py --env {task} --seed {seed} --device {device}", *flags))
 
 
 @dataclass
@@ -159,24 +158,19 @@ def measure(runner: Runner, cell: Cell, case: Case) -> Row:
     for target in returns.timed or (returns.target,):
         for x in ("control_steps", "seconds"):
             row[f"{x} to {target}"] = passing(curves, target, x)[0]
-    saved = load_case(path, len(own["lengths"]), "cpu")
-    if "muscle" not in saved.env.scene.features:
-        world = transfer.MuJoCo(saved.env.scene, saved.env.num_envs, saved.env.control_dt)
-        motion = transfer.travel(saved, world, saved.env.episode_length)
-        found = transfer.measure(motion, saved.env.scene, saved.env.control_dt, saved.env.task.forward)
-        row |= {"return in MuJoCo": found["return"], "speed in MuJoCo": found["speed"]}
-    return row
+    found = transfer.in_mujoco(load_case(path, len(own["lengths"]), "cpu"))
+    return row | {f"{name} in MuJoCo": found[name] for name in ("return", "speed") if found}
 
 
-def line(cell: Cell, rows: Sequence[Cells]) -> Row:
+def line(machine: str, rows: Sequence[Cells]) -> Row:
     """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
-    returns = numbers(rows, "return")
-    shown: dict[str, object] = {"task": cell.task, "learner": cell.learner, "machine": cell.machine, "seeds": len(rows)}
+    returns, task = numbers(rows, "return"), rows[0]["task"]
+    shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"], "machine": machine, "seeds": len(rows)}
     shown["return"] = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
     shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
     shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}", "kept": middle(rows, "kept", ".3f")}
     shown |= {name: middle(rows, name, ".2f") for name in ("speed", "speed in MuJoCo")}
-    target = RETURNS[cell.task].target
+    target = RETURNS[task].target
     seconds, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
     passed = f"{seconds:.0f} s, {steps / 1e6:.3g} M" if seconds < math.inf else "never"
     return shown | {"target": target, "passes it after": passed}
@@ -188,11 +182,10 @@ def table(args: Args, name: str) -> list[Row]:
     rows = read_csv(args.directory.parent / group.machine / "cells.csv")
     for task in group.tasks:
         for learner in group.learners:
-            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
-            revisions = {row["revision"] for row in own if same_code(row["revision"])}
-            own = [row for row in own if row["revision"] in revisions and int(row["seed"]) <= group.seeds]
-            if len(own) == group.seeds:
-                lines.append(line(Cell(group.machine, learner, task, 0), own))
+            wanted = {str(seed) for seed in range(1, group.seeds + 1)}
+            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
+            if len(own) == group.seeds and all(same_code(row["revision"]) for row in own):
+                lines.append(line(group.machine, own))
     return lines
 
 

@@ -236,6 +236,15 @@ def measure(motion: Motion, scene: Scene, control_dt: float, forward: int | None
     return row | {"penetration": middle, "penetration 95 %": most}
 
 
+def in_mujoco(case: Case) -> dict[str, object]:
+    """`measure` of a policy under MuJoCo's own contact on the file as it is; empty of muscles: the file has none."""
+    env = case.env
+    if "muscle" in env.scene.features:
+        return {}
+    motion = travel(case, MuJoCo(env.scene, env.num_envs, env.control_dt), env.episode_length)
+    return measure(motion, env.scene, env.control_dt, env.task.forward)
+
+
 def conditions(case: Case, args: Args) -> dict[str, World]:
     """The worlds, by the names that the csv gives them; the first is that of the training."""
     env, scene, n, how = case.env, case.env.scene, case.env.num_envs, case.env.sim.integration

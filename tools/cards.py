@@ -41,17 +41,11 @@ def here(case: Case) -> dict[str, object]:
 
 
 def in_mujoco(case: Case) -> dict[str, object]:
-    """Nothing of muscles, which are not simulated in MuJoCo here."""
-    env = case.env
-    if isinstance(env.task, Joystick):
+    if isinstance(case.env.task, Joystick):
         (found,) = joystick.measure(joystick.Args(friction=(1.0,)), case.path)
         return {"error in MuJoCo": found["error"]}
-    if "muscle" in env.scene.features:
-        return {}
-    world = transfer.MuJoCo(env.scene, env.num_envs, env.control_dt)
-    motion = transfer.travel(case, world, env.episode_length)
-    row = transfer.measure(motion, env.scene, env.control_dt, env.task.forward)
-    return {f"{name} in MuJoCo": row[name] for name in ("return", "speed")}
+    row = transfer.in_mujoco(case)
+    return {f"{name} in MuJoCo": row[name] for name in ("return", "speed") if row}
 
 
 @command

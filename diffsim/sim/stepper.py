@@ -98,7 +98,10 @@ class Stepper:
         return self._end[:, : sum(self._widths[:2])].clone()
 
     def backward(self, checkpoint: Checkpoint, g_end: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The adjoints of qpos, qvel, ctrl, factors and forces from that of the state (N, nq + nv) after the step."""
+        """The adjoints of qpos, qvel, ctrl, factors and forces from that of the state (N, nq + nv) after the step.
+
+        Raises RuntimeError if the checkpoint serves another step by now.
+        """
         if self._version[checkpoint.slot] != checkpoint.version:
             raise RuntimeError(
                 f"backward through a control step whose checkpoint was overwritten: at most {self._horizon} "

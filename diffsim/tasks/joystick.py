@@ -144,8 +144,9 @@ class Joystick(Task):
     def mirror(self) -> Mirror:
         """See Task. The image's clock is half a cycle ahead."""
         device, dtype = self._start.device, self._start.dtype
-        qpos, qvel, action = reflections(load_scene(robot(self)).mj_model, self.robot.sides, device, dtype)
-        joints, rates = (Reflection(part.index[n:] - n, part.sign[n:]) for part, n in ((qpos, 7), (qvel, 6)))
+        qpos, qvel, action, joints, rates = reflections(
+            load_scene(robot(self)).mj_model, self.robot.sides, device, dtype
+        )
         signs = (*VECTOR, *PSEUDOVECTOR, *VECTOR), (1.0, -1.0, -1.0, -1.0, -1.0), (1.0,)
         body, command, height = (Reflection.of(enumerate(part), device, dtype) for part in signs)
         sensed = body, joints, rates

@@ -55,11 +55,9 @@ class Locomotion(Task):
     @cached_property
     def mirror(self) -> Mirror:
         """See Task. It is made when first asked for, which a CUDA graph cannot capture, so ask before."""
-        model = load_scene(robot(self)).mj_model
         device, dtype = self._start.device, self._start.dtype
-        qpos, qvel, action = reflections(model, self.sides, device, dtype)
+        qpos, qvel, action, joints, rates = reflections(load_scene(robot(self)).mj_model, self.sides, device, dtype)
         root = (1.0, *PSEUDOVECTOR, 1.0, *VECTOR, *PSEUDOVECTOR)  # height to angular velocity
-        joints, rates = (Reflection(part.index[n:] - n, part.sign[n:]) for part, n in ((qpos, 7), (qvel, 6)))
         fixed = [Reflection.of(enumerate(signs), device, dtype) for signs in (root, (1.0, 1.0))]
         seen = (fixed[0], joints, rates, fixed[1])  # as in observe
         return Mirror(qpos, qvel, action, Reflection.cat((*seen, action) if self.observe_action else seen))

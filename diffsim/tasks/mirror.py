@@ -60,8 +60,9 @@ class Mirror(NamedTuple):
 
 def reflections(
     model: mujoco.MjModel, sides: Sides, device: torch.device, dtype: torch.dtype
-) -> tuple[Reflection, Reflection, Reflection]:
-    """Those of qpos (nq,), qvel (nv,) and action (nu,), by the names of joints and actuators.
+) -> tuple[Reflection, ...]:
+    """Those of qpos (nq,), qvel (nv,) and action (nu,), by the names of joints and actuators; then those of the joints
+    (nq - 7,) and their rates (nv - 6,) that follow a free root.
 
     Args:
         model: of which left and right are mirror images in the reference configuration. This is not checked.
@@ -78,8 +79,8 @@ def reflections(
     for motor, partner in enumerate(_partners([model.actuator(k).name for k in range(model.nu)], sides)):
         pulls = model.actuator_trntype[motor] == mujoco.mjtTrn.mjTRN_TENDON
         action.append((partner, 1.0 if pulls else qvel[model.jnt_dofadr[model.actuator_trnid[motor, 0]]][1]))
-    first, second, third = (Reflection.of(numbers, device, dtype) for numbers in (qpos, qvel, action))
-    return first, second, third
+    whole = [Reflection.of(numbers, device, dtype) for numbers in (qpos, qvel, action)]
+    return *whole, *(Reflection(part.index[n:] - n, part.sign[n:]) for part, n in zip(whole, (7, 6), strict=False))
 
 
 def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Sequence[float], Sequence[float]]:

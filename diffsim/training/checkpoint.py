@@ -107,7 +107,7 @@ def find_nonfinite(learner: Learner) -> str | None:
 
 
 def load(path: Path, script: str | None = None) -> dict[str, Any]:
-    """The checkpoint at path, of a script if one is named; raises ValueError if there is none that is whole."""
+    """The checkpoint at path, whole, of this format and of the script if one is named; else raises ValueError."""
     if not path.is_file():
         fail(f"no such checkpoint: {path}")
     try:
