@@ -2,12 +2,12 @@
 
     python benchmarks/paper.py --check                             what is missing, and results of no known origin
     python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables
-    python benchmarks/paper.py --time-limit 500 --train-only       on a machine that is lent: bring runs/paper home
+    python benchmarks/paper.py --learners sapo --train-only        on a machine that is lent: bring runs/paper home
     python benchmarks/paper.py --machine h200 --evaluate-only --update-results    and evaluate there
     python benchmarks/paper.py --draw-only --update-results        only the tables
 
-Groups of cells are in cases.json: learners on tasks of a machine, by seeds. A cell counts for a revision if the package
-and the scripts are the same there. Writes cells.csv, a line for each; a line of a table has all seeds of one revision.
+Groups of cells are in cases.json: learners on tasks of a machine, by seeds. All are of the revision there, or of one
+with the same package and script. Writes cells.csv, a line for each; a table has the learners whose seeds are all there.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ import diffsim
 from diffsim.training import checkpoint, fail
 from diffsim.training.evaluation import kept
 
-CODE = ("diffsim", ":(glob)*.py")  # what a training depends on
 KEY = ("learner", "task", "seed")
+REVISION: str = CASES["paper"]["revision"]
 
 
 class Group(NamedTuple):
@@ -47,7 +47,7 @@ class Group(NamedTuple):
     seeds: int
 
 
-GROUPS = {name: Group(**case) for name, case in CASES["paper"].items()}
+GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
 
 
 class Cell(NamedTuple):
@@ -72,6 +72,7 @@ class Cell(NamedTuple):
 class Args(ScriptFlags):
     runs: Path = ROOT / "runs" / "paper"  # directory of the runs: {runs}/{machine}/{learner}/{task}__{seed}
     only: tuple[str, ...] = tuple(GROUPS)  # groups
+    learners: tuple[str, ...] = ()  # learners (default: all of a group)
     seeds: tuple[int, ...] = ()  # seeds (default: all of a group)
     machine: str = ""  # whose cells these are (default: that of --device)
     check: bool = False  # only say what is missing
@@ -95,31 +96,33 @@ def cells(args: Args) -> Iterator[Cell]:
         for learner in group.learners
         for task in group.tasks
         for seed in range(1, group.seeds + 1)
-        if task in args.env and seed in (args.seeds or [seed])
+        if task in args.env and seed in (args.seeds or [seed]) and learner in (args.learners or [learner])
     }
     return (cell for _, cell in sorted(found, key=lambda each: each[0]))
 
 
 @functools.cache
-def same_code(revision: str) -> bool:
-    """Whether a training there would be the same; no, of one that is not in this history."""
-    call = ["git", "diff", "--quiet", revision, "HEAD", "--", *CODE]
+def same_code(revision: str, learner: str) -> bool:
+    """Whether a training there is one of REVISION; no, of one that is not in this history."""
+    call = ["git", "diff", "--quiet", REVISION, revision, "--", "diffsim", f"{LEARNERS[learner].split()[0]}.py"]
     return subprocess.run(call, cwd=ROOT, capture_output=True).returncode == 0
 
 
 def done(rows: Sequence[Cells], cell: Cell) -> bool:
     own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
-    return any(same_code(row["revision"]) for row in own)
+    return any(same_code(row["revision"], cell.learner) for row in own)
 
 
-def train(runner: Runner, case: Case) -> bool:
-    """To the end; whether it got there. A cell that another revision began is refused, since none is of two."""
+def train(runner: Runner, cell: Cell, case: Case) -> bool:
+    """To the end; whether it got there. Code that is not of REVISION is refused, to begin a cell and to go on."""
     path, revision = case.folder / "cell.json", tables.revision()
     if tables.unknown(f"; ; {revision}"):
         fail(f"a cell is of a commit, not of {revision}")
+    if not same_code(revision, cell.learner):
+        fail(f"the package or {case.script}.py has changed since {REVISION}: check that out, or measure all cells anew")
     begun = json.loads(path.read_text()) if path.is_file() else {}
-    if begun and not same_code(begun["revision"]):
-        fail(f"{case.folder} was begun at {begun['revision']}: remove it, or check that revision out")
+    if begun and not same_code(begun["revision"], cell.learner):
+        fail(f"{case.folder} was begun at {begun['revision']}: remove it")
     if not begun:
         case.folder.mkdir(parents=True, exist_ok=True)
         trained_on = tables.origin(runner.args.device).removeprefix("# ").partition("; ")[0]
@@ -184,7 +187,7 @@ def table(args: Args, name: str) -> list[Row]:
         for learner in group.learners:
             wanted = {str(seed) for seed in range(1, group.seeds + 1)}
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
-            if len(own) == group.seeds and all(same_code(row["revision"]) for row in own):
+            if len(own) == group.seeds and all(same_code(row["revision"], learner) for row in own):
                 lines.append(line(group.machine, own))
     return lines
 
@@ -208,8 +211,9 @@ def check(args: Args) -> str:
 
 
 def main(args: Args) -> None:
-    if unknown := [name for name in args.only if name not in GROUPS]:
-        fail(f"--only: there is no group {unknown[0]!r}; choose from {', '.join(GROUPS)}")
+    for flag, names, known in (("only", args.only, GROUPS), ("learners", args.learners, LEARNERS)):
+        if unknown := [name for name in names if name not in known]:
+            fail(f"--{flag}: there is no {unknown[0]!r}; choose from {', '.join(known)}")
     if args.check:
         print(check(args))
         return
@@ -218,7 +222,7 @@ def main(args: Args) -> None:
         if cell.machine != args.place or done(args.read("cells"), cell):
             continue
         case = cell.case(args.runs)
-        if not args.evaluate_only and not train(runner, case):
+        if not args.evaluate_only and not train(runner, cell, case):
             continue
         if not args.train_only and (row := measure(runner, cell, case)):
             args.keep("cells", row, KEY)

@@ -21,7 +21,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
     """The lines of the H200's cells.csv; the code is that of aaaaaaa."""
     rows = list[dict[str, str]]()
     monkeypatch.setattr(paper, "read_csv", lambda path: rows if path.parts[-2:] == ("h200", "cells.csv") else [])
-    monkeypatch.setattr(paper, "same_code", lambda revision: revision == "aaaaaaa")
+    monkeypatch.setattr(paper, "same_code", lambda revision, learner: revision == "aaaaaaa")
     for seed, value in enumerate((5000.0, 5100.0, 4800.0, 5300.0, 5200.0), start=1):
         row = SAPO | {"seed": str(seed), "return": f"{value}", "training (s)": f"{60 + seed}", "falls": f"{seed / 100}"}
         rows.append(row | {"seconds to 3000": "inf" if seed < 3 else "9", "control_steps to 3000": f"{seed}e6"})
@@ -35,6 +35,8 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
         assert group.machine in ("cpu", "h200") and group.seeds >= 3
         for learner in group.learners:
             assert paper.Cell(group.machine, learner, group.tasks[-1], group.seeds) in found
+    (one,) = paper.cells(paper.Args(only=("headline",), learners=("sapo",), env=("hopper",), seeds=(4,)))
+    assert one == paper.Cell("h200", "sapo", "hopper", 4)
     some = list(paper.cells(paper.Args(only=("headline", "muscles"), env=("humanoid_mtu",), seeds=(2, 4))))
     assert {(cell.learner, cell.seed) for cell in some} == {
         *((learner, seed) for learner in ("shac", "sapo", "ppo_4096") for seed in (2, 4)),
@@ -74,22 +76,31 @@ def test_what_is_missing_is_said_with_its_command(known: list[dict[str, str]]) -
 
 
 def test_code_is_the_same_where_package_and_scripts_are() -> None:
-    assert paper.same_code("HEAD") and not paper.same_code("no-commit")
+    assert paper.same_code(paper.REVISION, "shac") and not paper.same_code("no-commit", "shac")
 
 
 def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     error = refusal(lambda: paper.main(paper.Args(only=("headlines",))), capsys)
-    assert "there is no group 'headlines'; choose from headline, cores" in error
+    assert "--only: there is no 'headlines'; choose from headline, cores" in error
+    error = refusal(lambda: paper.main(paper.Args(learners=("SHAC",))), capsys)
+    assert "--learners: there is no 'SHAC'; choose from shac, shac_no_critic" in error
     monkeypatch.setattr(tables, "revision", lambda: "1234567-dirty")
-    case = paper.Cell("cpu", "shac", "cartpole", 1).case(Path("nowhere"))
-    error = refusal(lambda: paper.train(Runner(paper.Args()), case), capsys)
-    assert error.endswith("a cell is of a commit, not of 1234567-dirty")
+    cell = paper.Cell("cpu", "shac", "cartpole", 1)
+
+    def begin() -> None:
+        paper.train(Runner(paper.Args()), cell, cell.case(Path("nowhere")))
+
+    assert refusal(begin, capsys).endswith("a cell is of a commit, not of 1234567-dirty")
+    monkeypatch.setattr(tables, "revision", lambda: "1234567")
+    monkeypatch.setattr(paper, "same_code", lambda revision, learner: False)
+    assert f"the package or shac.py has changed since {paper.REVISION}" in refusal(begin, capsys)
 
 
 def test_cells_are_trained_evaluated_and_kept_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(tables, "revision", lambda: "HEAD")
+    monkeypatch.setattr(paper, "REVISION", "HEAD")
     places = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path / "results" / "cpu"), "--device", "cpu"]
     flags = [*places, "--only", "cores", "--env", "cartpole", "--seeds", "1"]
     short = "-- --iterations 2 --num-envs 4 --horizon 4 --eval-episodes 2".split()
