@@ -36,6 +36,7 @@ import diffsim
 from diffsim.training import checkpoint, fail
 from diffsim.training.evaluation import kept
 
+CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the script: what a training depends on
 KEY = ("learner", "task", "seed")
 REVISION: str = CASES["paper"]["revision"]
 
@@ -104,7 +105,7 @@ def cells(args: Args) -> Iterator[Cell]:
 @functools.cache
 def same_code(revision: str, learner: str) -> bool:
     """Whether a training there is one of REVISION; no, of one that is not in this history."""
-    call = ["git", "diff", "--quiet", REVISION, revision, "--", "diffsim", f"{LEARNERS[learner].split()[0]}.py"]
+    call = ["git", "diff", "--quiet", REVISION, revision, "--", *CODE, f"{LEARNERS[learner].split()[0]}.py"]
     return subprocess.run(call, cwd=ROOT, capture_output=True).returncode == 0
 
 
