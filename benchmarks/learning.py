@@ -31,7 +31,6 @@ from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, pa
 from tables import ROOT, Row, markdown, read_csv
 
 from diffsim.training import Count, fail
-from diffsim.training.evaluation import ENOUGH
 
 
 class Returns(NamedTuple):
@@ -191,7 +190,7 @@ def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[str]) -
 def summaries(args: Args, learners: Sequence[str], tasks: Sequence[str]) -> list[dict[str, str]]:
     """Lines of learning.csv, of all machines."""
     rows = [
-        {"machine": machine} | row | {"gate": "passed" if float(row["kept"] or 0) >= ENOUGH else "failed"}
+        {"machine": machine} | row
         for machine, path in args.machines("learning").items()
         for row in read_csv(path)
         if row["learner"] in learners and row["task"] in tasks

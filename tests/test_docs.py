@@ -146,20 +146,7 @@ def test_readme_has_the_return_of_every_task() -> None:
 
 
 ORIGIN = re.compile(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python \w+")
-# Files from before the benchmarks wrote where rows come from: pages rest on them, until they are measured again.
-# This list may only shrink.
-WITHOUT_ORIGIN = {
-    "cpu": """
-        learning
-    """,
-    "h100": """
-        learning ppo_baseline_ant ppo_baseline_hopper ppo_baseline_humanoid shac_general_ant shac_h16_ant shac_h4_ant
-        shac_h8_ant
-    """,
-}
-
-
-# Of commits that this history does not hold, or by commands that are gone: these may only shrink, too.
+# Of commits that this history does not hold: this list may only shrink.
 OF_OTHER_COMMITS = (
     "cpu/learning",
     "cpu/pods_cartpole",
@@ -167,7 +154,6 @@ OF_OTHER_COMMITS = (
     "cpu/robustness",
     "cpu/robustness_curves",
 )
-OF_OLDER_COMMANDS = "cpu/learning", "h100/learning"
 
 
 def test_every_csv_file_is_of_a_commit() -> None:
@@ -189,15 +175,10 @@ def test_every_csv_file_says_where_it_comes_from() -> None:
     paths = sorted((ROOT / "results").glob("*/*.csv"))
     files = {path for path in (ROOT / "results").rglob("*") if path.is_file()}
     assert paths and files == {*paths, LOG}
-    without = {
-        ROOT / "results" / name / f"{stem}.csv" for name, stems in WITHOUT_ORIGIN.items() for stem in stems.split()
-    }
     for path in paths:
         origins = [line for line in path.read_text().splitlines() if line.startswith("# ")]
         assert origins and all(ORIGIN.match(line) for line in origins), path
-        complete = not any(re.search("unknown|dirty", line) for line in origins)
-        assert complete != (path in without), f"{path}: {'take it off the list' if complete else 'unknown origin'}"
-    assert without <= {*paths}, f"take off the list: {without - {*paths}}"
+        assert not any(re.search("unknown|dirty", line) for line in origins), path
 
 
 def test_every_csv_file_is_shown_or_needed() -> None:
@@ -381,7 +362,7 @@ def test_flags_exist(page: Path) -> None:
 
 
 def test_commands_of_results_run_today() -> None:
-    """Their scripts and flags exist; files of older ones are listed, until they are measured again."""
+    """Their scripts and flags exist."""
     older = set[str]()
     for path in sorted((ROOT / "results").glob("*/*.csv")):
         for line in path.read_text().splitlines():
@@ -394,7 +375,7 @@ def test_commands_of_results_run_today() -> None:
                 mentioned = {word.partition("=")[0] for word in own if re.match(r"--[a-z]", word)}
                 if not script.is_file() or not mentioned <= (flags(script) if "Args" in classes(script) else ANY):
                     older.add(f"{path.parent.name}/{path.stem}")
-    assert older == {*OF_OLDER_COMMANDS}
+    assert not older
 
 
 @functools.cache

@@ -52,7 +52,7 @@ def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> No
     (line,) = paper.table(paper.Args(), "headline")
     assert (line["task"], line["learner"], line["seeds"]) == ("hopper", "sapo", 5)
     assert line["return"] == "5100 (4800 to 5300)" and line["training (s)"] == "63" and line["falls"] == "0.05"
-    assert line["passes it after"] == "9 s, 3 M" and line["in all (s)"] == ""
+    assert (line["s to target"], line["steps to target"], line["in all (s)"]) == ("9", "3 M", "")
     known[4]["revision"] = "bbbbbbb"
     assert paper.table(paper.Args(), "headline") == []
     known[4] |= {"revision": "aaaaaaa", "seed": "6"}
