@@ -2,8 +2,8 @@
 
     python benchmarks/learning.py --env ant --seeds 1 2 3              train (finished runs are kept), evaluate, draw
     python benchmarks/learning.py --experiment comparison              the paper's Figures 4 and 7, likewise
-    python benchmarks/learning.py --experiment horizon --time-limit 500    stop in time; the same command goes on
-    python benchmarks/learning.py --experiment horizon --draw-only     only draw and tabulate what there is
+    python benchmarks/learning.py --experiment records --time-limit 500    stop in time; the same command goes on
+    python benchmarks/learning.py --experiment records --draw-only     only draw and tabulate what there is
     python benchmarks/learning.py --runs runs/short -- --iterations 50 what follows "--" goes to the learner
 
 Learners (a script with flags), experiments (learners on tasks, the first is what the others are compared with) and the
