@@ -185,14 +185,15 @@ def line(machine: str, rows: Sequence[Cells]) -> Row:
 
 
 def table(args: Args, name: str) -> list[Row]:
-    """A line for each learner and task of which all seeds are there, of one revision."""
+    """A line for each learner and task of which all seeds are there, of one revision and one kind of machine."""
     group, lines = GROUPS[name], list[Row]()
     rows = read_csv(args.directory.parent / group.machine / "cells.csv")
     for task in group.tasks:
         for learner in group.learners:
             wanted = {str(seed) for seed in range(1, group.seeds + 1)}
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
-            if len(own) == group.seeds and all(same_code(row["revision"], learner) for row in own):
+            own = [row for row in own if same_code(row["revision"], learner)]
+            if len(own) == group.seeds and len({row["trained on"] for row in own}) == 1:
                 lines.append(line(group.machine, own))
     return lines
 

@@ -13,7 +13,9 @@ import tables
 from learners import refusal
 from runner import Runner
 
-SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4")
+SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4") | {
+    "trained on": "NVIDIA H200"
+}
 
 
 @pytest.fixture
@@ -53,9 +55,11 @@ def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> No
     assert (line["task"], line["learner"], line["seeds"]) == ("hopper", "sapo", 5)
     assert line["return"] == "5100 (4800 to 5300)" and line["training (s)"] == "63" and line["falls"] == "0.05"
     assert (line["s to target"], line["steps to target"], line["in all (s)"]) == ("9", "3 M", "")
-    known[4]["revision"] = "bbbbbbb"
-    assert paper.table(paper.Args(), "headline") == []
-    known[4] |= {"revision": "aaaaaaa", "seed": "6"}
+    for column, other in {"revision": "bbbbbbb", "trained on": "NVIDIA H100"}.items():
+        before, known[4][column] = known[4][column], other
+        assert paper.table(paper.Args(), "headline") == []
+        known[4][column] = before
+    known[4]["seed"] = "6"
     assert paper.table(paper.Args(), "headline") == []
 
 
