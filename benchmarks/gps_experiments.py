@@ -296,7 +296,7 @@ def temperatures(env: str) -> Iterator[Row]:
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
     found: dict[str, list[Row]] = {f"gps_{name}": [] for name in ("runs", *MEASURED)}
-    older = set[str]()
+    older: dict[str, set[str]] = {name: set() for name in found}  # of gps_runs all: progress.csv does not tell its own
     for directory in (path.parent for path in args.runs.glob("*__*__*/progress.csv")):
         run = dict(zip(RUN, directory.name.split("__"), strict=True))
         run_of = run | {"horizon": json.loads((directory / "args.json").read_text())["horizon"]}
@@ -305,7 +305,9 @@ def collect(args: Args) -> None:
         for name in MEASURED:
             path = directory / f"{name}.csv"
             found[f"gps_{name}"] += [run | row for row in read_csv(path)]
-            older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(path)}
+            lines = {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(path)}
+            older[f"gps_{name}"] |= lines
+            older["gps_runs"] |= lines
 
     def run_name(row: Row) -> tuple[object, ...]:
         return tuple(row[key] for key in RUN)
@@ -313,7 +315,7 @@ def collect(args: Args) -> None:
     for name, rows in found.items():
         here = {*map(run_name, rows)}
         rows += [row for row in args.read(name) if run_name(row) not in here]
-        known = older | {line for line in origins(args.csv(name)) if line.endswith(f"; {LISTED}\n")}
+        known = older[name] | {line for line in origins(args.csv(name)) if line.endswith(f"; {LISTED}\n")}
         write_csv(args.csv(name), sorted(rows, key=run_name), older=sorted(known))
 
 
