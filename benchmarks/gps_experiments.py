@@ -61,15 +61,8 @@ WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights
 SHOWN = (1, 10, 50, 500)  # of them in the page
 MEASURED = "generalisation", "weights", "torques"  # csv files of a run
 KINDS = {"start": (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), "push": (0.5, 1.0, 2.0)}  # perturbations and their sizes
-DRAWN = [
-    *(case for case in VARIANTS if case != "one-start"),
-    "full",
-    "paper",
-    "adaptive",
-    "feedback",
-    "feedback-short",
-    "feedback-long",
-]
+DRAWN: list[str] = [case for case in VARIANTS if case != "one-start"]
+DRAWN += "full paper adaptive feedback feedback-short feedback-long".split()
 COLOURS = [*(f"C{i}" for i in range(10)), "k", "m", "y"]
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 Runs = list[dict[str, str]]
