@@ -8,8 +8,8 @@
     python benchmarks/gps_experiments.py --record hop.npz --actor runs/<run>/checkpoint.pt     record a policy
 
 Cases, plans and the suite of docs/gps.md are in cases.json; what follows "--" goes to gps.py. Writes gps_runs.csv
-(every iteration of all runs), gps_generalisation.csv (controllers from perturbed starts and under pushes), the table of
-gps.md, and pictures of the paper's Figures 2 and 3.
+(every iteration of all runs), gps_generalisation.csv (controllers from perturbed starts and under pushes),
+gps_torques.csv, the table of gps.md, and pictures of the paper's Figures 2 and 3.
 """
 
 from __future__ import annotations
@@ -50,15 +50,19 @@ RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
     "gps_guides gps_guides_std eval_objective eval_objective_std eval_without_noise eval_return eval_speed "
-    "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps"
+    "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps "
+    "gps_start"
 ).split()
 PERTURBED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
+TORQUED = "feedback-few", "feedback-short"  # cases whose torques are measured
 SPREADS = (1.0, 3.0, 10.0, 30.0, 0.0)  # the last one is of eta = 1
 COUNT = 20  # trajectories of guides, and perturbed starts and pushes of each size
 WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
 SHOWN = (1, 10, 50, 500)  # of them in the page
+MEASURED = "generalisation", "weights", "torques"  # csv files of a run
 KINDS = {"start": (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), "push": (0.5, 1.0, 2.0)}  # perturbations and their sizes
-DRAWN = [*VARIANTS, "full", "paper", "adaptive", "feedback", "feedback-short", "feedback-long"]
+DRAWN: list[str] = [case for case in VARIANTS if case != "one-start"]
+DRAWN += "full paper adaptive feedback feedback-short feedback-long".split()
 COLOURS = [*(f"C{i}" for i in range(10)), "k", "m", "y"]
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 Runs = list[dict[str, str]]
@@ -119,6 +123,7 @@ def train(runner: Runner, name: str, flags: Sequence[str], count: int = COUNT) -
     for file, measure, wanted in (
         ("generalisation.csv", lambda search: generalisation(search, count), case in PERTURBED),
         ("weights.csv", weights, case.startswith("paper")),
+        ("torques.csv", torques, case in TORQUED),
     ):
         if wanted and not (directory / file).is_file():
             write_csv(directory / file, measure(load_search(directory / "checkpoint.pt")))
@@ -214,6 +219,32 @@ def generalisation(search: gps.Search, count: int = COUNT) -> list[Row]:
     return rows
 
 
+def noisy(act: Act, noise: Tensor) -> Act:
+    """The controller with noise (m, T, nu) on its actions."""
+    return lambda t, x: act(t, x) + noise[:, t]
+
+
+def torques(search: gps.Search, count: int = COUNT) -> list[Row]:
+    """The motors' torques (N m) under each controller, without noise and with the policy's, and in guiding samples.
+
+    Means over steps and motors of their magnitude and square; `kept` is of the guides' mean return.
+    """
+    system, policy, guide = search.system, search.network, search.guides[0]
+    gear = torch.tensor(system.scene.mj_model.actuator_gear[:, 0], dtype=REAL)
+    noise, horizon = search.noise(count, torch.Generator().manual_seed(gps.SEED)), search.args.horizon
+    start = guide.x[:1].expand(count, -1)
+    cases = {("guide", "guide"): guide.sample(system, noise)}
+    for name, act in controllers(search).items():
+        cases[name, "none"] = system.rollout(start, horizon, act)
+        cases[name, "policy"] = system.rollout(start, horizon, noisy(act, policy.sigma * noise))
+    rows = list[Row]()
+    for (name, kind), (x, u, finite) in cases.items():
+        torque, returns = gear * u.tanh(), search.measure(x, u, finite).returns
+        row = scalars(controller=name, noise=kind, magnitude=torque.abs().mean(), square=torque.square().mean())
+        rows.append(row | scalars(mean=returns.mean(), kept=keeps(returns, search.guide_return[0]).double().mean()))
+    return rows
+
+
 def width(guide: LinearGaussian, sigma: Tensor) -> Tensor:
     """(T,) a guide's mean variance, in the policy's."""
     return (guide.L.norm(dim=-1) / sigma).square().mean(-1)
@@ -265,17 +296,19 @@ def temperatures(env: str) -> Iterator[Row]:
 
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
-    found: dict[str, list[Row]] = {"gps_runs": [], "gps_generalisation": [], "gps_weights": []}
-    older = set[str]()
+    found: dict[str, list[Row]] = {f"gps_{name}": [] for name in ("runs", *MEASURED)}
+    older: dict[str, set[str]] = {name: set() for name in found}  # of gps_runs all: progress.csv does not tell its own
     for directory in (path.parent for path in args.runs.glob("*__*__*/progress.csv")):
         run = dict(zip(RUN, directory.name.split("__"), strict=True))
         run_of = run | {"horizon": json.loads((directory / "args.json").read_text())["horizon"]}
         for row in read_csv(directory / "progress.csv"):
             found["gps_runs"].append(run_of | {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT})
-        for name in ("generalisation", "weights"):
+        for name in MEASURED:
             path = directory / f"{name}.csv"
             found[f"gps_{name}"] += [run | row for row in read_csv(path)]
-            older |= {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(path)}
+            lines = {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(path)}
+            older[f"gps_{name}"] |= lines
+            older["gps_runs"] |= lines
 
     def run_name(row: Row) -> tuple[object, ...]:
         return tuple(row[key] for key in RUN)
@@ -283,7 +316,7 @@ def collect(args: Args) -> None:
     for name, rows in found.items():
         here = {*map(run_name, rows)}
         rows += [row for row in args.read(name) if run_name(row) not in here]
-        known = older | {line for line in origins(args.csv(name)) if line.endswith(f"; {LISTED}\n")}
+        known = older[name] | {line for line in origins(args.csv(name)) if line.endswith(f"; {LISTED}\n")}
         write_csv(args.csv(name), sorted(rows, key=run_name), older=sorted(known))
 
 

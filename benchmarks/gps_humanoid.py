@@ -16,7 +16,7 @@ from statistics import mean
 
 import torch
 from common import CheckpointFlags, Part, measured, run
-from gps_experiments import CONTROLLERS, RUN, Act, controllers, load_run, scalars
+from gps_experiments import CONTROLLERS, RUN, controllers, load_run, noisy, scalars
 from groups import grouped
 from tables import Row
 from torch import Tensor
@@ -45,11 +45,6 @@ def until_fall(system: System, x: Tensor, finite: Tensor) -> tuple[Tensor, Tenso
     steps = up.cumprod(1).sum(1)
     way = x[..., 0].gather(1, steps.unsqueeze(1)).squeeze(1) - x[:, 0, 0]
     return steps, way / (steps.clamp(min=1) * system.control_dt)
-
-
-def noisy(act: Act, noise: Tensor) -> Act:
-    """The controller with noise (m, T, nu) on its actions."""
-    return lambda t, x: act(t, x) + noise[:, t]
 
 
 def measure(args: CheckpointFlags, path: Path) -> Iterator[Row]:

@@ -69,6 +69,18 @@ def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
 
 
+def test_torques(runs: Path) -> None:
+    """Of the plan's own controller they are the plan's; a motor's is its gear times tanh(u)."""
+    search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
+    rows = {(row["controller"], row["noise"]): row for row in experiments.torques(search, 4)}
+    assert len(rows) == 7 and rows["policy", "none"] != rows["policy", "policy"]
+    force = search.guides[0].u.tanh() * float(search.system.scene.mj_model.actuator_gear[0, 0])
+    ddp = rows["ddp", "none"]
+    assert ddp["magnitude"] == pytest.approx(force.abs().mean().item(), rel=1e-6)
+    assert ddp["square"] == pytest.approx(force.square().mean().item(), rel=1e-6)
+    assert ddp["mean"] == pytest.approx(search.plan_return, rel=1e-9)
+
+
 def test_weights_at_some_steps(runs: Path) -> None:
     """By products of densities, which a few steps allow; the guide as a policy would weigh its samples alike."""
     search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")

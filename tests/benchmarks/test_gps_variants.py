@@ -22,7 +22,7 @@ TINY = (
 @pytest.mark.parametrize("case", list(gps_variants.CASES))
 def test_variants(case: str, tmp_path: Path) -> None:
     modules = run(gps_variants, tmp_path, *TINY, "--case", case)["modules"]
-    search, S, guided = modules["learner"], modules["S"], case in ("unregularized", "effective")
+    search, S, guided = modules["learner"], modules["S"], case in ("unregularized", "effective", "one-start")
     assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
     assert (search["w_r"] == 0) == (case == "unregularized")
     assert (len(S["samples"][0][:, 0].unique(dim=0)) > 3) == (case == "restart")
@@ -44,6 +44,17 @@ def test_a_bound_on_effective_samples(tmp_path: Path) -> None:
         log_pi = search.network.log_prob(search.optimise(S)[0], S.obs, S.u)
         least.append((1 / log_weights(log_pi, S.log_mixture).softmax(0).square().sum(0)).min().item())
     assert least[0] < 4.0 < 4.9 < least[1]
+
+
+def test_one_start(tmp_path: Path) -> None:
+    """It proposes what the search does where the start at theta* wins; otherwise Phi is lower."""
+    args = gps_variants.parse(gps_variants.VariantArgs, [*TINY, "--case", "one-start", "--device", "cpu"])
+    search = gps_variants.OneStart(args, diffsim.make("cartpole", 1))
+    search.prepare(lambda _: None, tmp_path / "plan.npz")
+    one, alone = search.optimise(search.S.samples)
+    both, two = gps_variants.gps.Search.optimise(search, search.S.samples)
+    assert "gps/start" not in alone and torch.equal(one, both) == (two["gps/start"] == 0)
+    assert alone["gps/phi"] == two["gps/phi"] if two["gps/start"] == 0 else alone["gps/phi"] < two["gps/phi"]
 
 
 def test_resume(tmp_path: Path) -> None:
