@@ -82,8 +82,8 @@ def same(shown: str, measured: str) -> bool:
 @pytest.mark.parametrize("page", CHECKED, ids=lambda page: page.stem)
 def test_tables_agree_with_the_csv_files_that_they_name(page: Path) -> None:
     for table in tables(page):
-        if not table.source or len(columns := table.columns()) < 2:
-            continue
+        if not table.source or table.source.stem == "cells" or len(columns := table.columns()) < 2:
+            continue  # lines of several cells: tests/benchmarks/test_paper.py
         measured = read_csv(table.source)
         for row in table.rows:
             shown = dict(zip(table.header, row, strict=False))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,19 @@ def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> No
         known[4][column] = before
     known[4]["seed"] = "6"
     assert paper.table(paper.Args(), "headline") == []
+
+
+def test_pages_show_the_lines_of_the_cells() -> None:
+    if not paper.same_code(paper.REVISION, "shac"):
+        pytest.skip("the history is not here")
+    args, shown = paper.Args(output=common.RESULTS / "cpu"), 0
+    for name, group in paper.GROUPS.items():
+        text = (common.DOCS / group.page).read_text()
+        for part in re.findall(rf"<!-- {name} -->\n(.*?)<!-- /{name} -->", text, re.DOTALL):
+            lines = paper.table(args, name)
+            assert part == tables.markdown(lines, group.columns)
+            shown += len(lines)
+    assert shown
 
 
 def test_what_is_missing_is_said_with_its_command(known: list[dict[str, str]]) -> None:
