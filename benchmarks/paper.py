@@ -179,9 +179,12 @@ def line(machine: str, rows: Sequence[Cells]) -> Row:
     shown |= {name: middle(rows, name, ".2f") for name in ("speed", "speed in MuJoCo")}
     target = RETURNS[task].target
     seconds, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
-    never = seconds == math.inf
-    shown |= {"target": target, "s to target": "never" if never else f"{seconds:.0f}"}
-    return shown | {"steps to target": "never" if never else f"{steps / 1e6:.3g} M"}
+    shown |= {"target": target, "s to target": "" if math.isnan(seconds) else tell(seconds, ".0f")}
+    return shown | {"steps to target": tell(steps / 1e6, ".3g") + " M" * (steps < math.inf)}
+
+
+def tell(value: float, form: str) -> str:
+    return "never" if value == math.inf else f"{value:{form}}"
 
 
 def table(args: Args, name: str) -> list[Row]:
