@@ -68,4 +68,7 @@ def optimise(
 
 
 if __name__ == "__main__":
-    tyro.cli(optimise)
+    try:
+        tyro.cli(optimise)
+    except ValueError as error:  # a video of another suffix
+        raise SystemExit(str(error)) from None
