@@ -39,6 +39,7 @@ from diffsim.training.evaluation import kept
 CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the script: what a training depends on
 KEY = ("learner", "task", "seed")
 REVISION: str = CASES["paper"]["revision"]
+UNTIMED = ("task", "learner", "seeds", "return", "kept", "in the reference", "target", "steps to target")
 
 
 class Group(NamedTuple):
@@ -47,7 +48,7 @@ class Group(NamedTuple):
     tasks: Sequence[str]
     seeds: int
     page: str = "experiments.md"
-    columns: Sequence[str] = ()  # of the table (default: all)
+    timed: bool = True  # or its cells may share their machine, and have no seconds
 
 
 GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
@@ -63,6 +64,17 @@ class Cell(NamedTuple):
         folder = runs / self.machine / self.learner / f"{self.task}__{self.seed}"
         script, *flags = LEARNERS[self.learner].split()
         return Case(folder, self.task, self.seed, script, (*flags,))
+
+    @property
+    def timed(self) -> bool:
+        return any(
+            group.timed
+            and self.machine == group.machine
+            and self.learner in group.learners
+            and self.task in group.tasks
+            and self.seed <= group.seeds
+            for group in GROUPS.values()
+        )
 
     @property
     def command(self) -> str:
@@ -111,13 +123,19 @@ def same_code(revision: str, learner: str) -> bool:
     return subprocess.run(call, cwd=ROOT, capture_output=True).returncode == 0
 
 
+def counts(row: Cells, timed: bool) -> bool:
+    """Whether a cell's line is of REVISION, and has its seconds, if it is to be timed."""
+    return same_code(row["revision"], row["learner"]) and (not timed or bool(row["training (s)"]))
+
+
 def done(rows: Sequence[Cells], cell: Cell) -> bool:
     own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
-    return any(same_code(row["revision"], cell.learner) for row in own)
+    return any(counts(row, cell.timed) for row in own)
 
 
-def train(runner: Runner, cell: Cell, case: Case) -> bool:
+def train(runner: Runner, cell: Cell) -> bool:
     """To the end; whether it got there. Code that is not of REVISION is refused, to begin a cell and to go on."""
+    case = cell.case(runner.args.runs)
     path, revision = case.folder / "cell.json", tables.revision()
     if tables.unknown(f"; ; {revision}"):
         fail(f"a cell is of a commit, not of {revision}")
@@ -138,8 +156,9 @@ def train(runner: Runner, cell: Cell, case: Case) -> bool:
     return True
 
 
-def measure(runner: Runner, cell: Cell, case: Case) -> Row:
+def measure(runner: Runner, cell: Cell) -> Row:
     """A cell's line: what its training and all its evaluations say; empty if it is not whole."""
+    case = cell.case(runner.args.runs)
     path = case.folder / "checkpoint.pt"
     if not path.is_file() or not (case.folder / "cell.json").is_file():
         return {}
@@ -195,10 +214,14 @@ def table(args: Args, name: str) -> list[Row]:
         for learner in group.learners:
             wanted = {str(seed) for seed in range(1, group.seeds + 1)}
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
-            own = [row for row in own if same_code(row["revision"], learner)]
+            own = [row for row in own if counts(row, group.timed)]
             if len(own) == group.seeds and len({row["trained on"] for row in own}) == 1:
                 lines.append(line(group.machine, own))
     return lines
+
+
+def printed(args: Args, name: str) -> str:
+    return markdown(table(args, name), None if GROUPS[name].timed else UNTIMED)
 
 
 def check(args: Args) -> str:
@@ -230,14 +253,12 @@ def main(args: Args) -> None:
     for cell in () if args.draw_only else cells(args):
         if cell.machine != args.place or done(args.read("cells"), cell):
             continue
-        case = cell.case(args.runs)
-        if not args.evaluate_only and not train(runner, cell, case):
+        if not args.evaluate_only and not train(runner, cell):
             continue
-        if not args.train_only and (row := measure(runner, cell, case)):
+        if not args.train_only and (row := measure(runner, cell)):
             args.keep("cells", row, KEY)
     for name in args.only:
-        text = markdown(table(args, name), GROUPS[name].columns)
-        args.publish(name, text, GROUPS[name].page, everywhere=True)
+        args.publish(name, printed(args, name), GROUPS[name].page, everywhere=True)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,7 @@ import tables
 from learners import refusal
 from runner import Runner
 
-SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4") | {
-    "trained on": "NVIDIA H200"
-}
+SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4")
 
 
 @pytest.fixture
@@ -27,6 +25,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
     monkeypatch.setattr(paper, "same_code", lambda revision, learner: revision == "aaaaaaa")
     for seed, value in enumerate((5000.0, 5100.0, 4800.0, 5300.0, 5200.0), start=1):
         row = SAPO | {"seed": str(seed), "return": f"{value}", "training (s)": f"{60 + seed}", "falls": f"{seed / 100}"}
+        row["trained on"] = "NVIDIA H200"
         rows.append(row | {"seconds to 3000": "inf" if seed < 3 else "9", "control_steps to 3000": f"{seed}e6"})
     return rows
 
@@ -39,7 +38,8 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
         for learner in group.learners:
             assert paper.Cell(group.machine, learner, group.tasks[-1], group.seeds) in found
     (one,) = paper.cells(paper.Args(only=("headline",), learners=("sapo",), env=("hopper",), seeds=(4,)))
-    assert one == paper.Cell("h200", "sapo", "hopper", 4)
+    assert one == paper.Cell("h200", "sapo", "hopper", 4) and one.timed
+    assert not paper.Cell("cpu", "shac_fast", "cartpole", 1).timed and paper.Cell("cpu", "shac", "cartpole", 1).timed
     some = list(paper.cells(paper.Args(only=("headline", "muscles"), env=("humanoid_mtu",), seeds=(2, 4))))
     assert {(cell.learner, cell.seed) for cell in some} == {
         *((learner, seed) for learner in ("shac", "sapo", "ppo_4096") for seed in (2, 4)),
@@ -56,7 +56,7 @@ def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> No
     assert (line["task"], line["learner"], line["seeds"]) == ("hopper", "sapo", 5)
     assert line["return"] == "5100 (4800 to 5300)" and line["training (s)"] == "63" and line["falls"] == "0.05"
     assert (line["s to target"], line["steps to target"], line["in all (s)"]) == ("9", "3 M", "")
-    for column, other in {"revision": "bbbbbbb", "trained on": "NVIDIA H100"}.items():
+    for column, other in {"revision": "bbbbbbb", "trained on": "NVIDIA H100", "training (s)": ""}.items():
         before, known[4][column] = known[4][column], other
         assert paper.table(paper.Args(), "headline") == []
         known[4][column] = before
@@ -71,9 +71,8 @@ def test_pages_show_the_lines_of_the_cells() -> None:
     for name, group in paper.GROUPS.items():
         text = (common.DOCS / group.page).read_text()
         for part in re.findall(rf"<!-- {name} -->\n(.*?)<!-- /{name} -->", text, re.DOTALL):
-            lines = paper.table(args, name)
-            assert part == tables.markdown(lines, group.columns)
-            shown += len(lines)
+            assert part == paper.printed(args, name)
+            shown += len(paper.table(args, name))
     assert shown
 
 
@@ -110,7 +109,7 @@ def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: 
     cell = paper.Cell("cpu", "shac", "cartpole", 1)
 
     def begin() -> None:
-        paper.train(Runner(paper.Args()), cell, cell.case(Path("nowhere")))
+        paper.train(Runner(paper.Args(runs=Path("nowhere"))), cell)
 
     assert refusal(begin, capsys).endswith("a cell is of a commit, not of 1234567-dirty")
     monkeypatch.setattr(tables, "revision", lambda: "1234567")
