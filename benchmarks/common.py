@@ -99,6 +99,12 @@ class CommonFlags:
             tables.fill(DOCS / page, name, text)
 
 
+def check_names(flag: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """End the benchmark with one line if a flag names what is not known."""
+    if unknown := [name for name in names if name not in known]:
+        fail(f"{flag}: there is no {unknown[0]!r}; choose from {', '.join(known)}")
+
+
 @dataclass
 class CheckpointFlags(CommonFlags):
     """What benchmarks of saved policies take. A policy says its task."""

@@ -26,7 +26,7 @@ from typing import Annotated
 import numpy as np
 import torch
 import tyro
-from common import Line, Panel, checkpoint_of, parse, plot
+from common import Line, Panel, check_names, checkpoint_of, parse, plot
 from gps_variants import CASES as VARIANTS
 from gps_variants import VariantArgs
 from groups import grouped, middle, numbers
@@ -388,9 +388,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.record:
         record(args.record, args.actor, args.steps)
         return
-    for words, known in ((args.cases, CASES), (args.env, diffsim.TASKS)):
-        if unknown := [word for word in words if word not in known]:
-            fail(f"unknown {unknown[0]!r}: choose from {', '.join(known)}")
+    check_names("--cases", args.cases, CASES)
+    check_names("--env", args.env, diffsim.TASKS)
     if args.list:
         print("\n".join(commands(args)))
         return

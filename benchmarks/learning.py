@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import common
 import numpy as np
-from common import LEARNT, Line, Panel, Tasks, plot, run
+from common import LEARNT, Line, Panel, Tasks, check_names, plot, run
 from runner import COLUMNS, Case, Curve, Runner, ScriptFlags, curve, folders, passing, seed, summary
 from tables import ROOT, Row, markdown, read_csv
 
@@ -218,8 +218,8 @@ def report(args: Args, name: str) -> None:
 
 
 def main(args: Args) -> None:
-    if args.experiment and args.experiment not in EXPERIMENTS:
-        fail(f"--experiment: there is no {args.experiment!r}; choose from {', '.join(EXPERIMENTS)}")
+    if args.experiment:
+        check_names("--experiment", [args.experiment], EXPERIMENTS)
     case = EXPERIMENTS[args.experiment] if args.experiment else Experiment("", (args.algorithm,), LEARNT)
     scripts = {learner: LEARNERS.get(learner, learner).split() for learner in case.learners}
     if missing := [script for script, *_ in scripts.values() if not (ROOT / f"{script}.py").is_file()]:

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import common
 import tables
 import transfer
-from common import load_case, run
+from common import check_names, load_case, run
 from groups import Cells, middle, numbers
 from learning import CASES, LEARNERS, RETURNS
 from runner import Case, Runner, ScriptFlags, checked, curve, evaluation, finer, passing
@@ -243,9 +243,8 @@ def check(args: Args) -> str:
 
 
 def main(args: Args) -> None:
-    for flag, names, known in (("only", args.only, GROUPS), ("learners", args.learners, LEARNERS)):
-        if unknown := [name for name in names if name not in known]:
-            fail(f"--{flag}: there is no {unknown[0]!r}; choose from {', '.join(known)}")
+    check_names("--only", args.only, GROUPS)
+    check_names("--learners", args.learners, LEARNERS)
     if args.check:
         print(check(args))
         return

@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import mean, pstdev
 from typing import NamedTuple
 
-from common import run
+from common import check_names, run
 from groups import grouped, numbers
 from runner import Case, Runner, ScriptFlags
 from tables import Row, markdown, read_csv
@@ -81,6 +81,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def main(args: Args) -> None:
+    check_names("--only", args.only, FIGURES)
     if not args.draw_only:
         runner = Runner(args)
         for case in cases(args):

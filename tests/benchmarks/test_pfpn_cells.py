@@ -8,6 +8,7 @@ from pathlib import Path
 import pfpn_cells
 import pytest
 from common import DOCS, RESULTS, ROOT
+from learners import refusal
 from tables import markdown, read_csv
 
 import pfpn
@@ -25,6 +26,11 @@ def test_each_cell_is_a_command(figure: str, cell: str, monkeypatch: pytest.Monk
     base, args = parse(pfpn.Args, flags), parse(pfpn.Args, [*flags, *case.cells[cell].split()])
     for name in ("algorithm", "iterations", "num_envs", "horizon", "epochs", "minibatch_size", "gamma", "hidden"):
         assert getattr(args, name) == getattr(base, name)
+
+
+def test_an_unknown_figure_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    error = refusal(lambda: pfpn_cells.main(pfpn_cells.Args(only=("figure 3",))), capsys)
+    assert error.endswith(f"--only: there is no 'figure 3'; choose from {', '.join(pfpn_cells.FIGURES)}")
 
 
 def write(folder: Path, returns: list[float], dead: float | None) -> None:
