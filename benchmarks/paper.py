@@ -151,7 +151,7 @@ def train(runner: Runner, cell: Cell) -> bool:
     fresh, start = not (case.folder / "progress.csv").is_file(), time.monotonic()
     if not runner.train(case):
         return False
-    if fresh:  # trained in one go
+    if fresh and not runner.args.arguments:  # in one go, with all evaluations
         path.write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
     return True
 
