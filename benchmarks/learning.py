@@ -1,7 +1,7 @@
 """Learning: trains learners on tasks and seeds, evaluates the final policies, and draws and tabulates all of it.
 
     python benchmarks/learning.py --env ant --seeds 1 2 3              train (finished runs are kept), evaluate, draw
-    python benchmarks/learning.py --experiment comparison              the paper's Figures 4 and 7, likewise
+    python benchmarks/learning.py --experiment orders                  several learners beside each other, likewise
     python benchmarks/learning.py --experiment records --time-limit 500    stop in time; the same command goes on
     python benchmarks/learning.py --experiment records --draw-only     only draw and tabulate what there is
     python benchmarks/learning.py --runs runs/short -- --iterations 50 what follows "--" goes to the learner
@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from statistics import mean, median, pstdev
@@ -43,7 +44,7 @@ class Returns(NamedTuple):
 
 
 class Experiment(NamedTuple):
-    """Several learners beside each other, among them those of the paper's Figures 4 to 9."""
+    """Several learners beside each other."""
 
     title: str
     learners: Sequence[str]
@@ -161,15 +162,19 @@ def ratios(args: Args, learners: Sequence[str], tasks: Sequence[str]) -> list[Ro
     return rows
 
 
-def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[str]) -> None:
-    """Each seed (thin) and the median (bold) against control steps and seconds, on log axes if ends lie far apart."""
+def draw(path: Path, learners: Sequence[str], tasks: Sequence[str], of: Callable[[str, str], list[Curve]]) -> None:
+    """Each seed (thin) and the median (bold) against control steps and seconds, on log axes if ends lie far apart.
+
+    Args:
+        of: the curves of a learner on a task.
+    """
     grid = list[list[Panel]]()
     for x, text in (("control_steps", "control steps"), ("seconds", "seconds of training")):
         panels = list[Panel]()
         for env in tasks:
             lines, begins, ends, published = list[Line](), list[float](), list[float](), RETURNS[env].published
             for k, learner in enumerate(learners):
-                runs = curves(args, learner, env)
+                runs = of(learner, env)
                 if runs := timed(runs) if x == "seconds" else runs:
                     shared = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
                     middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
@@ -184,7 +189,7 @@ def draw(args: Args, name: str, learners: Sequence[str], tasks: Sequence[str]) -
             panels.append(Panel(lines, env, text, "" if panels else "return of training episodes", log))
         if any(panel.lines for panel in panels):  # not where all runs shared their machine, and have no seconds
             grid.append(panels)
-    plot(args.picture(name), grid)
+    plot(path, grid)
 
 
 def summaries(args: Args, learners: Sequence[str], tasks: Sequence[str]) -> list[dict[str, str]]:
@@ -214,7 +219,7 @@ def report(args: Args, name: str) -> None:
         args.publish(table_name, f"{text}![{case.title}]({args.link(picture)})\n", case.page)
         compared = [env for env in case.tasks if env in {row["task"] for row in found}]
     if picture and compared:
-        draw(args, picture, case.learners, compared)
+        draw(args.picture(picture), case.learners, compared, partial(curves, args))
 
 
 def main(args: Args) -> None:
@@ -241,7 +246,8 @@ def main(args: Args) -> None:
     rows = sorted(args.read("learning"), key=lambda row: LEARNT.index(row["task"]))
     own = [row for row in rows if row["learner"] == learner]
     args.publish("results", markdown(own, RESULT_COLUMNS), PAGES.get(learner, "experiments.md"))
-    draw(args, learner, case.learners, [env for env in LEARNT if curves(args, learner, env)])
+    there = [env for env in LEARNT if curves(args, learner, env)]
+    draw(args.picture(learner), case.learners, there, partial(curves, args))
 
 
 if __name__ == "__main__":

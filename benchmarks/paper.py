@@ -7,7 +7,8 @@
     python benchmarks/paper.py --draw-only --update-results        only the tables
 
 Groups of cells are in cases.json: learners on tasks of a machine, by seeds. All are of the revision there, or of one
-with the same package and script. Writes cells.csv, a line for each; a table has the learners whose seeds are all there.
+with the same package and script. Writes cells.csv, a line for each, and curves.csv, some POINTS of each one's training;
+a table has the learners whose seeds are all there.
 """
 
 from __future__ import annotations
@@ -18,18 +19,19 @@ import math
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
 from typing import NamedTuple
 
 import common
+import numpy as np
 import tables
 import transfer
 from common import check_names, load_case, run
-from groups import Cells, middle, numbers
-from learning import CASES, LEARNERS, RETURNS
-from runner import Case, Runner, ScriptFlags, checked, curve, evaluation, finer, passing
+from groups import Cells, grouped, middle, numbers
+from learning import CASES, LEARNERS, RETURNS, draw
+from runner import Case, Curve, Runner, ScriptFlags, checked, curve, evaluation, finer, passing
 from tables import ROOT, Row, markdown, read_csv
 
 import diffsim
@@ -38,6 +40,7 @@ from diffsim.training.evaluation import kept
 
 CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the script: what a training depends on
 KEY = ("learner", "task", "seed")
+POINTS = 50  # of a curve
 REVISION: str = CASES["paper"]["revision"]
 UNTIMED = ("task", "learner", "seeds", "return", "kept", "in the reference", "target", "steps to target")
 
@@ -49,6 +52,7 @@ class Group(NamedTuple):
     seeds: int
     page: str = "experiments.md"
     timed: bool = True  # or its cells may share their machine, and have no seconds
+    picture: bool = False  # of the curves, under the group's name
 
 
 GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
@@ -93,6 +97,11 @@ class Args(ScriptFlags):
     check: bool = False  # only say what is missing
     train_only: bool = False  # evaluate nothing
     evaluate_only: bool = False  # train nothing
+    shared: bool = False  # the machine did other work beside the trainings: their seconds are left out
+
+    def alone(self, cell: Cell) -> bool:
+        """Whether a cell's seconds mean something."""
+        return cell.timed and not self.shared
 
     @property
     def place(self) -> str:
@@ -156,9 +165,9 @@ def train(runner: Runner, cell: Cell) -> bool:
     return True
 
 
-def measure(runner: Runner, cell: Cell) -> Row:
+def measure(args: Args, runner: Runner, cell: Cell) -> Row:
     """A cell's line: what its training and all its evaluations say; empty if it is not whole."""
-    case = cell.case(runner.args.runs)
+    case = cell.case(args.runs)
     path = case.folder / "checkpoint.pt"
     if not path.is_file() or not (case.folder / "cell.json").is_file():
         return {}
@@ -184,7 +193,32 @@ def measure(runner: Runner, cell: Cell) -> Row:
         for x in ("control_steps", "seconds"):
             row[f"{x} to {target}"] = passing(curves, target, x)[0]
     found = transfer.in_mujoco(load_case(path, len(own["lengths"]), "cpu"))
-    return row | {f"{name} in MuJoCo": found[name] for name in ("return", "speed") if found}
+    row |= {f"{name} in MuJoCo": found[name] for name in ("return", "speed") if found}
+    if args.alone(cell):
+        return row
+    return {name: "" if "(s)" in name or name.startswith("seconds") else value for name, value in row.items()}
+
+
+def points(args: Args, cell: Cell) -> list[Row]:
+    """Some POINTS of a cell's training, from its first finished episode on."""
+    rows = [row for row in read_csv(cell.case(args.runs).folder / "progress.csv") if row.get("return")]
+    chosen = np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).round().astype(int)
+    columns = ("iteration", "control_steps", *(("seconds",) if args.alone(cell) else ()), "return")
+    about = dict(zip(KEY, cell[1:], strict=True))
+    return [about | {name: float(rows[k][name]) for name in columns} for k in chosen]
+
+
+def pictured(args: Args, name: str) -> None:
+    """Draw a group's curves, of tasks on which there are two learners."""
+    group, args = GROUPS[name], replace(args, machine=GROUPS[name].machine)
+    found = grouped(args.read("curves"), "learner", "task", "seed")
+
+    def of(learner: str, task: str) -> list[Curve]:
+        return [curve(rows) for about, rows in found.items() if about[:2] == (learner, task)]
+
+    compared = [task for task in group.tasks if sum(bool(of(learner, task)) for learner in group.learners) > 1]
+    if compared:
+        draw(args.picture(name), group.learners, compared, of)
 
 
 def line(machine: str, rows: Sequence[Cells]) -> Row:
@@ -254,10 +288,13 @@ def main(args: Args) -> None:
             continue
         if not args.evaluate_only and not train(runner, cell):
             continue
-        if not args.train_only and (row := measure(runner, cell)):
+        if not args.train_only and (row := measure(args, runner, cell)):
             args.keep("cells", row, KEY)
+            args.merge("curves", points(args, cell), (*KEY, "iteration"))
     for name in args.only:
         args.publish(name, printed(args, name), GROUPS[name].page, everywhere=True)
+        if GROUPS[name].picture:
+            pictured(args, name)
 
 
 if __name__ == "__main__":

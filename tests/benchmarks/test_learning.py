@@ -61,9 +61,10 @@ def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.Mon
         write_run(runs / "shac" / f"ant__{seed}", np.arange(0, 7000, 10.0), 2048, 0.5)
         write_run(runs / "ppo_baseline" / f"ant__{seed}", np.arange(0, 6000, 2.0), 20480, 0.05)
     write_run(runs / "bptt" / "ant__1", np.arange(300.0), 4096, 0.5, finished=False)
+    case = learning.Experiment("Learners", ("shac", "ppo_baseline", "bptt"), ("ant",))
+    monkeypatch.setitem(learning.EXPERIMENTS, "comparison", case)
     args = learning.Args(experiment="comparison", env=("ant",), runs=runs, update_results=True, draw_only=True)
     learning.main(args)
-    case = learning.EXPERIMENTS["comparison"]
     found = learning.table(args, case.learners, case.tasks)
     rows = {str(row["learner"]): {k: str(v) for k, v in row.items()} for row in found}
     shac, ppo, bptt = (rows[learner] for learner in ("shac", "ppo_baseline", "bptt"))

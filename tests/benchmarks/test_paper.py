@@ -76,6 +76,45 @@ def test_pages_show_the_lines_of_the_cells() -> None:
     assert shown
 
 
+def test_a_picture_has_the_curves_of_all_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seconds are of cells that are timed and had their machine alone; a task with one learner has no panel."""
+    args = paper.Args(runs=tmp_path / "runs", output=tmp_path / "results")
+    cells = [paper.Cell("h200", learner, "ant", seed) for learner in ("shac", "ppo_4096") for seed in (1, 2)]
+    for cell in (*cells, paper.Cell("h200", "sapo", "hopper", 1)):
+        folder = cell.case(args.runs).folder
+        folder.mkdir(parents=True)
+        lines = [f"{k},{2048 * k},{k / 2},{100 * cell.seed * k if k > 3 else ''}" for k in range(1, 400)]
+        (folder / "progress.csv").write_text("\n".join(["iteration,control_steps,seconds,return", *lines]))
+    chosen = paper.points(args, cells[1])
+    assert len(chosen) == paper.POINTS and chosen[0]["iteration"] == 4 and chosen[-1]["iteration"] == 399
+    assert all(
+        row["return"] == 200 * float(str(row["iteration"])) == 400 * float(str(row["seconds"])) for row in chosen
+    )
+    for other in (paper.points(paper.Args(runs=args.runs, shared=True), cells[1]), paper.points(args, untimed(args))):
+        assert [row["return"] for row in other] == [row["return"] for row in chosen] and "seconds" not in other[0]
+
+    drawn = list[list[list[common.Panel]]]()
+    monkeypatch.setattr("learning.plot", lambda path, grid: drawn.append(grid))
+    place = paper.Args(output=args.output, machine="h200")
+    for cell in cells:
+        place.merge("curves", paper.points(args, cell), (*paper.KEY, "iteration"))
+    place.merge("curves", paper.points(args, paper.Cell("h200", "sapo", "hopper", 1)), (*paper.KEY, "iteration"))
+    paper.pictured(args, "headline")
+    ((steps, seconds),) = drawn
+    assert [panel.title for panel in (*steps, *seconds)] == ["ant", "ant"]
+    assert [line.label for line in steps[0].lines if line.width == 2] == ["shac", "ppo_4096"]
+    assert max(seconds[0].lines[1].x) == 199.5 and max(seconds[0].lines[1].y) == 200 * 399
+
+
+def untimed(args: paper.Args) -> paper.Cell:
+    """A cell of a group without seconds, with the second run's curve."""
+    cell = paper.Cell("cpu", "shac_h4", "ant", 2)
+    folder = cell.case(args.runs).folder
+    folder.parent.mkdir(parents=True)
+    folder.symlink_to(args.runs / "h200" / "shac" / "ant__2")
+    return cell
+
+
 def test_what_is_missing_is_said_with_its_command(known: list[dict[str, str]]) -> None:
     known[2]["revision"] = "bbbbbbb"
     args = paper.Args(only=("headline",), env=("hopper",))
