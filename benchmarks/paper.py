@@ -160,7 +160,7 @@ def train(runner: Runner, cell: Cell) -> bool:
     fresh, start = not (case.folder / "progress.csv").is_file(), time.monotonic()
     if not runner.train(case):
         return False
-    if fresh and not runner.args.arguments:  # in one go, with all evaluations
+    if fresh and "--eval-every" not in runner.args.arguments:  # trained in one go, with all evaluations
         path.write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
     return True
 
@@ -205,7 +205,7 @@ def points(args: Args, cell: Cell) -> list[Row]:
     chosen = np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).round().astype(int)
     columns = ("iteration", "control_steps", *(("seconds",) if args.alone(cell) else ()), "return")
     about = dict(zip(KEY, cell[1:], strict=True))
-    return [about | {name: float(rows[k][name]) for name in columns} for k in chosen]
+    return [about | {name: rows[k][name] for name in columns} for k in chosen]
 
 
 def pictured(args: Args, name: str) -> None:
