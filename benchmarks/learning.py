@@ -189,7 +189,7 @@ def draw(path: Path, learners: Sequence[str], tasks: Sequence[str], of: Callable
             panels.append(Panel(lines, env, text, "" if panels else "return of training episodes", log))
         if any(panel.lines for panel in panels):  # not where all runs shared their machine, and have no seconds
             grid.append(panels)
-    plot(path, grid)
+    plot(path, grid, (3.4, 2.9) if len(tasks) > 1 else (6.0, 3.8))
 
 
 def summaries(args: Args, learners: Sequence[str], tasks: Sequence[str]) -> list[dict[str, str]]:

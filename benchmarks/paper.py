@@ -7,8 +7,8 @@
     python benchmarks/paper.py --draw-only --update-results        only the tables
 
 Groups of cells are in cases.json: learners on tasks of a machine, by seeds. All are of the revision there, or of one
-with the same package and script. Writes cells.csv, a line for each, and curves.csv, some POINTS of each one's training;
-a table has the learners whose seeds are all there.
+with the same package and script. Writes cells.csv, a line for each, and curves.csv, some POINTS of each training that a
+picture shows; a table has the learners whose seeds are all there.
 """
 
 from __future__ import annotations
@@ -70,15 +70,19 @@ class Cell(NamedTuple):
         return Case(folder, self.task, self.seed, script, (*flags,))
 
     @property
-    def timed(self) -> bool:
-        return any(
-            group.timed
-            and self.machine == group.machine
+    def groups(self) -> list[Group]:
+        return [
+            group
+            for group in GROUPS.values()
+            if self.machine == group.machine
             and self.learner in group.learners
             and self.task in group.tasks
             and self.seed <= group.seeds
-            for group in GROUPS.values()
-        )
+        ]
+
+    @property
+    def timed(self) -> bool:
+        return any(group.timed for group in self.groups)
 
     @property
     def command(self) -> str:
@@ -290,7 +294,8 @@ def main(args: Args) -> None:
             continue
         if not args.train_only and (row := measure(args, runner, cell)):
             args.keep("cells", row, KEY)
-            args.merge("curves", points(args, cell), (*KEY, "iteration"))
+            if any(group.picture for group in cell.groups):
+                args.merge("curves", points(args, cell), (*KEY, "iteration"))
     for name in args.only:
         args.publish(name, printed(args, name), GROUPS[name].page, everywhere=True)
         if GROUPS[name].picture:

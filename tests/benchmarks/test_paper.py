@@ -92,7 +92,7 @@ def test_a_picture_has_the_curves_of_all_cells(tmp_path: Path, monkeypatch: pyte
         assert [row["return"] for row in other] == [row["return"] for row in chosen] and "seconds" not in other[0]
 
     drawn = list[list[list[common.Panel]]]()
-    monkeypatch.setattr("learning.plot", lambda path, grid: drawn.append(grid))
+    monkeypatch.setattr("learning.plot", lambda path, grid, size: drawn.append(grid))
     place = paper.Args(output=args.output, machine="h200")
     for cell in cells:
         place.merge("curves", paper.points(args, cell), (*paper.KEY, "iteration"))
