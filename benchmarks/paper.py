@@ -4,7 +4,7 @@
     python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables
     python benchmarks/paper.py --learners sapo --train-only        on a machine that is lent: bring runs/paper home
     python benchmarks/paper.py --machine h200 --evaluate-only --update-results    and evaluate there
-    python benchmarks/paper.py --draw-only --update-results        only the tables
+    python benchmarks/paper.py --draw-only --update-results        only the tables and pictures
 
 Groups of cells are in cases.json: learners on tasks of a machine, by seeds. All are of the revision there, or of one
 with the same package and script. Writes cells.csv, a line for each, and curves.csv, some POINTS of each training that a
