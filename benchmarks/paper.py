@@ -199,9 +199,9 @@ def measure(args: Args, runner: Runner, cell: Cell) -> Row:
             row[f"{x} to {target}"] = passing(curves, target, x)[0]
     found = transfer.in_mujoco(load_case(path, len(own["lengths"]), "cpu"))
     row |= {f"{name} in MuJoCo": found[name] for name in ("return", "speed") if found}
-    if args.alone(cell):
-        return row
-    return {name: "" if "(s)" in name or name.startswith("seconds") else value for name, value in row.items()}
+    if not args.alone(cell):
+        row |= dict.fromkeys([name for name in row if "(s)" in name or name.startswith("seconds")], "")
+    return row
 
 
 def points(args: Args, cell: Cell) -> list[Row]:
