@@ -35,7 +35,9 @@ def origin(device: str = "cpu") -> str:
     """The comment line of rows that this process measures on a device."""
     info = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
     found = re.search("model name.*: (.*)", info)
-    machine = f"{os.cpu_count()} cores of {found[1] if found else platform.processor() or 'unknown'}"
+    cores, own = os.cpu_count(), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    share = f"{cores}" if own == cores else f"{own} of {cores}"
+    machine = f"{share} cores of {found[1] if found else platform.processor() or 'unknown'}"
     if device.startswith("cuda"):
         machine = torch.cuda.get_device_name(device)
     packages = {"torch": "torch", "warp": "warp-lang", "mujoco": "mujoco"}
