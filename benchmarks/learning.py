@@ -2,8 +2,8 @@
 
     python benchmarks/learning.py --env ant --seeds 1 2 3              train (finished runs are kept), evaluate, draw
     python benchmarks/learning.py --experiment orders                  several learners beside each other, likewise
-    python benchmarks/learning.py --experiment records --time-limit 500    stop in time; the same command goes on
-    python benchmarks/learning.py --experiment records --draw-only     only draw and tabulate what there is
+    python benchmarks/learning.py --experiment orders --time-limit 500    stop in time; the same command goes on
+    python benchmarks/learning.py --experiment orders --draw-only      only draw and tabulate what there is
     python benchmarks/learning.py --runs runs/short -- --iterations 50 what follows "--" goes to the learner
 
 Learners (a script with flags), experiments (learners on tasks, the first is what the others are compared with) and the
@@ -61,7 +61,7 @@ RETURNS = {name: Returns(**case) for name, case in CASES["returns"].items()}
 LEARNERS: dict[str, str] = CASES["learners"]  # script and flags
 EXPERIMENTS = {name: Experiment(**case) for name, case in CASES["experiments"].items()}
 POINTS = 100  # kept of each run
-WITH_PAGES = "shac", "sapo", "bptt", "mbpo", "ppo_baseline", "sac_baseline"
+WITH_PAGES = "bptt", "mbpo", "ppo_baseline", "sac_baseline"
 PAGES = {name: f"{name.removesuffix('_baseline')}.md" for name in WITH_PAGES}
 PAIRS = {name: (f"pfpn_{name}", f"pfpn_gaussian_{name}") for name in ("ppo", "shac", "sac")}  # by their algorithms
 RESULT_COLUMNS = ("task", "seeds", "return", "each seed", "published", "training (s)", "return passes", "kept")
@@ -99,9 +99,13 @@ def collect(args: Args, learner: str, env: str) -> None:
 
 
 def curves(args: Args, learner: str, env: str) -> list[Curve]:
-    """The curve of each seed from this machine's csv file, else from another one's (a GPU's first), without seconds."""
+    """The curve of each seed from this machine's csv file, else from another one's (a GPU's first), without seconds.
+
+    The file is the learner's on the task, or else curves.csv, which paper.py writes.
+    """
     seeds: dict[str, list[dict[str, str]]] = {}
-    rows = args.read(name := f"{learner}_{env}")
+    cells = [row for row in args.read("curves") if (row["learner"], row["task"]) == (learner, env)]
+    rows = args.read(name := f"{learner}_{env}") or cells
     if not rows and args.directory.parent == common.RESULTS:
         paths = sorted(common.RESULTS.glob(f"*/{name}.csv"), key=lambda path: (path.parent.name == "cpu", path))
         rows = [row | {"seconds": ""} for path in paths[:1] for row in read_csv(path)]

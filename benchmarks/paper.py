@@ -18,6 +18,7 @@ import json
 import math
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,7 +43,7 @@ CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 REVISION: str = CASES["paper"]["revision"]
-UNTIMED = ("task", "learner", "seeds", "return", "kept", "in the reference", "target", "steps to target")
+UNTIMED = ("task", "learner", "return", "kept", "in the reference", "target", "steps to target")
 
 
 class Group(NamedTuple):
@@ -214,22 +215,22 @@ def points(args: Args, cell: Cell) -> list[Row]:
 
 
 def pictured(args: Args, name: str) -> None:
-    """Draw a group's curves, of tasks on which there are two learners."""
+    """Draw the curves of a group's seeds, of tasks that have any, against seconds only if it is timed."""
     group, args = GROUPS[name], replace(args, machine=GROUPS[name].machine)
-    found = grouped(args.read("curves"), "learner", "task", "seed")
+    rows = [row if group.timed else row | {"seconds": ""} for row in args.read("curves")]
+    found = grouped((row for row in rows if int(row["seed"]) <= group.seeds), "learner", "task", "seed")
 
     def of(learner: str, task: str) -> list[Curve]:
         return [curve(rows) for about, rows in found.items() if about[:2] == (learner, task)]
 
-    compared = [task for task in group.tasks if sum(bool(of(learner, task)) for learner in group.learners) > 1]
-    if compared:
-        draw(args.picture(name), group.learners, compared, of)
+    if there := [task for task in group.tasks if any(of(learner, task) for learner in group.learners)]:
+        draw(args.picture(name), group.learners, there, of)
 
 
-def line(machine: str, rows: Sequence[Cells]) -> Row:
+def line(rows: Sequence[Cells]) -> Row:
     """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
     returns, task = numbers(rows, "return"), rows[0]["task"]
-    shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"], "machine": machine, "seeds": len(rows)}
+    shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"], "seeds": len(rows)}
     shown["return"] = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
     shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
     shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}", "kept": middle(rows, "kept", ".3f")}
@@ -255,12 +256,16 @@ def table(args: Args, name: str) -> list[Row]:
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
             own = [row for row in own if counts(row, group.timed)]
             if len(own) == group.seeds and len({row["trained on"] for row in own}) == 1:
-                lines.append(line(group.machine, own))
+                lines.append(line(own))
     return lines
 
 
 def printed(args: Args, name: str) -> str:
-    return markdown(table(args, name), None if GROUPS[name].timed else UNTIMED)
+    """A group's table; where it only compares, without tasks that have a single line."""
+    rows, timed = table(args, name), GROUPS[name].timed
+    count = Counter(row["task"] for row in rows)
+    columns = [column for column in rows[0] if column != "seeds"] if rows and timed else UNTIMED
+    return markdown([row for row in rows if timed or count[row["task"]] > 1], columns)
 
 
 def check(args: Args) -> str:
@@ -296,7 +301,7 @@ def main(args: Args) -> None:
         if not args.train_only and (row := measure(args, runner, cell)):
             args.keep("cells", row, KEY)
             if any(group.picture for group in cell.groups):
-                args.merge("curves", points(args, cell), (*KEY, "iteration"))
+                tables.replace_csv(args.csv("curves"), points(args, cell), KEY, args.device)
     for name in args.only:
         args.publish(name, printed(args, name), GROUPS[name].page, everywhere=True)
         if GROUPS[name].picture:

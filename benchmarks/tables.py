@@ -94,10 +94,20 @@ def merge_csv(path: Path, rows: Sequence[Row], key: Sequence[str], device: str =
     for row in [*read_csv(path), *({name: digits(value) for name, value in row.items()} for row in rows)]:
         merged.setdefault(tuple(row.get(k, "") for k in key), {}).update(row)
     if rows:
-        command = origin(device).rpartition("; ")[2]
-        older = [line for line in origins(path) if line.rpartition("; ")[2] != command]
-        write_csv(path, list(merged.values()), device, older)
+        write_over(path, list(merged.values()), device)
     return list(merged.values())
+
+
+def replace_csv(path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu") -> None:
+    """Write the rows in place of all that agree with one of them in all of `key`."""
+    new = {tuple(str(row[k]) for k in key) for row in rows}
+    write_over(path, [*(row for row in read_csv(path) if tuple(row[k] for k in key) not in new), *rows], device)
+
+
+def write_over(path: Path, rows: Sequence[Row], device: str) -> None:
+    """Write a file anew; the lines that say where its rows come from stay, but for one of the same command."""
+    command = origin(device).rpartition("; ")[2]
+    write_csv(path, rows, device, [line for line in origins(path) if line.rpartition("; ")[2] != command])
 
 
 def markdown(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:

@@ -135,16 +135,6 @@ def summary(path: Path, shown: Mapping[str, str]) -> dict[str, str]:
     return {name: "never" if text in ("inf", "inf M") else text for name, text in found.items()}
 
 
-def test_readme_has_the_return_of_every_task() -> None:
-    returns = [table for table in tables(README) if "return" in table.header]
-    (claimed,) = re.findall(r"^\*\*(\d+) seconds\*\*", README.read_text(), re.MULTILINE)
-    assert returns and any(row[-1] == claimed for table in returns for row in table.rows)
-    for table in returns:
-        assert table.source and {"task", "return", "training (s)"} <= {*table.columns()}
-        trained = {line["task"] for line in read_csv(table.source) if line["learner"] == "shac"}
-        assert trained <= {row[table.header.index("task")] for row in table.rows}
-
-
 ORIGIN = re.compile(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python \w+")
 
 

@@ -134,6 +134,11 @@ def test_runs_that_shared_their_machine_have_no_seconds(tmp_path: Path, monkeypa
     common.tables.write_csv(tmp_path / "cpu" / "shac_ant.csv", rows)
     (curve,) = learning.curves(args, "shac", "ant")
     assert curve["control_steps"][-1] == 700 * 2048 and np.isnan(curve["seconds"]).all()
+    cells = [{"learner": "bptt", "task": task} | row for row in rows for task in ("ant", "hopper")]
+    common.tables.write_csv(tmp_path / "h100" / "curves.csv", cells)
+    (curve,) = learning.curves(args, "bptt", "ant")
+    assert len(curve["return"]) == len(rows) and curve["control_steps"][-1] == 700 * 2048
+    assert not learning.curves(args, "sapo", "ant")
 
 
 def test_a_return_that_some_seeds_pass() -> None:

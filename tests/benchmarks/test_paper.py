@@ -76,8 +76,24 @@ def test_pages_show_the_lines_of_the_cells() -> None:
     assert shown
 
 
+def test_readme_shows_medians_of_five_seeds_for_every_task() -> None:
+    if not paper.same_code(paper.REVISION, "shac"):
+        pytest.skip("the history is not here")
+    readme, cores = (tables.ROOT / "README.md").read_text(), paper.GROUPS["cores"]
+    args = paper.Args(output=common.RESULTS / "cpu")
+    lines = {(line["task"], line["learner"]): line for line in paper.table(args, "cores")}
+    shown = re.findall(r"^\| `(\w+)` \| \[?(\w+).*\| ([-\d,]+) \| (\d+) \|$", readme, re.MULTILINE)
+    assert [task for task, *_ in shown] == [task for task in cores.tasks if task in {task for task, _ in lines}]
+    for task, learner, value, seconds in shown:
+        line = lines[task, learner]
+        assert line["seeds"] == 5 and line["training (s)"] == seconds
+        assert f"{int(str(line['return']).split()[0]):,}" == value
+    (claimed,) = re.findall(r"^\*\*(\d+) seconds\*\*", readme, re.MULTILINE)
+    assert claimed == lines["humanoid", "shac"]["training (s)"]
+
+
 def test_a_picture_has_the_curves_of_all_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seconds are of cells that are timed and had their machine alone; a task with one learner has no panel."""
+    """Seconds are of cells and groups that are timed and had their machine alone, seeds are the group's."""
     args = paper.Args(runs=tmp_path / "runs", output=tmp_path / "results")
     cells = [paper.Cell("h200", learner, "ant", seed) for learner in ("shac", "ppo_4096") for seed in (1, 2)]
     for cell in (*cells, paper.Cell("h200", "sapo", "hopper", 1)):
@@ -95,13 +111,17 @@ def test_a_picture_has_the_curves_of_all_cells(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("learning.plot", lambda path, grid, size: drawn.append(grid))
     place = paper.Args(output=args.output, machine="h200")
     for cell in cells:
-        place.merge("curves", paper.points(args, cell), (*paper.KEY, "iteration"))
-    place.merge("curves", paper.points(args, paper.Cell("h200", "sapo", "hopper", 1)), (*paper.KEY, "iteration"))
+        tables.replace_csv(place.csv("curves"), paper.points(args, cell), paper.KEY)
+    tables.replace_csv(place.csv("curves"), paper.points(args, paper.Cell("h200", "sapo", "hopper", 1)), paper.KEY)
     paper.pictured(args, "headline")
     ((steps, seconds),) = drawn
-    assert [panel.title for panel in (*steps, *seconds)] == ["ant", "ant"]
-    assert [line.label for line in steps[0].lines if line.width == 2] == ["shac", "ppo_4096"]
-    assert max(seconds[0].lines[1].x) == 199.5 and max(seconds[0].lines[1].y) == 200 * 399
+    assert [panel.title for panel in (*steps, *seconds)] == ["hopper", "ant"] * 2
+    assert [line.label for line in steps[1].lines if line.width == 2] == ["shac", "ppo_4096"]
+    assert max(seconds[1].lines[1].x) == 199.5 and max(seconds[1].lines[1].y) == 200 * 399
+    monkeypatch.setitem(paper.GROUPS, "headline", paper.GROUPS["headline"]._replace(timed=False, seeds=1))
+    paper.pictured(args, "headline")
+    ((steps,),) = drawn[1:]
+    assert [len(panel.lines) for panel in steps] == [2, 5]  # a seed and the median of each, and SHAC's published return
 
 
 def untimed(args: paper.Args) -> paper.Cell:

@@ -31,6 +31,13 @@ def test_rows_replace_those_of_their_key_and_origins_those_of_their_command(
     first, second = tables.origins(path)
     assert first.endswith("speed.py --first\n") and second.endswith("speed.py --second 'one two'\n")
     assert first.startswith("# ") and "; python 3." in first and "torch " in first and "; revision " in first
+    tables.replace_csv(path, [{"task": "ant", "us": "7"}, {"task": "ant", "us": "8"}], ("task",))
+    assert [(row["task"], row["us"], row["error"]) for row in tables.read_csv(path)] == [
+        ("hopper", "2", "0.25"),
+        ("ant", "7", ""),
+        ("ant", "8", ""),
+    ]
+    assert tables.origins(path) == [first, second]
 
 
 def test_only_its_own_part_of_a_page_is_filled(tmp_path: Path) -> None:
