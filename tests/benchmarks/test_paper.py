@@ -88,6 +88,10 @@ def test_readme_shows_medians_of_five_seeds_for_every_task() -> None:
         line = lines[task, learner]
         assert line["seeds"] == 5 and line["training (s)"] == seconds
         assert f"{int(str(line['return']).split()[0]):,}" == value
+    headline = {(line["task"], line["learner"]): line for line in paper.table(args, "headline")}
+    for task, value, seconds in re.findall(r"`(\w+)` (?:ends )?at ([\d,]+) after (\d+) s", readme):
+        line = headline[task, "sapo"]
+        assert (f"{int(str(line['return']).split()[0]):,}", seconds) == (value, line["training (s)"])
     (claimed,) = re.findall(r"^\*\*(\d+) seconds\*\*", readme, re.MULTILINE)
     assert claimed == lines["humanoid", "shac"]["training (s)"]
 
