@@ -230,7 +230,7 @@ def pictured(args: Args, name: str) -> None:
 def line(rows: Sequence[Cells]) -> Row:
     """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
     returns, task = numbers(rows, "return"), rows[0]["task"]
-    shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"], "seeds": len(rows)}
+    shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"]}
     shown["return"] = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
     shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
     shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}", "kept": middle(rows, "kept", ".3f")}
@@ -264,8 +264,7 @@ def printed(args: Args, name: str) -> str:
     """A group's table; where it only compares, without tasks that have a single line."""
     rows, timed = table(args, name), GROUPS[name].timed
     count = Counter(row["task"] for row in rows)
-    columns = [column for column in rows[0] if column != "seeds"] if rows and timed else UNTIMED
-    return markdown([row for row in rows if timed or count[row["task"]] > 1], columns)
+    return markdown([row for row in rows if timed or count[row["task"]] > 1], None if timed else UNTIMED)
 
 
 def check(args: Args) -> str:

@@ -20,6 +20,8 @@ from pathlib import Path
 
 import torch
 
+from diffsim.sim.launcher import available_cores
+
 ROOT = Path(__file__).resolve().parents[1]
 Row = Mapping[str, object]
 
@@ -35,7 +37,7 @@ def origin(device: str = "cpu") -> str:
     """The comment line of rows that this process measures on a device."""
     info = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
     found = re.search("model name.*: (.*)", info)
-    cores, own = os.cpu_count(), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores, own = os.cpu_count(), available_cores()
     share = f"{cores}" if own == cores else f"{own} of {cores}"
     machine = f"{share} cores of {found[1] if found else platform.processor() or 'unknown'}"
     if device.startswith("cuda"):
