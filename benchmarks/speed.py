@@ -6,6 +6,7 @@
     python benchmarks/speed.py --parts time --env cartpole ant humanoid    the SHAC paper's Table 12
     python benchmarks/speed.py --parts training --env ant -- --contact mujoco    what follows "--" goes to the script
     python benchmarks/speed.py --parts training --script pfpn -- --policy gaussian
+    python benchmarks/speed.py --parts memory --env ant humanoid_mtu    the most that a script takes
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
 A machine that does something else meanwhile gives wrong numbers.
@@ -17,6 +18,7 @@ import dataclasses
 import gc
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -50,7 +52,7 @@ from diffsim.training.evaluation import make_env
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 KernelName = Literal["blocks", "scalar"]  # on a CPU in vectors of environments, or one environment at a time
 THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
-PartName = Literal["physics", "scaling", "training", "time"]
+PartName = Literal["physics", "scaling", "training", "time", "memory"]
 MAX_MEMORY = 40 * 2**30  # of a setting's checkpoints; the scaling table leaves out larger settings
 TABLE_12 = {"cartpole": (0.15, 0.23, 0.34), "ant": (0.25, 0.37, 0.32), "humanoid": (0.91, 1.97, 0.32)}  # on a TITAN X
 
@@ -285,17 +287,50 @@ def measure_time(args: Args, name: TaskName) -> Iterator[Row]:
     yield {**row, "critic, ms": critic, **{f"published {part}, s (TITAN X)": seconds for part, seconds in published}}
 
 
+def command(args: Args, name: str, *flags: str) -> list[str]:
+    """A script on a task, without evaluations."""
+    words = f"--env {name} --device {args.device} --quiet --eval-every 0"
+    return [sys.executable, str(ROOT / f"{args.script}.py"), *words.split(), *flags, *args.arguments]
+
+
+def watch(command: Sequence[str], look: Callable[[int], None], **environment: str) -> None:
+    """Run a script; meanwhile look, by the process's number, again and again."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | environment)
+    while process.poll() is None:
+        look(process.pid)
+        time.sleep(0.01)
+    if process.returncode:
+        fail(f"{' '.join(command)} failed")
+
+
 def start(command: Sequence[str], directory: Path, cache: str) -> float:
     """Seconds from a script's start to the end of its first iteration; waits for its end."""
-    began, first = time.perf_counter(), None
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"WARP_CACHE_PATH": cache})
-    while process.poll() is None:
-        if first is None and read_csv(directory / "progress.csv"):
-            first = time.perf_counter() - began
-        time.sleep(0.01)
-    if first is None or process.returncode:
-        fail(f"{' '.join(command)} failed")
-    return first
+    began, first = time.perf_counter(), list[float]()
+
+    def look(_: int) -> None:
+        if not first and read_csv(directory / "progress.csv"):
+            first.append(time.perf_counter() - began)
+
+    watch(command, look, WARP_CACHE_PATH=cache)
+    return first[0] if first else fail(f"{' '.join(command)} wrote no progress.csv")
+
+
+def measure_memory(args: Args, name: TaskName) -> Iterator[Row]:
+    """The most memory that a script takes in three iterations: its process on a CPU, on a GPU what others then lack."""
+    cuda = args.device != "cpu"
+    free, most = torch.cuda.mem_get_info()[0] if cuda else 0, 0
+
+    def look(pid: int) -> None:
+        nonlocal most
+        status = Path(f"/proc/{pid}/status").read_text()  # a process that has ended has no such line
+        resident = re.search(r"VmHWM:\s+(\d+) kB", status)
+        most = max(most, free - torch.cuda.mem_get_info()[0] if cuda else 1024 * int(resident[1] if resident else 0))
+
+    with tempfile.TemporaryDirectory() as run:
+        watch(command(args, name, "--stop-after", "3", "--run-dir", run), look)
+        num_envs = json.loads(Path(run, "args.json").read_text())["num_envs"]
+    script = " ".join((args.script, *args.arguments))
+    yield {"task": name, "script": script, "environments": num_envs, "memory (GiB)": most / 2**30}
 
 
 def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
@@ -303,15 +338,14 @@ def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
     techniques = {technique: ["--threads", str(threads)] for technique, threads in THREADS.items()}
     if args.device != "cpu":
         techniques = {"cuda graph": [], "cuda, eager": ["--no-cuda-graph"]}
-    words = f"{args.script}.py --env {name} --device {args.device} --quiet --iterations {args.iterations + 4}"
-    command = [sys.executable, *words.split(), "--eval-every", "0", "--save-every", "0", *args.arguments]
-    command[1] = str(ROOT / command[1])
+    common = "--iterations", str(args.iterations + 4), "--save-every", "0"
     for technique, flags in techniques.items():
         with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryDirectory() as runs:
             run = Path(runs)
-            cold = start([*command, *flags, "--stop-after", "1", "--run-dir", f"{run}/cold"], run / "cold", cache)
-            last = ["--stop-after", str(args.iterations + 3), "--run-dir", f"{run}/warm"]
-            warm = start([*command, *flags, *last], run / "warm", cache)
+            first = command(args, name, *common, *flags, "--stop-after", "1", "--run-dir", f"{run}/cold")
+            cold = start(first, run / "cold", cache)
+            last = "--stop-after", str(args.iterations + 3), "--run-dir", f"{run}/warm"
+            warm = start(command(args, name, *common, *flags, *last), run / "warm", cache)
             progress = read_csv(run / "warm" / "progress.csv")[3:]
             num_envs = json.loads((run / "warm" / "args.json").read_text())["num_envs"]
         critic = [1e3 * float(row["time_update_critic"]) for row in progress if "time_update_critic" in row]
@@ -330,6 +364,7 @@ PARTS: dict[PartName, Part] = {
     "scaling": Part("speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique")),
     "training": Part("speed_training", measure_training, ("task", "environments", "device", "script")),
     "time": Part("time", measure_time, ("task",), "time", "experiments.md"),
+    "memory": Part("speed_memory", measure_memory, ("task", "script"), "speed_memory", "performance.md"),
 }
 
 

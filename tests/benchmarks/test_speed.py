@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from learners import refusal
 from tables import markdown, read_csv
 
 import diffsim
+from diffsim.training.errors import UsageError
 
 
 def test_of_each_state_the_fastest_turn_counts_and_over_states_the_median() -> None:
@@ -21,6 +23,20 @@ def test_of_each_state_the_fastest_turn_counts_and_over_states_the_median() -> N
     state = (torch.zeros(1),) * 3
     found = speed.race({"ours": lambda _: {"forward": next(times)}}, [state] * 4, repeats=2)
     assert found == {"ours": {"forward": 5.0}}
+
+
+def test_memory_is_the_most_that_the_script_ever_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = """import json, pathlib, sys, time
+held = b"x" * (300 << 20)
+del held
+pathlib.Path(sys.argv[1], "args.json").write_text(json.dumps({"num_envs": 64}))
+time.sleep(0.1)"""
+    monkeypatch.setattr(speed, "command", lambda args, name, *flags: [sys.executable, "-c", code, flags[-1]])
+    (row,) = speed.measure_memory(speed.Args(), "ant")
+    assert row["environments"] == 64 and isinstance(found := row["memory (GiB)"], float) and 0.3 < found < 0.4
+    monkeypatch.setattr(speed, "command", lambda *_: [sys.executable, "-c", "raise SystemExit(3)"])
+    with pytest.raises(UsageError, match="SystemExit.* failed"):
+        list(speed.measure_memory(speed.Args(), "ant"))
 
 
 def test_the_front_is_what_no_other_point_beats() -> None:
