@@ -43,7 +43,7 @@ CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 REVISION: str = CASES["paper"]["revision"]
-UNTIMED = ("task", "learner", "return", "kept", "in the reference", "target", "steps to target")
+UNTIMED = ("task", "learner", "return", "kept", "target", "steps to target")
 
 
 class Group(NamedTuple):
@@ -215,13 +215,14 @@ def points(args: Args, cell: Cell) -> list[Row]:
 
 
 def pictured(args: Args, name: str) -> None:
-    """Draw the curves of a group's seeds, of tasks that have any, against seconds only if it is timed."""
+    """Draw the curves of learners whose seeds are all there, of tasks that have any; against seconds if it is timed."""
     group, args = GROUPS[name], replace(args, machine=GROUPS[name].machine)
     rows = [row if group.timed else row | {"seconds": ""} for row in args.read("curves")]
     found = grouped((row for row in rows if int(row["seed"]) <= group.seeds), "learner", "task", "seed")
 
     def of(learner: str, task: str) -> list[Curve]:
-        return [curve(rows) for about, rows in found.items() if about[:2] == (learner, task)]
+        own = [curve(rows) for about, rows in found.items() if about[:2] == (learner, task)]
+        return own if len(own) == group.seeds else []
 
     if there := [task for task in group.tasks if any(of(learner, task) for learner in group.learners)]:
         draw(args.picture(name), group.learners, there, of)

@@ -97,8 +97,8 @@ def test_readme_shows_medians_of_five_seeds_for_every_task() -> None:
     assert claimed == lines["humanoid", "shac"]["training (s)"]
 
 
-def test_a_picture_has_the_curves_of_all_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seconds are of cells and groups that are timed and had their machine alone, seeds are the group's."""
+def test_a_picture_has_the_curves_of_whole_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seconds are of cells and groups that are timed and had their machine alone; all seeds of the group are drawn."""
     args = paper.Args(runs=tmp_path / "runs", output=tmp_path / "results")
     cells = [paper.Cell("h200", learner, "ant", seed) for learner in ("shac", "ppo_4096") for seed in (1, 2)]
     for cell in (*cells, paper.Cell("h200", "sapo", "hopper", 1)):
@@ -118,11 +118,12 @@ def test_a_picture_has_the_curves_of_all_cells(tmp_path: Path, monkeypatch: pyte
     for cell in cells:
         tables.replace_csv(place.csv("curves"), paper.points(args, cell), paper.KEY)
     tables.replace_csv(place.csv("curves"), paper.points(args, paper.Cell("h200", "sapo", "hopper", 1)), paper.KEY)
+    monkeypatch.setitem(paper.GROUPS, "headline", paper.GROUPS["headline"]._replace(seeds=2))
     paper.pictured(args, "headline")
     ((steps, seconds),) = drawn
-    assert [panel.title for panel in (*steps, *seconds)] == ["hopper", "ant"] * 2
-    assert [line.label for line in steps[1].lines if line.width == 2] == ["shac", "ppo_4096"]
-    assert max(seconds[1].lines[1].x) == 199.5 and max(seconds[1].lines[1].y) == 200 * 399
+    assert [panel.title for panel in (*steps, *seconds)] == ["ant"] * 2  # of the hopper there is one seed of two
+    assert [line.label for line in steps[0].lines if line.width == 2] == ["shac", "ppo_4096"]
+    assert max(seconds[0].lines[1].x) == 199.5 and max(seconds[0].lines[1].y) == 200 * 399
     monkeypatch.setitem(paper.GROUPS, "headline", paper.GROUPS["headline"]._replace(timed=False, seeds=1))
     paper.pictured(args, "headline")
     ((steps,),) = drawn[1:]
