@@ -43,7 +43,7 @@ CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 REVISION: str = CASES["paper"]["revision"]
-UNTIMED = ("task", "learner", "return", "kept", "target", "steps to target")
+UNTIMED = ("task", "learner", "return", "in the reference", "target", "steps to target")
 
 
 class Group(NamedTuple):
