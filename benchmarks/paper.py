@@ -3,12 +3,14 @@
     python benchmarks/paper.py --check                             what is missing, and results of no known origin
     python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables
     python benchmarks/paper.py --learners sapo --train-only        on a machine that is lent: bring runs/paper home
+    python benchmarks/paper.py --pace 100                          there, alone: the seconds of an iteration
     python benchmarks/paper.py --machine h200 --evaluate-only --update-results    and evaluate there
     python benchmarks/paper.py --draw-only --update-results        only the tables and pictures
 
 Groups of cells are in cases.json: learners on tasks of a machine, by seeds. All are of the revision there, or of one
 with the same package and script. Writes cells.csv, a line for each, and curves.csv, some POINTS of each training that a
-picture shows; a table has the learners whose seeds are all there.
+picture shows; a table has the learners whose seeds are all there. On a GPU trainings may run side by side (--shared):
+their seconds are then those of pace.csv, of iterations that had the GPU alone.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from runner import Case, Curve, Runner, ScriptFlags, checked, curve, evaluation,
 from tables import ROOT, Row, markdown, read_csv
 
 import diffsim
-from diffsim.training import checkpoint, fail
+from diffsim.training import Natural, checkpoint, fail
 from diffsim.training.evaluation import kept
 
 CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the script: what a training depends on
@@ -57,6 +59,16 @@ class Group(NamedTuple):
 
 
 GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
+
+
+class Pace(NamedTuple):
+    """Of a training that has its machine alone."""
+
+    start: float  # s, what the first iterations take longer than the others
+    iteration: float  # s
+
+    def seconds(self, iterations: float) -> float:
+        return self.start + self.iteration * iterations
 
 
 class Cell(NamedTuple):
@@ -102,6 +114,7 @@ class Args(ScriptFlags):
     check: bool = False  # only say what is missing
     train_only: bool = False  # evaluate nothing
     evaluate_only: bool = False  # train nothing
+    pace: Natural = 0  # train so many iterations alone, and write what each takes to pace.csv
     shared: bool = False  # the machine did other work beside the trainings: their seconds are left out
 
     def alone(self, cell: Cell) -> bool:
@@ -142,14 +155,32 @@ def counts(row: Cells, timed: bool) -> bool:
     return same_code(row["revision"], row["learner"]) and (not timed or bool(row["training (s)"]))
 
 
+def paces(directory: Path) -> dict[tuple[str, str], Pace]:
+    """By learner and task."""
+    rows = (row for row in read_csv(directory / "pace.csv") if same_code(row["revision"], row["learner"]))
+    return {(row["learner"], row["task"]): Pace(*(float(row[f"{x} (s)"]) for x in Pace._fields)) for row in rows}
+
+
+def read_cells(directory: Path) -> list[Cells]:
+    """A machine's cells. One that has no seconds gets those of its pace, if that was measured."""
+    rows, known = read_csv(directory / "cells.csv"), paces(directory)
+    for row in rows:
+        if (pace := known.get((row["learner"], row["task"]))) and not row["training (s)"]:
+            row["training (s)"] = str(pace.seconds(float(row["iterations"])))
+            each = float(row["control steps"]) / float(row["iterations"])
+            for name in [name for name in row if name.startswith("control_steps to") and row[name]]:
+                passed = pace.seconds(float(row[name]) / each)
+                row[name.replace("control_steps", "seconds")] = str(passed)
+    return rows
+
+
 def done(rows: Sequence[Cells], cell: Cell) -> bool:
     own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
     return any(counts(row, cell.timed) for row in own)
 
 
-def train(runner: Runner, cell: Cell) -> bool:
-    """To the end; whether it got there. Code that is not of REVISION is refused, to begin a cell and to go on."""
-    case = cell.case(runner.args.runs)
+def begin(runner: Runner, cell: Cell, case: Case) -> dict[str, object]:
+    """What cell.json says of a training, new or begun. Code that is not of REVISION is refused."""
     path, revision = case.folder / "cell.json", tables.revision()
     if tables.unknown(f"; ; {revision}"):
         fail(f"a cell is of a commit, not of {revision}")
@@ -162,12 +193,34 @@ def train(runner: Runner, cell: Cell) -> bool:
         case.folder.mkdir(parents=True, exist_ok=True)
         trained_on = tables.origin(runner.args.device).removeprefix("# ").partition("; ")[0]
         path.write_text(json.dumps(begun := {"revision": revision, "trained on": trained_on}))
+    return begun
+
+
+def train(runner: Runner, cell: Cell) -> bool:
+    """To the end; whether it got there."""
+    case = cell.case(runner.args.runs)
+    begun = begin(runner, cell, case)
     fresh, start = not (case.folder / "progress.csv").is_file(), time.monotonic()
     if not runner.train(case):
         return False
     if fresh and "--eval-every" not in runner.args.arguments:  # trained in one go, with all evaluations
-        path.write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
+        (case.folder / "cell.json").write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
     return True
+
+
+def measure_pace(args: Args, runner: Runner, cell: Cell) -> Row:
+    """Of the second half of --pace iterations; empty if they are not there."""
+    case = cell.case(args.runs / "pace")
+    if not args.evaluate_only:
+        begin(runner, cell, case)
+        runner.train(case, args.pace)
+    seconds = [float(row["seconds"]) for row in read_csv(case.folder / "progress.csv")]
+    if len(seconds) < 2:
+        return {}
+    half = len(seconds) // 2
+    each = (seconds[-1] - seconds[half - 1]) / (len(seconds) - half)
+    about = dict(zip(KEY[:2], cell[1:3], strict=True)) | json.loads((case.folder / "cell.json").read_text())
+    return about | {"iterations": len(seconds), "start (s)": seconds[-1] - len(seconds) * each, "iteration (s)": each}
 
 
 def measure(args: Args, runner: Runner, cell: Cell) -> Row:
@@ -217,7 +270,12 @@ def points(args: Args, cell: Cell) -> list[Row]:
 def pictured(args: Args, name: str) -> None:
     """Draw the curves of learners whose seeds are all there, of tasks that have any; against seconds if it is timed."""
     group, args = GROUPS[name], replace(args, machine=GROUPS[name].machine)
-    rows = [row if group.timed else row | {"seconds": ""} for row in args.read("curves")]
+    rows, known = args.read("curves"), paces(args.directory)
+    for row in rows:
+        pace = known.get((row["learner"], row["task"]))
+        if pace and not row["seconds"]:
+            row["seconds"] = str(pace.seconds(float(row["iteration"])))
+        row["seconds"] = row["seconds"] if group.timed else ""
     found = grouped((row for row in rows if int(row["seed"]) <= group.seeds), "learner", "task", "seed")
 
     def of(learner: str, task: str) -> list[Curve]:
@@ -250,7 +308,7 @@ def tell(value: float, form: str) -> str:
 def table(args: Args, name: str) -> list[Row]:
     """A line for each learner and task of which all seeds are there, of one revision and one kind of machine."""
     group, lines = GROUPS[name], list[Row]()
-    rows = read_csv(args.directory.parent / group.machine / "cells.csv")
+    rows = read_cells(args.directory.parent / group.machine)
     for task in group.tasks:
         for learner in group.learners:
             wanted = {str(seed) for seed in range(1, group.seeds + 1)}
@@ -271,7 +329,7 @@ def printed(args: Args, name: str) -> str:
 def check(args: Args) -> str:
     """What is missing, a line for each learner and task; then csv files whose origin is unknown, or not in history."""
     lines, missing, count = list[str](), dict[tuple[str, str, str], list[Cell]](), 0
-    known = {name: read_csv(common.RESULTS / name / "cells.csv") for name in {GROUPS[g].machine for g in args.only}}
+    known = {name: read_cells(common.RESULTS / name) for name in {GROUPS[g].machine for g in args.only}}
     for cell in cells(args):
         count += 1
         if not done(known[cell.machine], cell):
@@ -294,7 +352,13 @@ def main(args: Args) -> None:
         return
     runner = Runner(args)
     for cell in () if args.draw_only else cells(args):
-        if cell.machine != args.place or done(args.read("cells"), cell):
+        if cell.machine != args.place:
+            continue
+        if args.pace:
+            if cell.seed == 1 and (row := measure_pace(args, runner, cell)):
+                args.keep("pace", row, KEY[:2])
+            continue
+        if done(read_cells(args.directory), cell):
             continue
         if not args.evaluate_only and not train(runner, cell):
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,25 @@ def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> No
         known[4][column] = before
     known[4]["seed"] = "6"
     assert paper.table(paper.Args(), "headline") == []
+
+
+def test_a_cell_that_shared_its_gpu_has_the_seconds_of_the_pace(
+    known: list[dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pace = {"learner": "sapo", "task": "hopper", "revision": "aaaaaaa", "start (s)": "1.5", "iteration (s)": "0.05"}
+    shared = {"training (s)": "", "seconds to 3000": "", "control steps": "33e6", "control_steps to 3000": "6e6"}
+    known[3] |= shared
+    known[4] |= shared | {"control_steps to 3000": "inf"}
+    files = {"cells.csv": known, "pace.csv": [pace]}
+    monkeypatch.setattr(paper, "read_csv", lambda path: files[path.name] if path.parts[-2] == "h200" else [])
+    rows = paper.read_cells(Path("h200"))
+    assert [float(row["training (s)"]) for row in rows] == pytest.approx([61, 62, 63, 56.5, 56.5])
+    assert [float(row["seconds to 3000"]) for row in rows] == pytest.approx([math.inf, math.inf, 9, 11.5, math.inf])
+    for other in ({"task": "ant"}, {"revision": "bbbbbbb"}):
+        known[3] |= shared
+        pace |= other
+        assert paper.read_cells(Path("h200"))[3]["training (s)"] == ""
+        assert paper.table(paper.Args(), "headline") == []
 
 
 def test_pages_show_the_lines_of_the_cells() -> None:
@@ -128,7 +148,7 @@ def test_a_picture_has_the_curves_of_whole_lines(tmp_path: Path, monkeypatch: py
     monkeypatch.setitem(paper.GROUPS, "headline", paper.GROUPS["headline"]._replace(timed=False, seeds=1))
     paper.pictured(args, "headline")
     ((steps,),) = drawn[1:]
-    assert [len(panel.lines) for panel in steps] == [2, 5]  # a seed and the median of each, and SHAC's published return
+    assert [len(panel.lines) for panel in steps] == [3, 5]  # a seed and the median of each, and published returns
 
 
 def untimed(args: paper.Args) -> paper.Cell:
@@ -197,6 +217,9 @@ def test_cells_are_trained_evaluated_and_kept_once(
 
     assert call("--train-only") == []
     assert {row["learner"]: row["iterations"] for row in call("--evaluate-only")} == {"shac": "2", "sapo": "2"}
+    call("--pace", "2")
+    for pace in tables.read_csv(tmp_path / "results" / "cpu" / "pace.csv"):
+        assert pace["iterations"] == "2" and pace["trained on"] and float(pace["iteration (s)"]) > 0
     folder = tmp_path / "runs" / "cpu" / "shac" / "cartpole__1"
     before = (folder / "checkpoint.pt").stat().st_mtime_ns
     row: dict[str, Any] = next(row for row in call() if row["learner"] == "shac")
