@@ -61,10 +61,7 @@ RETURNS = {name: Returns(**case) for name, case in CASES["returns"].items()}
 LEARNERS: dict[str, str] = CASES["learners"]  # script and flags
 EXPERIMENTS = {name: Experiment(**case) for name, case in CASES["experiments"].items()}
 POINTS = 100  # kept of each run
-WITH_PAGES = "bptt", "mbpo", "ppo_baseline", "sac_baseline"
-PAGES = {name: f"{name.removesuffix('_baseline')}.md" for name in WITH_PAGES}
 PAIRS = {name: (f"pfpn_{name}", f"pfpn_gaussian_{name}") for name in ("ppo", "shac", "sac")}  # by their algorithms
-RESULT_COLUMNS = ("task", "seeds", "return", "each seed", "published", "training (s)", "return passes", "kept")
 
 
 @dataclass
@@ -85,12 +82,11 @@ def collect(args: Args, learner: str, env: str) -> None:
         values = np.array([float(row.get("return") or "nan") for row in rows])
         if np.isnan(values).all():
             continue
-        columns = (*COLUMNS, *(name for name in rows[0] if name.startswith("models_")))
         keep = {*np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).round().astype(int)}
         keep |= {np.nanargmax(values), *np.flatnonzero(values >= returns.target)[:1]}
         keep |= {k for k, row in enumerate(rows) if row.get("eval_return")}
         for row in (rows[k] for k in sorted(keep)):
-            points.append({"seed": seed(folder)} | {c: row.get(c) and f"{float(row[c]):.6g}" or "" for c in columns})
+            points.append({"seed": seed(folder)} | {c: row.get(c) and f"{float(row[c]):.6g}" or "" for c in COLUMNS})
     args.write(f"{learner}_{env}", points)
     timed = {*returns.timed, *([returns.record] if returns.record and learner.startswith("sapo") else [])}
     if found := summary(args.runs / learner, env, sorted(timed)):
@@ -247,9 +243,6 @@ def main(args: Args) -> None:
     if args.experiment:
         return report(args, args.experiment)
     learner = args.algorithm
-    rows = sorted(args.read("learning"), key=lambda row: LEARNT.index(row["task"]))
-    own = [row for row in rows if row["learner"] == learner]
-    args.publish("results", markdown(own, RESULT_COLUMNS), PAGES.get(learner, "experiments.md"))
     there = [env for env in LEARNT if curves(args, learner, env)]
     draw(args.picture(learner), case.learners, there, partial(curves, args))
 

@@ -38,19 +38,6 @@ def write_run(folder: Path, returns: np.ndarray, steps: int, seconds: float, fin
         writer.writerows(rows)
 
 
-def test_curves_keep_the_errors_of_models(tmp_path: Path) -> None:
-    write_run(tmp_path / "mbpo" / "ant__1", np.arange(3.0), 16, 0.5)
-    path = tmp_path / "mbpo" / "ant__1" / "progress.csv"
-    header, *lines = path.read_text().splitlines()
-    text = [header + ",models_mse,losses_actor", *(f"{line},0.{k},7" for k, line in enumerate(lines))]
-    path.write_text("\n".join(text))
-    args = learning.Args(runs=tmp_path, output=tmp_path / "results")
-    learning.collect(args, "mbpo", "ant")
-    rows = args.read("mbpo_ant")
-    assert list(rows[0]) == ["seed", *runner.COLUMNS, "models_mse"]
-    assert [row["models_mse"] for row in rows] == ["0", "0.1", "0.2"]
-
-
 def test_page_compares_steps_and_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SHAC passes 5,000 at iteration 501, PPO at 2,501 of ten times the steps; BPTT never, and has not finished."""
     runs, output = tmp_path / "runs", tmp_path / "results" / "cpu"

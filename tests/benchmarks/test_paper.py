@@ -47,9 +47,8 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
         ("sac_large", 2),
     }
     (cell,) = (cell for cell in some if cell.learner == "sac_large")
-    assert (
-        cell.command == "python sac_baseline.py --env humanoid_mtu --seed 2 --device cuda --large-batch --accuracy fast"
-    )
+    command = "python sac_baseline.py --env humanoid_mtu --seed 2 --device cuda --large-batch --accuracy fast"
+    assert cell.command == f"{command} --iterations 400"
 
 
 def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> None:
