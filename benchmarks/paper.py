@@ -31,7 +31,7 @@ import common
 import numpy as np
 import tables
 import transfer
-from common import check_names, load_case, run
+from common import TASKS, check_names, load_case, run
 from groups import Cells, grouped, middle, numbers
 from learning import CASES, LEARNERS, RETURNS, draw
 from runner import Case, Curve, Runner, ScriptFlags, checked, curve, evaluation, finer, passing
@@ -370,6 +370,9 @@ def main(args: Args) -> None:
         args.publish(name, printed(args, name), GROUPS[name].page, everywhere=True)
         if GROUPS[name].picture:
             pictured(args, name)
+    rows = sorted(args.read("pace"), key=lambda row: TASKS.index(row["task"]))
+    if rows:
+        args.publish("pace", markdown(rows, ("task", "learner", "iteration (s)")), "performance.md", everywhere=True)
 
 
 if __name__ == "__main__":
