@@ -320,10 +320,10 @@ def table(args: Args, name: str) -> list[Row]:
 
 
 def printed(args: Args, name: str) -> str:
-    """A group's table; where it only compares, without tasks that have a single line."""
-    rows, timed = table(args, name), GROUPS[name].timed
+    """A group's table, without tasks that have a single line, which compares nothing."""
+    rows = table(args, name)
     count = Counter(row["task"] for row in rows)
-    return markdown([row for row in rows if timed or count[row["task"]] > 1], None if timed else UNTIMED)
+    return markdown([row for row in rows if count[row["task"]] > 1], None if GROUPS[name].timed else UNTIMED)
 
 
 def check(args: Args) -> str:
