@@ -70,10 +70,10 @@ class CommonFlags:
         return tables.merge_csv(self.csv(name), rows, key, self.device)
 
     def keep(self, name: str, row: Row, key: Sequence[str]) -> None:
-        """Print a row, and merge it, as soon as it is measured."""
+        """Print a row, and write it in place of the one with its key, as soon as it is measured."""
         shown = (f"{k} {tables.digits(v)}" for k, v in row.items() if k == "task" or k not in ABOUT)
         print("  " + ", ".join(shown), flush=True)
-        self.merge(name, [row], key)
+        tables.merge_csv(self.csv(name), [row], key, self.device, whole=True)
 
     def machines(self, name: str) -> dict[str, Path]:
         """The csv files of a name by their machines: all of the tree of results, or the one of --output."""

@@ -90,11 +90,17 @@ def write_csv(path: Path, rows: Sequence[Row], device: str = "cpu", older: Itera
         writer.writerows(rows)
 
 
-def merge_csv(path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu") -> list[dict[str, str]]:
-    """Write the rows' cells over those of rows that agree in all of `key`; returns all rows of the file."""
-    merged: dict[tuple[str, ...], dict[str, str]] = {}
-    for row in [*read_csv(path), *({name: digits(value) for name, value in row.items()} for row in rows)]:
-        merged.setdefault(tuple(row.get(k, "") for k in key), {}).update(row)
+def merge_csv(
+    path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu", whole: bool = False
+) -> list[dict[str, str]]:
+    """Write the rows' cells over those of rows that agree in all of `key`; returns all rows of the file.
+
+    Cells of other columns stay, unless the rows are whole: then what an older benchmark measured beside them goes.
+    """
+    merged = {tuple(row.get(k, "") for k in key): row for row in read_csv(path)}
+    for row in ({name: digits(value) for name, value in row.items()} for row in rows):
+        place = tuple(row.get(k, "") for k in key)
+        merged[place] = row if whole else merged.get(place, {}) | row
     if rows:
         write_over(path, list(merged.values()), device)
     return list(merged.values())
