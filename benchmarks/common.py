@@ -66,14 +66,14 @@ class CommonFlags:
     def write(self, name: str, rows: Sequence[Row]) -> None:
         tables.write_csv(self.csv(name), rows, self.device)
 
-    def merge(self, name: str, rows: Sequence[Row], key: Sequence[str]) -> list[dict[str, str]]:
-        return tables.merge_csv(self.csv(name), rows, key, self.device)
+    def replace(self, name: str, rows: Sequence[Row], key: Sequence[str]) -> list[dict[str, str]]:
+        return tables.replace_csv(self.csv(name), rows, key, self.device)
 
     def keep(self, name: str, row: Row, key: Sequence[str]) -> None:
         """Print a row, and write it in place of the one with its key, as soon as it is measured."""
         shown = (f"{k} {tables.digits(v)}" for k, v in row.items() if k == "task" or k not in ABOUT)
         print("  " + ", ".join(shown), flush=True)
-        tables.merge_csv(self.csv(name), [row], key, self.device, whole=True)
+        self.replace(name, [row], key)
 
     def machines(self, name: str) -> dict[str, Path]:
         """The csv files of a name by their machines: all of the tree of results, or the one of --output."""

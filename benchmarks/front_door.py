@@ -87,7 +87,7 @@ def measure(torch: str, folder: Path) -> list[Row]:
 def main(argv: Sequence[str] | None = None) -> None:
     args = common.parse(Args, __doc__, argv)
     with tempfile.TemporaryDirectory() as folder:
-        args.merge("front_door", measure(args.torch, Path(folder)), ("part",))
+        args.replace("front_door", measure(args.torch, Path(folder)), ("part",))
 
 
 if __name__ == "__main__":

@@ -394,7 +394,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         print("\n".join(commands(args)))
         return
     if args.temperatures:
-        args.merge("gps_temperatures", [row for env in args.env for row in temperatures(env)], ("env", "spread"))
+        args.replace("gps_temperatures", [row for env in args.env for row in temperatures(env)], ("env", "spread"))
         return
     if not args.draw_only:
         runner = Runner(args, args.jobs)

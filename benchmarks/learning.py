@@ -91,7 +91,7 @@ def collect(args: Args, learner: str, env: str) -> None:
     timed = {*returns.timed, *([returns.record] if returns.record and learner.startswith("sapo") else [])}
     if found := summary(args.runs / learner, env, sorted(timed)):
         row = {"learner": learner, "task": env} | found | {"published": returns.published.get(learner, "")}
-        args.merge("learning", [row], ("learner", "task"))
+        args.replace("learning", [row], ("learner", "task"))
 
 
 def curves(args: Args, learner: str, env: str) -> list[Curve]:

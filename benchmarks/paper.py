@@ -365,7 +365,7 @@ def main(args: Args) -> None:
         if not args.train_only and (row := measure(args, runner, cell)):
             args.keep("cells", row, KEY)
             if any(group.picture for group in cell.groups):
-                tables.replace_csv(args.csv("curves"), points(args, cell), KEY, args.device)
+                args.replace("curves", points(args, cell), KEY)
     for name in args.only:
         args.publish(name, printed(args, name), GROUPS[name].page, everywhere=True)
         if GROUPS[name].picture:

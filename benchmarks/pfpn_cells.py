@@ -86,7 +86,7 @@ def main(args: Args) -> None:
         runner = Runner(args)
         for case in cases(args):
             runner.train(case)
-    rows = args.merge("pfpn_cells", list(measured(args)), KEY)
+    rows = args.replace("pfpn_cells", list(measured(args)), KEY)
     for name in args.only:
         args.publish(name, markdown(table([row for row in rows if row["figure"] == name])), "pfpn.md")
 

@@ -19,6 +19,7 @@ from importlib import metadata
 from pathlib import Path
 
 import torch
+from groups import grouped
 
 from diffsim.sim.launcher import available_cores
 
@@ -90,26 +91,17 @@ def write_csv(path: Path, rows: Sequence[Row], device: str = "cpu", older: Itera
         writer.writerows(rows)
 
 
-def merge_csv(
-    path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu", whole: bool = False
-) -> list[dict[str, str]]:
-    """Write the rows' cells over those of rows that agree in all of `key`; returns all rows of the file.
+def replace_csv(path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu") -> list[dict[str, str]]:
+    """Write rows in place of all that agree with one of them in all of `key`; returns all rows of the file.
 
-    Cells of other columns stay, unless the rows are whole: then what an older benchmark measured beside them goes.
+    Whole rows go, so that no cell which an older benchmark measured stays beside new ones.
     """
-    merged = {tuple(row.get(k, "") for k in key): row for row in read_csv(path)}
-    for row in ({name: digits(value) for name, value in row.items()} for row in rows):
-        place = tuple(row.get(k, "") for k in key)
-        merged[place] = row if whole else merged.get(place, {}) | row
+    new = [{name: digits(value) for name, value in row.items()} for row in rows]
+    groups = grouped(read_csv(path), *key) | grouped(new, *key)
+    merged = [row for group in groups.values() for row in group]
     if rows:
-        write_over(path, list(merged.values()), device)
-    return list(merged.values())
-
-
-def replace_csv(path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu") -> None:
-    """Write the rows in place of all that agree with one of them in all of `key`."""
-    new = {tuple(str(row[k]) for k in key) for row in rows}
-    write_over(path, [*(row for row in read_csv(path) if tuple(row[k] for k in key) not in new), *rows], device)
+        write_over(path, merged, device)
+    return merged
 
 
 def write_over(path: Path, rows: Sequence[Row], device: str) -> None:

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 import joystick  # noqa: E402
 import transfer  # noqa: E402
 from common import Case, load_case  # noqa: E402
-from tables import digits, merge_csv  # noqa: E402
+from tables import digits, replace_csv  # noqa: E402
 
 CARDS, EPISODES = Path(str(POLICIES)) / "cards.csv", 64
 
@@ -55,7 +55,7 @@ def main(policies: Positional[tuple[Path, ...]] = ()) -> None:
         case = load_case(path, EPISODES, "cpu")
         row = {"policy": path.stem, "sha256": fingerprint(path)} | here(case) | in_mujoco(case)
         print(", ".join(f"{name} {digits(value)}" for name, value in row.items()), flush=True)
-        merge_csv(CARDS, [row], ("policy",))
+        replace_csv(CARDS, [row], ("policy",))
 
 
 if __name__ == "__main__":

@@ -22,25 +22,20 @@ def test_rows_replace_those_of_their_key_and_origins_those_of_their_command(
     ):
         monkeypatch.setattr(sys, "argv", ["speed.py", *flags])
         tables.origin.cache_clear()
-        tables.merge_csv(path, rows, ("task",))
+        tables.replace_csv(path, rows, ("task",))
     tables.origin.cache_clear()
     assert tables.read_csv(path) == [
-        {"task": "ant", "us": "3", "error": "0.5"},
+        {"task": "ant", "us": "3", "error": ""},  # of which the second command measures none
         {"task": "hopper", "us": "2", "error": "0.25"},
-    ]
-    tables.merge_csv(path, [{"task": "ant", "us": 4.0}], ("task",), whole=True)
-    assert [(row["task"], row["us"], row["error"]) for row in tables.read_csv(path)] == [
-        ("ant", "4", ""),
-        ("hopper", "2", "0.25"),
     ]
     first, second = tables.origins(path)
     assert first.endswith("speed.py --first\n") and second.endswith("speed.py --second 'one two'\n")
     assert first.startswith("# ") and "; python 3." in first and "torch " in first and "; revision " in first
     tables.replace_csv(path, [{"task": "ant", "us": "7"}, {"task": "ant", "us": "8"}], ("task",))
     assert [(row["task"], row["us"], row["error"]) for row in tables.read_csv(path)] == [
-        ("hopper", "2", "0.25"),
         ("ant", "7", ""),
         ("ant", "8", ""),
+        ("hopper", "2", "0.25"),
     ]
     assert tables.origins(path) == [first, second]
 
