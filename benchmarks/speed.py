@@ -229,30 +229,37 @@ def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
     """A window of control steps differentiably, and with its backward pass."""
     graphs = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"
     settings = dict.fromkeys([(n, 32) for n in args.scaling] + [(64, h) for h in args.horizons])
-    default, cuda = diffsim.TASKS[name].integration("default"), args.device != "cpu"
-    for (num_envs, horizon), technique in product(settings, graphs if cuda else THREADS):
-        if cuda:
-            gc.collect()  # the graphs of the setting before
-            torch.cuda.empty_cache()
-            torch.cuda.synchronize()
-            free = torch.cuda.mem_get_info()[0]
-        env = diffsim.make(name, num_envs=num_envs, seed=0, device=args.device)
-        scene, steps = env.scene, num_envs * horizon
-        numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
-        if 4 * numbers * steps * default.substeps > MAX_MEMORY:
-            continue
-        options = dict[str, Any](device=args.device, threads=THREADS.get(technique))
-        options["division"] = divide(scene) if "one thread" in technique else None
-        sim = Simulator(scene, num_envs, default, horizon=horizon, **options)
-        actions = (torch.rand(horizon, num_envs, sim.nu, device=env.device) * 2 - 1).requires_grad_()
-        calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]
-        captured = [graph.capture(call, env.device) if "graph" in technique else call for call in calls]
-        one_way, both = (min(timed(call, env.device, warmup=3, calls=4)) for call in captured)
-        passes = {"forward": one_way, "backward": both - one_way}
-        row = {"task": name, "environments": num_envs, "horizon": horizon, "technique": technique}
-        row |= {f"{way} (us/substep of all)": 1e6 * s / horizon / default.substeps for way, s in passes.items()}
-        row["differentiated control steps/s"] = steps / both
-        yield row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if cuda else ""}
+    for (num_envs, horizon), technique in product(settings, graphs if args.device != "cpu" else THREADS):
+        row = scaling_row(args.device, name, num_envs, horizon, technique)
+        if row is not None:
+            yield row
+
+
+def scaling_row(device: str, name: TaskName, num_envs: int, horizon: int, technique: str) -> Row | None:
+    """None if it needs too much memory. Its locals end with it, so that the next row's memory is without this one's."""
+    cuda = device != "cpu"
+    if cuda:
+        gc.collect()  # the graphs of the row before
+        torch.cuda.empty_cache()
+        torch.cuda.synchronize()
+        free = torch.cuda.mem_get_info()[0]
+    default, env = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs, device, seed=0)
+    scene, steps = env.scene, num_envs * horizon
+    numbers = scene.nq + 2 * scene.nv + 7 * (scene.nlink - 1) + 21  # of a checkpoint, see kernels/model.py
+    if 4 * numbers * steps * default.substeps > MAX_MEMORY:
+        return None
+    options = dict[str, Any](device=device, threads=THREADS.get(technique))
+    options["division"] = divide(scene) if "one thread" in technique else None
+    sim = Simulator(scene, num_envs, default, horizon=horizon, **options)
+    actions = (torch.rand(horizon, num_envs, sim.nu, device=env.device) * 2 - 1).requires_grad_()
+    calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]
+    captured = [graph.capture(call, env.device) if "graph" in technique else call for call in calls]
+    one_way, both = (min(timed(call, env.device, warmup=3, calls=4)) for call in captured)
+    passes = {"forward": one_way, "backward": both - one_way}
+    row: dict[str, object] = {"task": name, "environments": num_envs, "horizon": horizon, "technique": technique}
+    row |= {f"{way} (us/substep of all)": 1e6 * s / horizon / default.substeps for way, s in passes.items()}
+    row["differentiated control steps/s"] = steps / both
+    return row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if cuda else ""}
 
 
 def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
