@@ -133,17 +133,21 @@ def train(args: Args, name: Name) -> Iterator[Row]:
         training.log(ppo.roll_out() | update() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
         if training.seconds >= args.seconds:
             training.last = settings.iterations = iteration
-    yield {"task": name, "seed": args.seed, **read_csv(training.directory / "progress.csv")[-1]}
+    last = read_csv(training.directory / "progress.csv")[-1]
+    shown = {"control steps": "control_steps", "training (s)": "seconds", "control steps/s": "charts_SPS"}
+    shown |= {"return": "return", "lost": "sim_lost"}
+    row: Row = {"task": name, "seed": args.seed, "iteration": int(last["iteration"])}
+    yield {**row, **{column: last[metric] and float(last[metric]) for column, metric in shown.items()}}
 
 
 PARTS = {
     "speed": Part("peer_speed", measure_speed, ("task", "environments"), "peer_speed", "performance.md"),
-    "train": Part("peer_train", train, ("task", "seed")),
+    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md"),
 }
 
 
 def main(args: Args) -> None:
-    if not util.find_spec("mujoco_warp"):
+    if not (args.draw_only or util.find_spec("mujoco_warp")):
         fail("mujoco_warp is missing: pip install -e '.[peer]'")
     for part in args.parts:
         measured(args, PARTS[part])
