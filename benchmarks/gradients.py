@@ -4,8 +4,10 @@
 
 A policy acts with noise from states that it visits. The reward of a window is differentiated with respect to a shift
 of all of the window's actions, in each environment: how long these gradients are, and how well their mean agrees with
-differences of the mean reward, which see jumps that no derivative sees. The grounds are the paper's springs and
-MuJoCo's own contact, whose gradients count that it begins with a jump, or not. Writes gradients.csv and gradients.png.
+differences of the mean reward, which see jumps that no derivative sees; also after each gradient was clipped to the
+length that one in a hundred exceeds. Differences of two sizes must agree, or the mean reward has no slope to compare
+with. The grounds are the paper's springs and MuJoCo's own contact, whose gradients count that it begins with a jump, or
+not. Writes gradients.csv and gradients.png.
 """
 
 from __future__ import annotations
@@ -33,8 +35,9 @@ GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "mujoco --no-touchdown": {"contact": "mujoco", "touchdown": False},
 }
 COLUMNS = {"norm": ("norm, median", "y"), "norm 95 %": ("norm, 95 %", "y"), "cosine": ("cosine", "")}
-SHOWN = "cosine, 4 steps", "cosine, 8 steps", "cosine, 16 steps", "norm 95 %, 16 steps"
+SHOWN = *(f"{name}, {k} steps" for name in ("cosine", "clipped") for k in (4, 8, 16)), "norm 95 %, 16 steps"
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
+AGREE = 0.9  # least cosine of differences by SHIFT and by half of it, for which the page shows others
 KEY = ("task", "learner", "horizon", "ground")
 
 
@@ -69,6 +72,12 @@ def differences(env: DiffEnv, policy: torch.nn.Module, horizon: int, noise: Tens
     return torch.stack(slopes)
 
 
+def clip(each: Tensor) -> Tensor:
+    """Gradients (N, nu), none longer than the length that one in a hundred exceeds."""
+    norms = each.norm(dim=1, keepdim=True)
+    return each * (norms.quantile(0.99) / norms).clamp(max=1.0)
+
+
 def measure(args: Args, path: Path) -> Iterator[Row]:
     """Rows of one policy."""
     case = common.load_case(path, 1, "cpu")
@@ -86,21 +95,24 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         for horizon in args.horizons:
             noise = NOISE * torch.randn(horizon, n, env.scene.nu, generator=drawn)
             env.set_state(*start)
-            slopes = differences(env, policy, horizon, noise, SHIFT)
+            slopes, finer = (differences(env, policy, horizon, noise, size) for size in (SHIFT, SHIFT / 2))
             shift = torch.zeros(n, env.scene.nu, requires_grad=True)
             (each,) = torch.autograd.grad(window(env, policy, horizon, shift, noise).sum(), shift)
             norms = each.norm(dim=1)
             row = {"task": task, "learner": case.saved.script, "horizon": horizon, "ground": ground}
-            row |= {"norm": float(norms.median()), "norm 95 %": float(norms.quantile(0.95))}
-            row["cosine"] = float(torch.cosine_similarity(each.mean(0), slopes, dim=0))
+            row |= {"norm": float(norms.median()), "norm 95 %": float(norms.quantile(0.95)), "most": float(norms.max())}
+            vectors = {"cosine": each.mean(0), "clipped": clip(each).mean(0), "differences": finer}
+            row |= {name: float(torch.cosine_similarity(x, slopes, dim=0)) for name, x in vectors.items()}
             yield row | {"environments": n}
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task and ground."""
+    """A line for each task and ground; no cosine with differences that do not agree."""
     lines = list[Row]()
     for (task, ground), own in grouped(rows, "task", "ground").items():
-        cells = {f"{name}, {row['horizon']} steps": row[name] for row in own for name in COLUMNS}
+        agree = [row for row in own if float(row["differences"]) > AGREE]
+        cells = {f"{name}, {row['horizon']} steps": row[name] for row in agree for name in ("cosine", "clipped")}
+        cells |= {f"norm 95 %, {row['horizon']} steps": row["norm 95 %"] for row in own}
         lines.append({"task": task, "ground": ground} | {name: cells.get(name, "") for name in SHOWN})
     return lines
 
