@@ -39,7 +39,7 @@ def test_a_clipped_gradient_keeps_its_direction() -> None:
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = f"--num-envs 16 --horizons 8 --warmup 40 --output {tmp_path}".split()
+    flags = f"--num-envs 16 --horizons 8 --warmup 990 --output {tmp_path}".split()
     gradients.main(parse(gradients.Args, None, [str(POLICIES / "hopper.pt"), *flags]))
     rows = read_csv(tmp_path / "gradients.csv")
     assert [row["ground"] for row in rows] == [*gradients.GROUNDS]
