@@ -37,7 +37,6 @@ from torch import Tensor
 import diffsim
 import gps
 from diffsim.planning import REAL, LinearGaussian, nearest_feedback
-from diffsim.planning.samples import log_mixture, log_weights
 from diffsim.training import checkpoint, command, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import make_env
 
@@ -259,9 +258,9 @@ def weights(search: gps.Search) -> list[Row]:
     """
     S, policy, rows = search.S.samples, search.network, list[Row]()
     log_pi, guides = policy.log_prob(policy.theta, S.obs, S.u), search.S.initial
-    log_w, guided = log_weights(log_pi, S.log_mixture), S.source < guides
+    log_w, guided = gps.log_weights(log_pi, S.log_mixture), S.source < guides
     own, weight = (S.source == search.S.best).nonzero().flatten()[-search.args.samples :], log_w.softmax(0)
-    gap = log_pi.cumsum(1) - log_mixture(S.log_q[:, :guides])
+    gap = log_pi.cumsum(1) - gps.log_mixture(S.log_q[:, :guides])
     away = ((S.u - policy.mean(policy.theta, S.obs)) / policy.sigma).square().mean(-1)
     wide = width(search.guides[0], policy.sigma)
     for t in (t for t in WEIGHED if t <= search.args.horizon):

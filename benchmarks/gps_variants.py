@@ -17,7 +17,6 @@ from tables import ROOT
 from torch import Tensor
 
 from diffsim.planning.lbfgs import maximise
-from diffsim.planning.samples import Samples, log_weights, phi, sparse
 from diffsim.training import command, evaluate_checkpoint, parse
 
 sys.path.append(str(ROOT))
@@ -29,7 +28,7 @@ LEAST = 5.0  # effective samples: half of what the policy draws
 class NonGuided(gps.Search):
     """S begins without the guides; they only pretrain the policy."""
 
-    def build(self, guiding: Samples) -> None:
+    def build(self, guiding: gps.Samples) -> None:
         pass
 
 
@@ -42,7 +41,7 @@ class Restart(NonGuided):
         x = torch.cat([guide.x[:-1] for guide in self.guides])
         return x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
 
-    def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
+    def optimise(self, S: gps.Samples) -> tuple[Tensor, dict[str, float]]:
         self.student, metrics = super().optimise(S)
         return self.student, metrics
 
@@ -54,7 +53,7 @@ class Restart(NonGuided):
 class SingleExample(NonGuided):
     """Pretrained on the plans alone, without samples about them."""
 
-    def pretrain(self, guiding: Samples) -> Tensor:
+    def pretrain(self, guiding: gps.Samples) -> Tensor:
         obs = self.system.observe(torch.stack([guide.x[:-1] for guide in self.guides]))
         return super().pretrain(guiding._replace(obs=obs, u=torch.stack([guide.u for guide in self.guides])))
 
@@ -76,7 +75,7 @@ class PolicyGradient(NonGuided):
 class DAgger(NonGuided):
     """Ross et al. 2011: the controller's actions at the states that the policy visits join the data."""
 
-    def build(self, guiding: Samples) -> None:
+    def build(self, guiding: gps.Samples) -> None:
         self.lessons = guiding.obs, guiding.u
 
     def iterate(self, iteration: int) -> dict[str, float]:
@@ -90,10 +89,10 @@ class DAgger(NonGuided):
 class OneStart(gps.Search):
     """Line 7 from theta* alone, not from theta* fitted to the best sample, too."""
 
-    def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
+    def optimise(self, S: gps.Samples) -> tuple[Tensor, dict[str, float]]:
         policy, objective = self.network, self.objective(S.log_mixture, S.reward / self.scale)
         iterations = self.args.lbfgs_iterations
-        theta, value = maximise(lambda theta: sparse(objective, policy, theta, S), policy.theta, iterations)
+        theta, value = maximise(lambda theta: gps.sparse(objective, policy, theta, S), policy.theta, iterations)
         return theta, {"gps/phi": value}
 
 
@@ -102,9 +101,9 @@ class Effective(gps.Search):
 
     def objective(self, mixture: Tensor, reward: Tensor) -> Callable[[Tensor], Tensor]:
         def value(log_pi: Tensor) -> Tensor:
-            effective = 1 / log_weights(log_pi, mixture).softmax(0).square().sum(0)
+            effective = 1 / gps.log_weights(log_pi, mixture).softmax(0).square().sum(0)
             missing = (LEAST - effective).clamp(min=0)
-            return phi(log_pi, mixture, reward, 0.0) - missing.square().sum()
+            return gps.phi(log_pi, mixture, reward, 0.0) - missing.square().sum()
 
         return value
 

@@ -21,12 +21,12 @@ import diffsim
 import gps
 from diffsim.planning import LinearGaussian, gaussian_log_prob, load_demonstration, save_demonstration
 from diffsim.planning.lbfgs import maximise
-from diffsim.planning.samples import log_mixture, log_weights, phi, sparse
 from diffsim.planning.terrains import named_terrains
 from diffsim.training import evaluate, load_policy, make_policy_env
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from diffsim.view import render
+from gps import log_mixture, log_weights, phi, sparse
 
 SMALL = (
     "--env cartpole --horizon 30 --restarts 3 --screening 4 --ilqr-iterations 20 --pretraining 40 --hidden 8 "

@@ -10,7 +10,7 @@ import torch
 from learners import assert_same, run
 
 import diffsim
-from diffsim.planning.samples import log_weights
+import gps
 
 TINY = (
     "--env cartpole --horizon 8 --restarts 3 --screening 4 --ilqr-iterations 3 --pretraining 5 --hidden 8 "
@@ -42,7 +42,7 @@ def test_a_bound_on_effective_samples(tmp_path: Path) -> None:
         search.prepare(lambda _: None, tmp_path / f"{case}.npz")
         S = search.S.samples
         log_pi = search.network.log_prob(search.optimise(S)[0], S.obs, S.u)
-        least.append((1 / log_weights(log_pi, S.log_mixture).softmax(0).square().sum(0)).min().item())
+        least.append((1 / gps.log_weights(log_pi, S.log_mixture).softmax(0).square().sum(0)).min().item())
     assert least[0] < 4.0 < 4.9 < least[1]
 
 
