@@ -43,6 +43,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
     T, U, vec2, vec3, vec4, vec6, mat3, Model, Law = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
+    Load = t.Load
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
     @wp.func
@@ -148,23 +149,20 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         B: vec6,
         height: T,
         stuck: T,
-        Ia: mat3,
-        Ib: mat3,
-        Id: mat3,
-        F: vec6,
+        load: Load,
     ):
-        """Inertia blocks and bias force of link k with its contacts, linear about A; stuck as of cone."""
+        """The load of link k with its contacts, linear about A; stuck as of cone."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             centre, distance, on = place(m, c, R, x, height)
             if block.any_of(on):
                 p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
                 f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, stuck)
                 PH = wp.skew(p) * H
-                Ia = Ia - PH * wp.skew(p)
-                Ib = Ib + PH
-                Id = Id + H
-                F = F - force_at(p, f + H * point_velocity(A, p))
-        return Ia, Ib, Id, F
+                load.a = load.a - PH * wp.skew(p)
+                load.b = load.b + PH
+                load.d = load.d + H
+                load.f = load.f - force_at(p, f + H * point_velocity(A, p))
+        return load
 
     @wp.func
     def contacts_along(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, height: T, step: vec6, part: T):

@@ -16,7 +16,7 @@ from diffsim.kernels.spec import KernelSpec
 def lane_sums(spec: KernelSpec) -> SimpleNamespace:
     t, threads = types(spec), spec.threads_per_env
     T, vec6, mat3 = t.T, t.vec6, t.mat3
-    mat3s, vec6s = wp.array(dtype=mat3), wp.array(dtype=vec6)
+    loads_of, vec6s = wp.array(dtype=t.Load), wp.array(dtype=vec6)
     neighbour = f"""
 #if defined(__CUDA_ARCH__)
     const unsigned first = (threadIdx.x & 31u) & ~({threads}u - 1u);
@@ -53,13 +53,13 @@ def lane_sums(spec: KernelSpec) -> SimpleNamespace:
             return value
 
         @wp.func
-        def add_inertias(Ia: mat3s, Ib: mat3s, Id: mat3s, P: vec6s):
+        def add_loads(loads: loads_of):
             begin = int(inertial)
             for i in range(begin, last + 1):
-                Ia[i] = add_mat3(Ia[i])
-                Ib[i] = add_mat3(Ib[i])
-                Id[i] = add_mat3(Id[i])
-                P[i] = add_vec6(P[i])
+                loads[i].a = add_mat3(loads[i].a)
+                loads[i].b = add_mat3(loads[i].b)
+                loads[i].d = add_mat3(loads[i].d)
+                loads[i].f = add_vec6(loads[i].f)
 
         @wp.func
         def add_vectors(a: vec6s):
@@ -67,7 +67,7 @@ def lane_sums(spec: KernelSpec) -> SimpleNamespace:
             for i in range(begin, last + 1):
                 a[i] = add_vec6(a[i])
 
-        return by_name(add, add_inertias, add_vectors)
+        return by_name(add, add_loads, add_vectors)
 
     powers = [2**k for k in range(threads.bit_length() - 1)]
     return SimpleNamespace(

@@ -25,6 +25,7 @@ from diffsim.kernels.wide import blocks
 def external_force(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
     T, vec3, vec6, Model, block = t.T, t.vec3, t.vec6, t.Model, blocks(spec)
+    loads_of = wp.array(dtype=t.Load)
     mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (t.mat3, vec3, vec6))
     join, force_at, point_velocity, read = sp.join, sp.force_at, sp.point_velocity, block.read
     FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base feels no force
@@ -38,12 +39,12 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         return f, force_at(p, f) + join(torque, vec3())
 
     @wp.func
-    def add_forces(m: Model, at: int, n: int, forces: t.array2, e: int, R: mat3s, x: vec3s, P: vec6s):
-        """Adds the forces to the links' bias forces P."""
+    def add_forces(m: Model, at: int, n: int, forces: t.array2, e: int, R: mat3s, x: vec3s, loads: loads_of):
+        """Adds the forces to the links' bias forces."""
         for i in range(FIRST, n):
             for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
                 f, wrench = external(forces, e, m.body[entry], x[i] + R[i] * vec3(m.body_com[entry]))
-                P[i] = P[i] - wrench
+                loads[i].f = loads[i].f - wrench
 
     @wp.func
     def add_forces_adjoint(

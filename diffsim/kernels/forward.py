@@ -50,6 +50,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
 
+    Load, loads_of = t.Load, wp.array(dtype=t.Load)
     mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6))
 
     @wp.func
@@ -78,9 +79,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         guess: t.array,
         step: t.array,
         twist: vec6s,
-        Ia: mat3s,
-        Ib: mat3s,
-        Id: mat3s,
+        loads: loads_of,
     ):
         """The part of Newton's step that MuJoCo's cost is least after, or all of it where that is near.
 
@@ -92,7 +91,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             k = at + i
             a = wp.spatial_top(twist[i])
             l = wp.spatial_bottom(twist[i])
-            inertia = inertia + wp.dot(a, Ia[i] * a + T(2.0) * (Ib[i] * l)) + wp.dot(l, Id[i] * l)
+            inertia = inertia + wp.dot(a, loads[i].a * a + T(2.0) * (loads[i].b * l)) + wp.dot(l, loads[i].d * l)
             if i > 0:
                 inertia = inertia + T(m.carried[k]) * T(m.armature[k]) * step[i] * step[i]
         if wp.static(THREADS_PER_ENV > 1):
@@ -176,11 +175,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         V = wp.zeros(shape=SLOTS, dtype=vec6)
         C = wp.zeros(shape=SLOTS, dtype=vec6)
         A = wp.zeros(shape=SLOTS, dtype=vec6)
-        P = wp.zeros(shape=SLOTS, dtype=vec6)
         U = wp.zeros(shape=SLOTS, dtype=vec6)
-        Ia = wp.zeros(shape=SLOTS, dtype=mat3)
-        Ib = wp.zeros(shape=SLOTS, dtype=mat3)
-        Id = wp.zeros(shape=SLOTS, dtype=mat3)
+        loads = wp.zeros(shape=SLOTS, dtype=Load)
         dinv = wp.zeros(shape=SLOTS, dtype=T)
         u = wp.zeros(shape=SLOTS, dtype=T)
         q = wp.zeros(shape=SLOTS, dtype=T)
@@ -214,10 +210,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             w = vec3(read(qvel, e, 3), read(qvel, e, 4), read(qvel, e, 5))
 
         if wp.static(CONSTRAINED):
-            Ia0 = wp.zeros(shape=SLOTS, dtype=mat3)  # inertias and bias forces without constraints
-            Ib0 = wp.zeros(shape=SLOTS, dtype=mat3)
-            Id0 = wp.zeros(shape=SLOTS, dtype=mat3)
-            P0 = wp.zeros(shape=SLOTS, dtype=vec6)
+            free_loads = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
             B = wp.zeros(shape=SLOTS, dtype=vec6)  # the twist if the rates were the accelerations, see constraint.py
             guess = wp.zeros(shape=SLOTS, dtype=T)  # acceleration of the last pass, and that of the base
             if wp.static(SEARCH):
@@ -260,20 +253,13 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         for k in range(3):
                             store(ck_q, row, adr + 1 + k, e, turn[b][k])
             for i in range(1, INERT + 1):
-                Ia[i] = mat3()
-                Ib[i] = mat3()
-                Id[i] = mat3()
-                P[i] = vec6()
+                loads[i] = Load()
             for i in range(FIRST, n):
-                ia, ib, id, f = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place)
-                Ia[i] = ia
-                Ib[i] = ib
-                Id[i] = id
-                P[i] = f
+                loads[i] = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place)
             if wp.static(FORCED):
-                force.add_forces(m, at, n, forces, e, R, x, P)
+                force.add_forces(m, at, n, forces, e, R, x, loads)
             if wp.static(MUSCLE):
-                muscle.add_muscles(m, lane, pull, tension, lengths, rates, R, x, V, P)
+                muscle.add_muscles(m, lane, pull, tension, lengths, rates, R, x, V, loads)
             # 2. inward: articulated inertias. With constraints each pass is a step of Newton's method, the first as if
             # all of them stuck. MuJoCo's implicit damping is one pass more: (M + h b) change = -h b a.
             begin = 0
@@ -289,10 +275,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     A[0] = A[0] - join(vec3(), wp.cross(R[0] * w, v))
                 B[0] = vec6()
                 for i in range(n):
-                    Ia0[i] = Ia[i]
-                    Ib0[i] = Ib[i]
-                    Id0[i] = Id[i]
-                    P0[i] = P[i]
+                    free_loads[i] = loads[i]
                     guess[i] = T(0.0)
                     if i > 0:
                         A[i] = A[m.parent[at + i]] + C[i]
@@ -303,38 +286,32 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     stuck = T(wp.where(solve == 0, 1, 0))
                     factor_row = SOLVES * row + (SOLVES - 1) * newton
                     for i in range(n):
-                        Ia[i] = Ia0[i]
-                        Ib[i] = Ib0[i]
-                        Id[i] = Id0[i]
-                        P[i] = P0[i]
+                        loads[i] = free_loads[i]
                         if newton == 0:
-                            P[i] = vec6()
+                            loads[i].f = vec6()
                             C[i] = vec6()
                     if wp.static(CONTACT):
                         if newton == 1:
                             for i in range(FIRST, n):
                                 k = at + i
-                                ia, ib, id, f = constraint.add_contacts(
-                                    m, law, k, R[i], x[i], V[i], A[i], B[i], place, stuck, Ia[i], Ib[i], Id[i], P[i]
+                                loads[i] = constraint.add_contacts(
+                                    m, law, k, R[i], x[i], V[i], A[i], B[i], place, stuck, loads[i]
                                 )
-                                Ia[i] = ia
-                                Ib[i] = ib
-                                Id[i] = id
-                                P[i] = f
                 if wp.static(SHARERS > 1):
-                    sums.sharers.add_inertias(Ia, Ib, Id, P)
+                    sums.sharers.add_loads(loads)
                 for j in range(1, slots + 1):
                     i = slots - j
                     if wp.static(THREADS_PER_ENV > SHARERS):
                         if i == TRUNK:
-                            sums.limbs.add_inertias(Ia, Ib, Id, P)
+                            sums.limbs.add_loads(loads)
                     if i > 0 and i < n:
                         k = at + i
                         p = m.parent[k]
                         sa = wp.spatial_top(S[i])
                         sl = wp.spatial_bottom(S[i])
-                        Ua = Ia[i] * sa + Ib[i] * sl
-                        Ul = sa * Ib[i] + Id[i] * sl
+                        own = loads[i]
+                        Ua = own.a * sa + own.b * sl
+                        Ul = sa * own.b + own.d * sl
                         Ui = join(Ua, Ul)
                         d = wp.dot(S[i], Ui) + T(m.armature[k])
                         qi = q[i]
@@ -356,21 +333,21 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                                 d = d + held[1]
                             else:
                                 d = d + damper
-                            ui = ui - wp.dot(S[i], P[i])
+                            ui = ui - wp.dot(S[i], own.f)
                         else:
                             ui = joint.actuation(m, k, motor[i], qi, qd[i])
-                            ui = ui + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], P[i])
+                            ui = ui + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], own.f)
                         di = T(1.0) / d
                         if wp.static(FLOATING) or p > 0:
                             va = Ua * di
                             vl = Ul * di
                             ca = wp.spatial_top(C[i])
                             cl = wp.spatial_bottom(C[i])
-                            bias = join(Ia[i] * ca + Ib[i] * cl, ca * Ib[i] + Id[i] * cl)
-                            P[p] = P[p] + P[i] + bias + join(va, vl) * (ui - wp.dot(Ui, C[i]))
-                            Ia[p] = Ia[p] + Ia[i] - wp.outer(Ua, va)
-                            Ib[p] = Ib[p] + Ib[i] - wp.outer(Ua, vl)
-                            Id[p] = Id[p] + Id[i] - wp.outer(Ul, vl)
+                            bias = join(own.a * ca + own.b * cl, ca * own.b + own.d * cl)
+                            loads[p].f = loads[p].f + own.f + bias + join(va, vl) * (ui - wp.dot(Ui, C[i]))
+                            loads[p].a = loads[p].a + own.a - wp.outer(Ua, va)
+                            loads[p].b = loads[p].b + own.b - wp.outer(Ua, vl)
+                            loads[p].d = loads[p].d + own.d - wp.outer(Ul, vl)
                         U[i] = Ui
                         dinv[i] = di
                         u[i] = ui
@@ -384,7 +361,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(DAMPED):
                     A[0] = A[0] * T(newton)
                 if wp.static(FLOATING):
-                    L, a0 = base.factor_base(Ia[0], Ib[0], Id[0], -P[0])
+                    L, a0 = base.factor_base(loads[0].a, loads[0].b, loads[0].d, -loads[0].f)
                     A[0] = a0
                     turning_up = wp.transpose(R[0]) * wp.spatial_top(a0)
                     speeding_up = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + vec3(m.gravity)
@@ -418,7 +395,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                                 for i in range(1, n):
                                     lam[i] = u[i] - guess[i]
                                     U[i] = U[m.parent[at + i]] + S[i] * lam[i]
-                                part = search(m, law, at, n, R, x, V, B, place, q, qd, guess, lam, U, Ia0, Ib0, Id0)
+                                part = search(m, law, at, n, R, x, V, B, place, q, qd, guess, lam, U, free_loads)
                         else:  # where a step is no shorter, half of it
                             part = pick(last_change, change, T(0.5), T(1.0))
                             last_change = change

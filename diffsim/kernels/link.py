@@ -17,7 +17,7 @@ from diffsim.kernels.spec import KernelSpec
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, vec6, mat3, Model, Law = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law
-    momentum, Place, VARIED = sp.momentum, t.Place, spec.varied
+    momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
     LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
     DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
@@ -53,7 +53,12 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             F = F - drag.drag_wrench(m, k, R, com, V)
         if wp.static(CONTACT):
             Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, Ia, Ib, Id, F)
-        return Ia, Ib, Id, F
+        load = Load()
+        load.a = Ia
+        load.b = Ib
+        load.d = Id
+        load.f = F
+        return load
 
     @wp.func
     def link_adjoint(

@@ -124,9 +124,17 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         motor: T
         block: int  # whose environments' rows of Model.terrain are read where there is one only
 
+    @wp.struct
+    class Load:  # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force
+        a: wp.types.matrix((3, 3), T)
+        b: wp.types.matrix((3, 3), T)
+        d: wp.types.matrix((3, 3), T)
+        f: wp.types.vector(6, T)
+
     return SimpleNamespace(
         T=T,
         U=U,
+        Load=Load,
         vec2=wp.types.vector(2, T),
         vec3=wp.types.vector(3, T),
         vec4=wp.types.vector(4, T),

@@ -34,6 +34,7 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
     t, sp, hill = types(spec), spatial(spec), hill_law(spec)
     T, vec3, vec6, Model, Law, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.array
     join, point_velocity = sp.join, sp.point_velocity
+    loads_of = wp.array(dtype=t.Load)
     mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
     HILL, VARIED, block = "hill" in spec.features, spec.varied, blocks(spec)
 
@@ -103,9 +104,9 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
         R: mat3s,
         x: vec3s,
         V: vec6s,
-        P: vec6s,
+        loads: loads_of,
     ):
-        """Adds the muscles to the links' bias forces P."""
+        """Adds the muscles to the links' bias forces."""
         if wp.static(HILL):
             measure(m, lane, R, x, V, V, lengths, rates, rates)
             for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
@@ -125,8 +126,8 @@ def muscle_law(spec: KernelSpec, adjoint: bool) -> SimpleNamespace:
                 force = force + f
                 torque = torque + wp.cross(a, f)
             wrench = outward(R[i], x[i], torque, force)
-            P[i] = P[i] - wrench
-            P[j] = P[j] + wrench
+            loads[i].f = loads[i].f - wrench
+            loads[j].f = loads[j].f + wrench
 
     @wp.func
     def add_muscles_adjoint(
