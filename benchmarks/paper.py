@@ -6,19 +6,19 @@
     python benchmarks/paper.py --pace 100                          there, alone: the seconds of an iteration
     python benchmarks/paper.py --machine h200 --evaluate-only --update-results    and evaluate there
     python benchmarks/paper.py --draw-only --update-results        only the tables and pictures
+    python benchmarks/paper.py --same REVISION --update-results    record whether this revision trains the same policies
+    python benchmarks/paper.py --sentinels --update-results        measure sentinels after a change of numbers
 
-Groups of cells are in cases.json: learners on tasks of a machine, by seeds. All are of the revision there, or of one
-with the same package and script. Writes cells.csv, a line for each, and curves.csv, some POINTS of each training that a
-picture shows; a table has the learners whose seeds are all there. On a GPU trainings may run side by side (--shared):
-their seconds are then those of pace.csv, of iterations that had the GPU alone.
+Groups of cells are in cases.json: learners on tasks of a machine, by seeds. A cell counts while no revision since its
+own has changed its numbers (fingerprints.py). Writes cells.csv, a line for each, and curves.csv, some POINTS of each
+training that a picture shows; a table has the learners whose seeds are all there. On a GPU trainings may run side by
+side (--shared): their seconds are then those of pace.csv, of iterations that had the GPU alone.
 """
 
 from __future__ import annotations
 
-import functools
 import json
 import math
-import subprocess
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -28,6 +28,7 @@ from statistics import mean, median
 from typing import NamedTuple
 
 import common
+import fingerprints
 import numpy as np
 import tables
 import transfer
@@ -41,10 +42,9 @@ import diffsim
 from diffsim.training import Natural, checkpoint, fail
 from diffsim.training.evaluation import kept
 
-CODE = (":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view")  # and the script: what a training depends on
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
-REVISION: str = CASES["paper"]["revision"]
+SENTINELS: list[list[str]] = CASES["paper"]["sentinels"]  # learner and task
 UNTIMED = ("task", "learner", "return", "in the reference", "target", "steps to target")
 
 
@@ -104,6 +104,11 @@ class Cell(NamedTuple):
         return " ".join((f"python {script}.py --env {task} --seed {seed} --device {device}", *flags))
 
 
+def same_numbers(revision: str, learner: str, task: str) -> bool:
+    """Whether a training there is one of today."""
+    return fingerprints.counts(revision, f"{LEARNERS[learner]} --env {task}")
+
+
 @dataclass
 class Args(ScriptFlags):
     runs: Path = ROOT / "runs" / "paper"  # directory of the runs: {runs}/{machine}/{learner}/{task}__{seed}
@@ -116,6 +121,9 @@ class Args(ScriptFlags):
     evaluate_only: bool = False  # train nothing
     pace: Natural = 0  # train so many iterations alone, and write what each takes to pace.csv
     shared: bool = False  # the machine did other work beside the trainings: their seconds are left out
+    same: str = ""  # a revision: only say whether this one trains the same policies
+    reason: str = ""  # with --same: why some differ
+    sentinels: bool = False  # after a change of numbers, train some cells again and compare them with their range
 
     def alone(self, cell: Cell) -> bool:
         """Whether a cell's seconds mean something."""
@@ -143,21 +151,16 @@ def cells(args: Args) -> Iterator[Cell]:
     return (cell for _, cell in sorted(found, key=lambda each: each[0]))
 
 
-@functools.cache
-def same_code(revision: str, learner: str) -> bool:
-    """Whether a training there is one of REVISION; no, of one that is not in this history."""
-    call = ["git", "diff", "--quiet", REVISION, revision, "--", *CODE, f"{LEARNERS[learner].split()[0]}.py"]
-    return subprocess.run(call, cwd=ROOT, capture_output=True).returncode == 0
-
-
 def counts(row: Cells, timed: bool) -> bool:
-    """Whether a cell's line is of REVISION, and has its seconds, if it is to be timed."""
-    return same_code(row["revision"], row["learner"]) and (not timed or bool(row["training (s)"]))
+    """Whether a cell's line is one of today, and has its seconds, if it is to be timed."""
+    return same_numbers(row["revision"], row["learner"], row["task"]) and (not timed or bool(row["training (s)"]))
 
 
 def paces(directory: Path) -> dict[tuple[str, str], Pace]:
     """By learner and task."""
-    rows = (row for row in read_csv(directory / "pace.csv") if same_code(row["revision"], row["learner"]))
+    rows = (
+        row for row in read_csv(directory / "pace.csv") if same_numbers(row["revision"], row["learner"], row["task"])
+    )
     return {(row["learner"], row["task"]): Pace(*(float(row[f"{x} (s)"]) for x in Pace._fields)) for row in rows}
 
 
@@ -180,14 +183,14 @@ def done(rows: Sequence[Cells], cell: Cell) -> bool:
 
 
 def begin(runner: Runner, cell: Cell, case: Case) -> dict[str, object]:
-    """What cell.json says of a training, new or begun. Code that is not of REVISION is refused."""
+    """What cell.json says of a training, new or begun. A revision that is not recorded is refused."""
     path, revision = case.folder / "cell.json", tables.revision()
     if tables.unknown(f"; ; {revision}"):
         fail(f"a cell is of a commit, not of {revision}")
-    if not same_code(revision, cell.learner):
-        fail(f"the package or {case.script}.py has changed since {REVISION}: check that out, or measure all cells anew")
+    if unrecorded := fingerprints.open_end():
+        fail(unrecorded)
     begun = json.loads(path.read_text()) if path.is_file() else {}
-    if begun and not same_code(begun["revision"], cell.learner):
+    if begun and not same_numbers(begun["revision"], cell.learner, cell.task):
         fail(f"{case.folder} was begun at {begun['revision']}: remove it")
     if not begun:
         case.folder.mkdir(parents=True, exist_ok=True)
@@ -338,10 +341,32 @@ def check(args: Args) -> str:
         seeds = " ".join(str(cell.seed) for cell in each)
         lines.append(f"{each[0].machine}: {each[0].command.replace(f'--seed {each[0].seed}', f'--seed {{{seeds}}}')}")
     lines.append(f"{sum(map(len, missing.values()))} of {count} cells are missing")
+    lines += [unrecorded] if (unrecorded := fingerprints.open_end()) else []
     for path in sorted(common.RESULTS.glob("*/*.csv")):
         if found := next((bad for origin in tables.origins(path) if (bad := tables.unknown(origin))), ""):
             lines.append(f"{path.relative_to(common.RESULTS.parent)}: {found}")
     return "\n".join(lines)
+
+
+def measure_sentinels(args: Args, runner: Runner, seeds: int = 3) -> None:
+    """Train SENTINELS at this revision, and say in the newest link whether medians are within the published range."""
+    link, verdicts = fingerprints.links()[-1], list[str]()
+    for learner, task in SENTINELS:
+        cells = [Cell(args.place, learner, task, seed) for seed in range(1, seeds + 1)]
+        cases = [cell.case(args.runs / "sentinels" / link["revision"]) for cell in cells]
+        for cell, case in zip(cells, cases, strict=True):
+            begin(runner, cell, case)
+            if not (runner.train(case) and runner.evaluate(case)):
+                return
+        own = (row for row in read_csv(common.RESULTS / args.place / "cells.csv") if row["task"] == task)
+        known = numbers((row for row in own if row["learner"] == learner), "return")
+        found = median(evaluation(case.folder)["return"] for case in cases)
+        verdict = fingerprints.KEEPS if min(known) <= found <= max(known) else fingerprints.BREAKS
+        verdicts.append(f"{learner} {task} {found:.0f} {verdict} {min(known):.0f} to {max(known):.0f}")
+        print(verdicts[-1], flush=True)
+    if args.update_results:
+        link = link | {"sentinels": "; ".join(verdicts)}
+        tables.replace_csv(fingerprints.path(), [link], ("revision",), args.device)
 
 
 def main(args: Args) -> None:
@@ -350,7 +375,13 @@ def main(args: Args) -> None:
     if args.check:
         print(check(args))
         return
+    if args.same:
+        fingerprints.record(args, args.same, args.reason)
+        return
     runner = Runner(args)
+    if args.sentinels:
+        measure_sentinels(args, runner)
+        return
     for cell in () if args.draw_only else cells(args):
         if cell.machine != args.place:
             continue

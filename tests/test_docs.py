@@ -145,7 +145,7 @@ def test_every_csv_file_is_of_a_commit() -> None:
     if git("rev-parse", "--is-shallow-repository") != ["false"]:
         pytest.skip("the history is not here")
     commits = git("log", "--format=%H")
-    for path in sorted((ROOT / "results").glob("*/*.csv")):
+    for path in sorted((ROOT / "results").rglob("*.csv")):
         for line in path.read_text().splitlines():
             revisions = re.findall(r"\b[0-9a-f]{7}\b", line.split("; ", 3)[2]) if line.startswith("# ") else ()
             for short in revisions:
@@ -153,7 +153,7 @@ def test_every_csv_file_is_of_a_commit() -> None:
 
 
 def test_every_csv_file_says_where_it_comes_from() -> None:
-    paths = sorted((ROOT / "results").glob("*/*.csv"))
+    paths = sorted((ROOT / "results").rglob("*.csv"))
     files = {path for path in (ROOT / "results").rglob("*") if path.is_file()}
     assert paths and files == {*paths, LOG}
     for path in paths:
@@ -167,7 +167,7 @@ def test_every_csv_file_is_shown_or_needed() -> None:
     text = "".join(page.read_text() for page in PAGES)
     drawn = {name for case in EXPERIMENTS.values() for name in case["learners"]}
     pictures = {path.stem for path in (ROOT / "docs" / "figures").rglob("*.png")}
-    for path in sorted((ROOT / "results").glob("*/*.csv")):
+    for path in sorted((ROOT / "results").rglob("*.csv")):
         curves = any(path.stem == f"{name}_{task}" for name in drawn for task in RETURNS)
         assert path.name in text or curves or path.stem in pictures, f"no page shows {path}"
 
@@ -345,7 +345,7 @@ def test_flags_exist(page: Path) -> None:
 def test_commands_of_results_run_today() -> None:
     """Their scripts and flags exist."""
     older = set[str]()
-    for path in sorted((ROOT / "results").glob("*/*.csv")):
+    for path in sorted((ROOT / "results").rglob("*.csv")):
         for line in path.read_text().splitlines():
             if not line.startswith("# "):
                 break

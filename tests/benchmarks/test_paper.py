@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import common
+import fingerprints
 import paper
 import pytest
 import tables
 from learners import refusal
 from runner import Runner
 
+LINK = {"revision": "HEAD", "parent": "HEAD", "equal": " ".join(fingerprints.CASES), "differ": ""}
 SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4")
 
 
@@ -23,7 +25,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
     """The lines of the H200's cells.csv; the code is that of aaaaaaa."""
     rows = list[dict[str, str]]()
     monkeypatch.setattr(paper, "read_csv", lambda path: rows if path.parts[-2:] == ("h200", "cells.csv") else [])
-    monkeypatch.setattr(paper, "same_code", lambda revision, learner: revision == "aaaaaaa")
+    monkeypatch.setattr(paper, "same_numbers", lambda revision, learner, task: revision == "aaaaaaa")
     for seed, value in enumerate((5000.0, 5100.0, 4800.0, 5300.0, 5200.0), start=1):
         row = SAPO | {"seed": str(seed), "return": f"{value}", "training (s)": f"{60 + seed}", "falls": f"{seed / 100}"}
         row["trained on"] = "NVIDIA H200"
@@ -84,7 +86,7 @@ def test_a_cell_that_shared_its_gpu_has_the_seconds_of_the_pace(
 
 
 def test_pages_show_the_lines_of_the_cells() -> None:
-    if not paper.same_code(paper.REVISION, "shac"):
+    if not fingerprints.files(fingerprints.links()[0]["parent"]):
         pytest.skip("the history is not here")
     args, shown = paper.Args(output=common.RESULTS / "cpu"), 0
     for name, group in paper.GROUPS.items():
@@ -96,7 +98,7 @@ def test_pages_show_the_lines_of_the_cells() -> None:
 
 
 def test_readme_shows_medians_of_five_seeds_for_every_task() -> None:
-    if not paper.same_code(paper.REVISION, "shac"):
+    if not fingerprints.files(fingerprints.links()[0]["parent"]):
         pytest.skip("the history is not here")
     readme, cores = (tables.ROOT / "README.md").read_text(), paper.GROUPS["cores"]
     args = paper.Args(output=common.RESULTS / "cpu")
@@ -175,14 +177,6 @@ def test_what_is_missing_is_said_with_its_command(known: list[dict[str, str]]) -
     assert all(any(map(tables.unknown, tables.origins(path))) for path in files)
 
 
-def test_code_is_the_same_where_package_and_scripts_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not paper.same_code("no-commit", "shac")
-    paper.same_code.cache_clear()
-    monkeypatch.setattr(paper, "REVISION", "HEAD")  # the pinned one is not in a shallow clone
-    assert paper.same_code("HEAD", "shac")
-    paper.same_code.cache_clear()
-
-
 def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     error = refusal(lambda: paper.main(paper.Args(only=("headlines",))), capsys)
     assert "--only: there is no 'headlines'; choose from headline, cores" in error
@@ -196,15 +190,15 @@ def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: 
 
     assert refusal(begin, capsys).endswith("a cell is of a commit, not of 1234567-dirty")
     monkeypatch.setattr(tables, "revision", lambda: "1234567")
-    monkeypatch.setattr(paper, "same_code", lambda revision, learner: False)
-    assert f"the package or shac.py has changed since {paper.REVISION}" in refusal(begin, capsys)
+    monkeypatch.setattr(fingerprints, "links", list)
+    assert "python benchmarks/paper.py --same REVISION" in refusal(begin, capsys)
 
 
 def test_cells_are_trained_evaluated_and_kept_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(tables, "revision", lambda: "HEAD")
-    monkeypatch.setattr(paper, "REVISION", "HEAD")
+    monkeypatch.setattr(fingerprints, "links", lambda: [LINK])
     places = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path / "results" / "cpu"), "--device", "cpu"]
     flags = [*places, "--only", "cores", "--env", "cartpole", "--seeds", "1"]
     short = "-- --iterations 2 --num-envs 4 --horizon 4 --eval-episodes 2".split()

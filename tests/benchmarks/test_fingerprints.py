@@ -1,0 +1,161 @@
+"""Fingerprints notice changed numbers and no changed words; the chain of them says which results count."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import common
+import fingerprints
+import paper
+import pytest
+from fingerprints import CASES, counts
+from learners import refusal
+
+from diffsim.training.errors import UsageError
+
+NAMES = [*CASES]
+
+
+@pytest.fixture
+def chain(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, str]]]:
+    """Links a-b-c-d, all equal; what trainings depend on is another in each revision but the equal pairs given."""
+
+    def make(**equal: str) -> list[dict[str, str]]:
+        made = [link("a", "b"), link("b", "c"), link("c", "d")]
+        monkeypatch.setattr(fingerprints, "links", lambda: made)
+        monkeypatch.setattr(fingerprints, "files", lambda revision: {"shac.py": equal.get(revision, revision)})
+        return made
+
+    return make
+
+
+def link(parent: str, revision: str, differ: str = "", reason: str = "", sentinels: str = "") -> dict[str, str]:
+    equal = " ".join(name for name in NAMES if name not in differ.split())
+    values = revision, parent, "cpu", equal, differ, reason, sentinels
+    return dict(zip(fingerprints.COLUMNS, values, strict=True))
+
+
+def test_a_training_depends_on_its_learner_its_task_and_its_flags() -> None:
+    for command, names in {
+        "shac --env hopper": {"shac"},
+        "shac --env ant": {"shac", "ant"},
+        "sapo --env humanoid_mtu": {"sapo", "humanoid_mtu", "sapo_humanoid_mtu"},
+        "ppo_baseline --contact mujoco --env go2": {"ppo_baseline", "mujoco", "joystick"},
+        "shac --accuracy accurate --env cartpole": {"shac", "cartpole", "accurate"},
+    }.items():
+        assert fingerprints.depends(command) == names
+    for cell in paper.cells(paper.Args()):  # none is without a fingerprint of its learner and of its task
+        script, *_ = paper.LEARNERS[cell.learner].split()
+        names = fingerprints.depends(f"{paper.LEARNERS[cell.learner]} --env {cell.task}")
+        assert script in names and (cell.task == "hopper" or cell.task in names)
+
+
+def test_a_result_counts_while_each_link_keeps_what_it_depends_on(
+    chain: Callable[..., list[dict[str, str]]],
+) -> None:
+    made = chain(x="b", HEAD="d")
+    assert all(counts(revision, "shac --env ant") for revision in "abcdx") and not counts("y", "shac --env ant")
+    assert not fingerprints.open_end()
+    made[1] = link("b", "c", differ="ant")
+    assert [counts(revision, "shac --env ant") for revision in "abxcd"] == [False, False, False, True, True]
+    assert counts("a", "shac --env humanoid")
+    made[1] = link("b", "c", differ="ant", reason="a better ant", sentinels="")
+    assert not counts("a", "shac --env ant")
+    made[1] = link("b", "c", differ="ant", reason="a better ant", sentinels="shac ant within; sapo ant beyond")
+    assert not counts("a", "shac --env ant")
+    made[1] = link("b", "c", differ="ant", reason="a better ant", sentinels="shac ant within; sapo ant within")
+    assert counts("a", "shac --env ant")
+    made[1] = link("b", "c") | {"equal": "shac"}  # the ant was not compared
+    assert not counts("a", "shac --env ant") and counts("a", "shac --env hopper")
+    made[1] = link("z", "c")  # nobody has compared b with z
+    assert [counts(revision, "shac --env ant") for revision in "abzcd"] == [False, False, True, True, True]
+
+
+def test_head_is_the_newest_revision_or_the_command_is_told(
+    chain: Callable[..., list[dict[str, str]]],
+) -> None:
+    made = chain()
+    told = fingerprints.open_end()
+    assert "changed since d" in told and told.endswith(": python benchmarks/paper.py --same d --update-results")
+    assert told in paper.check(paper.Args(only=("alpha",)))
+    made.clear()
+    assert not counts("d", "shac --env ant") and "no revision is recorded" in fingerprints.open_end()
+    assert "6 of 6 cells are missing" in paper.check(paper.Args(only=("alpha",)))
+
+
+def test_the_chain_of_the_results_is_whole() -> None:
+    links = fingerprints.links()
+    assert links, "no result counts"
+    if not fingerprints.files(links[0]["parent"]):
+        pytest.skip("the history is not here")
+    for older, newer in zip(links, links[1:], strict=False):
+        assert fingerprints.same_files(older["revision"], newer["parent"])
+    for each in links:
+        assert fingerprints.files(each["revision"]) and each["machine"]
+        assert not each["differ"] or each["reason"]
+
+
+def test_a_link_is_recorded_where_the_chain_ends_and_with_its_reason(
+    chain: Callable[..., list[dict[str, str]]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    chain()
+    args, found = paper.Args(update_results=True, device="cpu"), dict.fromkeys(CASES, True)
+    written = list[dict[str, str]]()
+    monkeypatch.setattr(fingerprints, "compare", lambda *_: found)
+    monkeypatch.setattr(fingerprints, "checked_out", lambda revision: fingerprints.TemporaryDirectory())
+    monkeypatch.setattr("tables.replace_csv", lambda path, rows, *_: written.extend(rows))
+    assert "the chain ends at d: --same d" in refusal(lambda: fingerprints.record(args, "b", ""), capsys)
+    fingerprints.record(args, "d", "")
+    assert written[-1]["equal"].split() == NAMES and (written[-1]["parent"], written[-1]["differ"]) == ("d", "")
+    found["ant"] = False
+    with pytest.raises(UsageError, match="says why"):
+        fingerprints.record(args, "d", "")
+    assert len(written) == 1
+    fingerprints.record(args, "d", "a better ant")
+    assert (written[-1]["differ"], written[-1]["reason"]) == ("ant", "a better ant")
+
+
+def test_a_sentinel_beyond_the_published_range_breaks_the_chain(
+    chain: Callable[..., list[dict[str, str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, returns, written = chain(HEAD="d"), {"hopper": 5.0, "ant": 5.0, "humanoid_mtu": 5.0}, list[dict[str, str]]()
+    made[-1] |= {"equal": "shac", "differ": "ant", "reason": "a better ant"}
+    rows = [{"learner": a, "task": b, "seed": "1", "return": r} for a, b in paper.SENTINELS for r in ("4", "6")]
+    monkeypatch.setattr(paper, "read_csv", lambda path: rows)
+    monkeypatch.setattr(paper, "begin", lambda *_: {})
+    monkeypatch.setattr(paper, "evaluation", lambda folder: {"return": returns[folder.name.partition("__")[0]]})
+    monkeypatch.setattr("tables.replace_csv", lambda path, rows, *_: written.extend(rows))
+    monkeypatch.setattr("runner.Runner.train", lambda *_: True)
+    monkeypatch.setattr("runner.Runner.evaluate", lambda *_: True)
+    args = paper.Args(update_results=True, machine="cpu")
+    for value, kept in ((5.0, True), (7.0, False), (3.0, False)):
+        returns["ant"] = value
+        paper.measure_sentinels(args, paper.Runner(args))
+        made[-1] = written[-1]
+        assert counts("a", "shac --env ant") == kept
+
+
+def test_fingerprints_notice_changed_numbers_and_no_changed_words(tmp_path: Path) -> None:
+    """Of the task and of a kernel; each copy of the package is trained on its own."""
+    ignored = shutil.ignore_patterns("__pycache__", "policies")
+    shutil.copytree(common.ROOT / "diffsim", tmp_path / "diffsim", ignore=ignored)
+    shutil.copy(common.ROOT / "shac.py", tmp_path)
+
+    def changed(name: str, old: str, new: str) -> str:
+        path = tmp_path / "diffsim" / name
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        found = fingerprints.fingerprint(tmp_path, "cartpole")
+        path.write_text(text)
+        return found
+
+    before = fingerprints.fingerprint(common.ROOT, "cartpole")
+    assert before and changed("tasks/cartpole.py", "Eq. 13:", "Equation 13 says:") == before
+    assert changed("tasks/cartpole.py", "0.1", "0.11") not in (before, "")
+    assert changed("kernels/spatial.py", "p = mass * ", "p = T(1.01) * mass * ") not in (before, "")
+    assert changed("tasks/cartpole.py", "import", "imports") == ""
