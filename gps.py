@@ -647,7 +647,7 @@ def evaluate(search: Search) -> Evaluation:
     (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
     fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & search.args.early_termination).int()
     alive = fallen.cumsum(1) - fallen == 0
-    returns, lengths, forward, speed = (S.native * alive).sum(1), alive.sum(1), system.task.forward, None
+    returns, lengths, forward, speed = (S.native * alive).sum(1), alive.sum(1), system.task.forward_column, None
     if forward is not None:
         x = S.x[..., forward]
         distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]

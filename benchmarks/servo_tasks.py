@@ -17,9 +17,9 @@ from torch import Tensor
 
 import diffsim
 from diffsim.tasks import Contact, HumanoidImitation
+from diffsim.tasks.base import ASSETS
 from diffsim.tasks.imitation.clip import Clip
 from diffsim.tasks.joystick import Go2
-from diffsim.tasks.own import ASSETS
 from diffsim.training import load_policy
 
 STIFFNESS = 2.0  # 1/rad: a servo gives its motor's largest torque half a radian from the target

@@ -242,7 +242,7 @@ def in_mujoco(case: Case) -> dict[str, object]:
     if "muscle" in env.scene.features:
         return {}
     motion = travel(case, MuJoCo(env.scene, env.num_envs, env.control_dt), env.episode_length)
-    return measure(motion, env.scene, env.control_dt, env.task.forward)
+    return measure(motion, env.scene, env.control_dt, env.task.forward_column)
 
 
 def conditions(case: Case, args: Args) -> dict[str, World]:
@@ -266,7 +266,7 @@ def compare(case: Case, args: Args) -> dict[str, Motion]:
     motions, own = dict[str, Motion](), math.nan
     for name, world in conditions(case, args).items():
         motion = motions[name] = travel(case, world, args.steps)
-        found = measure(motion, env.scene, env.control_dt, env.task.forward)
+        found = measure(motion, env.scene, env.control_dt, env.task.forward_column)
         if isinstance(value := found["speed"], float):
             own = value if len(motions) == 1 else own
             found["kept"] = value / own

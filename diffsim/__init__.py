@@ -21,7 +21,6 @@ from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation, Task, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
-from diffsim.tasks.own import robot
 
 __all__ = [
     "TASKS",
@@ -96,7 +95,7 @@ def make(
         if task.num_memory:  # its times count in control steps
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
-    scene = load_scene(robot(task))
+    scene = task.load_robot()
     asked = dict(substeps=substeps, theta=theta, passes=passes, touchdown=touchdown)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
     if penalty and integration.integrator == "mujoco":

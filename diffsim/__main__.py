@@ -178,7 +178,7 @@ def report() -> str:
 def describe_tasks() -> list[str]:
     lines = [f"{'task':<18} {'obs':>4} {'act':>4}  {'episode':<18} {'substeps':>8}  demo"]
     for name, task in TASKS.items():
-        scene = load_scene(str(files("diffsim") / "assets" / task.asset))
+        scene = task.load_robot()
         episode = f"{task.episode_length} steps, {task.episode_length * task.control_dt:.1f} s"
         shipped = "yes" if (POLICIES / f"{name}.pt").is_file() else "-"
         lines.append(f"{name:<18} {task.obs_dim:>4} {scene.nu:>4}  {episode:<18} {task.substeps:>8}  {shipped}")

@@ -19,7 +19,6 @@ from diffsim.sim.launcher import check_memory
 from diffsim.sim.options import Options
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
-from diffsim.tasks.own import fit
 from diffsim.terrain import Elevation
 from diffsim.view.screen import RENDER_MODES, Frames, RenderMode, Screen
 
@@ -90,7 +89,7 @@ class DiffEnv(VectorEnv):
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         asked = Options(integration or task.integration("default"), **options).check()
         self.device, self.dtype = torch.device(asked.device), asked.dtype
-        fit(task, scene)
+        task.bind(scene)
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory)
         check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon

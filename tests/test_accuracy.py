@@ -97,8 +97,6 @@ def test_contact_decides_the_integration():
             assert task.integration(accuracy, "mujoco") == Integration("mujoco", substeps), name
     with pytest.raises(ValueError, match="unknown contact 'hard'; choose from soft, mujoco"):
         diffsim.make("hopper", contact="hard")
-    with pytest.raises(ValueError, match="^firm contact is gone: choose mujoco, MuJoCo's own$"):
-        diffsim.make("hopper", contact="firm")
 
 
 def test_penalty_constants_replace_the_files():

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from diffsim.env import DiffEnv
 from diffsim.planning.dynamics import REAL, Dynamics
-from diffsim.tasks.own import fit
 from diffsim.terrain import Elevation, root
 
 
@@ -34,8 +33,7 @@ class System(Dynamics):
         scene = env.scene if terrain is None else env.scene.with_terrain(terrain)
         self._elevations: dict[int, Elevation] = {}
         super().__init__(scene, env.sim.integration, env.control_dt, device=env.device, threads=threads)
-        self.task = type(env.task)(self.device, REAL)
-        fit(self.task, scene)
+        self.task = type(env.task)(self.device, REAL).bind(scene)
         self._no_action = torch.zeros(self.nu, dtype=REAL, device=self.device)
         start = self.start()
         still, moved = (self._observe(start, action.unsqueeze(0)) for action in (self._no_action, self._no_action + 1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from diffsim.tasks.ant import Ant
-from diffsim.tasks.base import Accuracy, Contact, Task
+from diffsim.tasks.base import Accuracy, Contact, Task, TaskError
 from diffsim.tasks.cartpole import CartPole
 from diffsim.tasks.half_cheetah import HalfCheetah
 from diffsim.tasks.hopper import Hopper
@@ -11,7 +11,7 @@ from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.humanoid_mtu import HumanoidMTU
 from diffsim.tasks.imitation.task import HumanoidImitation
 from diffsim.tasks.joystick import G1, Go1, Go2
-from diffsim.tasks.own import FILE, TaskError, task_of_file
+from diffsim.tasks.own import FILE, task_of_file
 from diffsim.tasks.swimmer import Swimmer
 from diffsim.tasks.walker import Walker
 

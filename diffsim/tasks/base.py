@@ -8,6 +8,8 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 from __future__ import annotations
 
 import os
+import sys
+from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias, get_args
 
 import mujoco
@@ -15,6 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from diffsim.robot.mjcf import load_scene
+from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
 from diffsim.tasks.mirror import Mirror
 
@@ -22,24 +26,29 @@ Accuracy = Literal["fast", "default", "accurate"]
 Contact = Literal["soft", "mujoco"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
-FIRM_IS_GONE = "firm contact is gone: choose mujoco, MuJoCo's own"
+ASSETS = Path(__file__).resolve().parents[1] / "assets"
+
+
+class TaskError(ValueError):
+    """There is no such task, or it does not fit its robot. The message is one line that says all."""
 
 
 class Task:
     """A task. Subclasses fill in the attributes and the methods `observe` and `reward`.
 
-    An episode starts uniformly in start +- spread / 2, where both list qpos, then qvel.
+    `bind` fits it to its robot, and finds what the subclass leaves out. An episode starts uniformly in
+    start +- spread / 2, where both list qpos, then qvel.
     """
 
     name: ClassVar[str] = "task"
-    asset: ClassVar[Asset]  # of a file's name, own.robot says where it is looked for
+    asset: ClassVar[Asset]  # of a file's name, load_robot says where it is looked for
     contact: ClassVar[Contact] = "mujoco"  # unless the user asks for the other one
     substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy on this contact
     fast: ClassVar[Integration]  # the other two on soft contact, chosen by measurement: docs/accuracy.md
     accurate: ClassVar[Integration]
     obs_dim: int
-    num_random: int  # random numbers per reset; own.fit finds it, obs_dim and forward if they are not given
-    forward: int | None  # column of qpos [m] that grows as the robot moves forward; None if it does not travel
+    num_random: int  # random numbers per reset
+    forward_column: int | None  # of qpos [m], grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
@@ -56,6 +65,61 @@ class Task:
         self._nq, self._quaternions = (len(self.start) + 1) // 2, list[int]()
 
     @classmethod
+    def load_robot(cls) -> Scene:
+        """The robot of the asset. A file of diffsim's tasks is in diffsim/assets; another's is sought beside the file
+        of the class that names it, in the working directory and in diffsim/assets."""
+        owner = next((kind for kind in cls.__mro__ if "asset" in vars(kind)), cls).__module__
+        asset: Asset | None = getattr(cls, "asset", None)
+        if asset is None:
+            raise TaskError(f"task {cls.name!r} names no robot: give it an asset, such as a file's path")
+        if not isinstance(asset, str | os.PathLike):
+            return load_scene(asset)
+        beside = getattr(sys.modules.get(owner), "__file__", None) or "."
+        folders = [] if owner.startswith("diffsim.") else [Path(beside).resolve().parent, Path.cwd()]
+        for folder in (*folders, ASSETS):
+            if (folder / asset).is_file():
+                return load_scene(folder / asset)
+        raise TaskError(f"task {cls.name!r}: no robot file {str(asset)!r} in {' or '.join(map(str, folders))}")
+
+    @torch.no_grad()
+    def bind(self, scene: Scene) -> Task:
+        """Itself, fitted to its robot: start, num_random, obs_dim and forward_column are found where they are missing.
+
+        Raises:
+            TaskError: a number that does not fit, by name.
+        """
+        n, m = scene.nq + scene.nv, scene.mj_model
+        self.forward_column = getattr(self, "forward_column", way_forward(scene))
+        self.num_random = getattr(self, "num_random", n)
+        if type(self).reset is Task.reset:
+            self._nq, self._quaternions = scene.nq, scene.quaternion_adr.tolist()
+            if not len(self._start):
+                key = max(mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
+                home = torch.tensor(m.key_qpos[key] if m.nkey else scene.qpos0)
+                self._start = torch.cat((home.to(self._start), self._start.new_zeros(scene.nv)))
+            sizes = {"num_random": self.num_random, "the length of start": len(self._start)}
+            for name, size in (sizes | {"the length of spread": len(self._spread) if self._spread.ndim else n}).items():
+                self._check(name, size, n, "nq + nv")
+        rand = self._start.new_full((2, self.num_random), 0.5)
+        qpos, qvel, action = state = *self.reset(rand), self._start.new_zeros(2, scene.nu)
+        self._check("the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
+        memory = self.begin(rand)
+        self._check("the width of what begin returns", memory.shape[-1], self.num_memory, "num_memory")
+        obs = self.observe_with(*state, memory)
+        self._check("the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
+        self.obs_dim = getattr(self, "obs_dim", obs.shape[-1])
+        self._check("obs_dim", self.obs_dim, obs.shape[-1], "what observe returns")
+        if self.obs_parts:
+            self._check("the sum of obs_parts", sum(size for _, size in self.obs_parts), self.obs_dim, "obs_dim")
+        if type(self).reward is not Task.reward:  # who only watches needs none
+            self._check("the shape of two rewards", tuple(self.reward(obs, action).shape), (2,))
+        return self
+
+    def _check(self, name: str, value: object, expected: object, source: str = "") -> None:
+        if value != expected:
+            raise TaskError(f"task {self.name!r}: {name} is {value}, must be {expected}{source and f' ({source})'}")
+
+    @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
         """The preset "fast", "default" (the paper's) or "accurate"; with MuJoCo's contact the first two are one.
 
@@ -64,8 +128,7 @@ class Task:
         """
         contact = cls.contact if contact is None else contact
         if contact not in get_args(Contact):
-            names = ", ".join(get_args(Contact))
-            raise ValueError(FIRM_IS_GONE if contact == "firm" else f"unknown contact {contact!r}; choose from {names}")
+            raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(get_args(Contact))}")
         if accuracy not in get_args(Accuracy):
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
         own = hasattr(cls, "substeps") and contact == cls.contact
@@ -151,3 +214,14 @@ class Planar(Task):
 def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:
     """R_height of Eqs. 16-17 and 21-22: with D = clip(delta, -1, upper) [m], -200 D^2 below zero and slope D above."""
     return slope * delta.clamp(0.0, upper) - 200.0 * delta.clamp(-1.0, 0.0).square()
+
+
+def way_forward(scene: Scene) -> int | None:
+    """Column of qpos that is the root's x, of its free joint or its slide along x; None if neither ground nor fluid
+    carries the robot, or if it has no such joint, as an arm."""
+    m = scene.mj_model
+    mujoco.mj_kinematics(m, data := mujoco.MjData(m))
+    along = (m.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (data.xaxis[:, 0] > 0.99)
+    along |= m.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    found = m.jnt_qposadr[along & (m.body_weldid[m.body_parentid[m.jnt_bodyid]] == 0)]
+    return int(found[0]) if len(found) and scene.features & {"contact", "drag"} else None

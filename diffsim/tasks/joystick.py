@@ -15,12 +15,10 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from diffsim.robot.mjcf import load_scene
 from diffsim.sim.integration import Integration
 from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.locomotion import rotate
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
-from diffsim.tasks.own import robot
 
 FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
 STANDING = 0.1  # share of commands that are zero; each of the three numbers of others is with the same probability
@@ -102,7 +100,7 @@ class Joystick(Task):
     control_dt = 0.02
     episode_length = 1000
 
-    forward = None  # what counts is the command
+    forward_column = None  # what counts is the command
     touchdown: ClassVar[bool] = True
     alive: ClassVar[float] = 4.0  # reward of a perfect step
 
@@ -144,9 +142,7 @@ class Joystick(Task):
     def mirror(self) -> Mirror:
         """See Task. The image's clock is half a cycle ahead."""
         device, dtype = self._start.device, self._start.dtype
-        qpos, qvel, action, joints, rates = reflections(
-            load_scene(robot(self)).mj_model, self.robot.sides, device, dtype
-        )
+        qpos, qvel, action, joints, rates = reflections(self.load_robot().mj_model, self.robot.sides, device, dtype)
         signs = (*VECTOR, *PSEUDOVECTOR, *VECTOR), (1.0, -1.0, -1.0, -1.0, -1.0), (1.0,)
         body, command, height = (Reflection.of(enumerate(part), device, dtype) for part in signs)
         sensed = body, joints, rates

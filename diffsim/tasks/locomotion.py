@@ -10,10 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.base import Task
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
-from diffsim.tasks.own import robot
 
 FORWARD_VELOCITY = 5  # column of the observation: v_x
 
@@ -56,7 +54,7 @@ class Locomotion(Task):
     def mirror(self) -> Mirror:
         """See Task. It is made when first asked for, which a CUDA graph cannot capture, so ask before."""
         device, dtype = self._start.device, self._start.dtype
-        qpos, qvel, action, joints, rates = reflections(load_scene(robot(self)).mj_model, self.sides, device, dtype)
+        qpos, qvel, action, joints, rates = reflections(self.load_robot().mj_model, self.sides, device, dtype)
         root = (1.0, *PSEUDOVECTOR, 1.0, *VECTOR, *PSEUDOVECTOR)  # height to angular velocity
         fixed = [Reflection.of(enumerate(signs), device, dtype) for signs in (root, (1.0, 1.0))]
         seen = (fixed[0], joints, rates, fixed[1])  # as in observe

@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from diffsim.env import DiffEnv
 from diffsim.robot.constants import control_range
 from diffsim.tasks import TASKS
-from diffsim.tasks.base import FIRM_IS_GONE
 from diffsim.training.errors import fail
 from diffsim.training.layers import First, Likeliest, ObsNormalizer
 from diffsim.training.ranges import fits
@@ -127,8 +126,6 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
         fail(f"{path} is a checkpoint of format {form!r}, and this version reads format {FORMAT}")
     if script not in (None, state["script"]):
         fail(f"{path} is a checkpoint of {state['script']!r}, not of {script}.py")
-    if state["args"].get("contact") == "firm":
-        fail(f"{path} was trained with --contact firm; {FIRM_IS_GONE}")
     return state
 
 

@@ -18,7 +18,7 @@ from diffsim.env import ActionError
 from diffsim.robot.scene import SceneError, TerrainError
 from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError
-from diffsim.tasks.own import TaskError
+from diffsim.tasks import TaskError
 from diffsim.training import distributed
 
 P = ParamSpec("P")

@@ -136,7 +136,7 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
         lengths += alive
         alive &= ~(terminated | truncated)
     path = torch.stack(qpos)
-    speed, forward = None, env.task.forward
+    speed, forward = None, env.task.forward_column
     if forward is not None:
         distance = path[..., forward].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, forward]
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()

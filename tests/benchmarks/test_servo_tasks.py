@@ -10,7 +10,7 @@ import torch
 from common import ROOT
 
 from diffsim import read_clip
-from diffsim.tasks.own import ASSETS
+from diffsim.tasks.base import ASSETS
 
 TROT = ROOT / "benchmarks" / "clips" / "dog_trot.npz"
 

@@ -159,14 +159,14 @@ def test_the_table_joins_seeds() -> None:
     """Medians over seeds, the worst of what is kept, shares of each friction."""
     rows = list[dict[str, str]]()
     for seed, here, there, whole in (("1", 4, 2, 1), ("2", 3, 2.7, 0.5), ("3", 2, 1.8, 0.9)):
-        own = {"task": "ant", "contact": "firm", "seed": seed, "checkpoint": f"shac_firm/ant__{seed}"}
+        own = {"task": "ant", "contact": "mujoco", "seed": seed, "checkpoint": f"shac_rigid/ant__{seed}"}
         for name, value in (("here", here), ("MuJoCo x1", there)):
             kept, depth = str(value / here), str(10 * value)
             row = own | {"condition": name, "speed": str(value), "return": "5", "kept": kept, "penetration": depth}
             rows.append(row | {"whole": str(whole)})
     (line,) = transfer.table(rows)
     assert [*map(str, line.values())] == [
-        *"ant firm shac_firm 3 3.00 2.00 here".split(),
+        *"ant mujoco shac_rigid 3 3.00 2.00 here".split(),
         *("MuJoCo x1", "90%", "50%", "80% / 80%", "30.0", "20.0"),
     ]
 

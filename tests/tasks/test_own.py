@@ -14,7 +14,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim.tasks import TASKS, Task, TaskError, find_task
-from diffsim.tasks.own import fit, forward, robot
+from diffsim.tasks.base import way_forward
 from diffsim.training import evaluate
 from diffsim.training.evaluation import fitting
 
@@ -125,24 +125,24 @@ def test_where_the_file_of_a_robot_is_sought(tmp_path: Path, monkeypatch: pytest
     there, here = tmp_path / "there", tmp_path / "here"
     there.mkdir(), here.mkdir()
     monkeypatch.chdir(here)
-    task = find_task(write(there / "task.py", "Mine"))()
+    task = find_task(write(there / "task.py", "Mine"))
     with pytest.raises(TaskError) as error:
-        robot(task)
+        task.load_robot()
     assert line_of(error) == f"task 'task': no robot file 'own_robot.xml' in {there} or {here}"
     for folder in (here, there):
         (folder / "own_robot.xml").write_text(SLED)
-        assert robot(task) == folder / "own_robot.xml"
+        assert task.load_robot().path == str(folder / "own_robot.xml")
     for folder in (here, there):
         (folder / "hopper.xml").write_text(SLED)
     hopper = Path(diffsim.__file__).parent / "assets" / "hopper.xml"
-    assert robot(TASKS["hopper"]()) == hopper
+    assert TASKS["hopper"].load_robot().path == str(hopper)
     stand = "from diffsim.tasks.hopper import Hopper\nclass Stand(Hopper): pass\n"
     (there / "stand.py").write_text(stand)
-    assert robot(find_task(str(there / "stand.py"))()) == hopper
+    assert find_task(str(there / "stand.py")).load_robot().path == str(hopper)
     (there / "stand.py").write_text(stand + "class Sled(Stand):\n    asset = 'hopper.xml'\n")
-    assert robot(find_task(str(there / "stand.py:Sled"))()) == there / "hopper.xml"
+    assert find_task(str(there / "stand.py:Sled")).load_robot().path == str(there / "hopper.xml")
     with pytest.raises(TaskError, match="task 'task' names no robot: give it an asset"):
-        robot(Bare())
+        Bare.load_robot()
 
 
 def test_a_robot_may_be_a_model_or_a_spec_which_stays_as_it_is() -> None:
@@ -181,15 +181,13 @@ HOME = '<key name="home" qpos="1 0 .5 0 1 0 0 0 0 1 0"/>'
 
 
 def fitted(kind: type[Task], scene: diffsim.Scene) -> Task:
-    task = kind(dtype=torch.float64)
-    fit(task, scene)
-    return task
+    return kind(dtype=torch.float64).bind(scene)
 
 
 def test_a_task_starts_at_the_keyframe() -> None:
     home, flat = (scene_of(BALLS.format(key=key)) for key in (HOME, ""))
     task, rand = fitted(Bare, home), torch.rand(5, 20, dtype=torch.float64)
-    assert (task.num_random, task.obs_dim, task.forward) == (20, 20, 0)
+    assert (task.num_random, task.obs_dim, task.forward_column) == (20, 20, 0)
     qpos, qvel = task.reset(rand)
     assert qpos.tolist() == [[1, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0]] * 5 and qvel.tolist() == [[0] * 9] * 5
     assert fitted(Bare, flat).reset(rand)[0][0].tolist() == [0, 0, 0.2, 1, 0, 0, 0, 1, 0, 0, 0]
@@ -271,12 +269,12 @@ Z, X, Y = (f'<joint type="slide" axis="{axis}"/>' for axis in ("0 0 1", "1 0 0",
 )
 def test_forward_is_along_x(joints: str, turn: str, column: int | None) -> None:
     text = SLIDES.format(joints=joints, turn=turn)
-    assert forward(scene_of(text)) == column
-    assert forward(scene_of(text.replace("<geom type", "<geom contype='0' conaffinity='0' type"))) is None
+    assert way_forward(scene_of(text)) == column
+    assert way_forward(scene_of(text.replace("<geom type", "<geom contype='0' conaffinity='0' type"))) is None
 
 
 def test_the_shipped_robots_move_along_their_first_coordinate() -> None:
-    found = {name: forward(diffsim.load_scene(robot(task()))) for name, task in TASKS.items()}
+    found = {name: way_forward(task.load_robot()) for name, task in TASKS.items()}
     assert found == {name: None if name == "cartpole" else 0 for name in TASKS}
 
 
@@ -291,10 +289,10 @@ def test_a_speed_is_that_of_the_way_forward() -> None:
         start = (-0.89, 0.0, 0.0, 0.0, 2.0, 0.0)
 
     class Sideways(Glide):
-        forward = 0
+        forward_column = 0
 
     class Nowhere(Glide):
-        forward = None
+        forward_column = None
 
     results = [
         evaluate(diffsim.make(kind, num_envs=2, dtype=torch.float64), lambda obs: obs[:, :0])

@@ -20,8 +20,8 @@ import diffsim
 import shac
 from diffsim import __main__ as command
 from diffsim.tasks import Go1
+from diffsim.tasks.base import ASSETS
 from diffsim.tasks.imitation.clip import Clip
-from diffsim.tasks.own import ASSETS
 from diffsim.training import Likeliest, ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import FORMAT, load, restore, save
 

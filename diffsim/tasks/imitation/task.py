@@ -8,12 +8,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffsim.robot.mjcf import load_scene
 from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.tasks.imitation.kinematics import Kinematics, difference, matrix
-from diffsim.tasks.own import robot
 
 STRAY = 0.5  # m; the episode ends when the root is further from the reference's
 
@@ -45,7 +43,7 @@ class HumanoidImitation(Task):
         self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
     ) -> None:
         super().__init__(device, dtype)
-        scene = load_scene(robot(self))
+        scene = self.load_robot()
         model, trunk = scene.mj_model, scene.contact_link == 0
         self.clip = read_clip(self.default_clip) if clip is None else clip
         self.clip.check(model)
