@@ -1,7 +1,9 @@
-"""The wheel holds all of the package and nothing else; the source distribution holds the repository."""
+"""What a wheel, a source distribution and an editable install hold, and that the package is found in each folder."""
 
 from __future__ import annotations
 
+import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -11,12 +13,13 @@ from zipfile import ZipFile
 
 import pytest
 
+import diffsim
 from diffsim.__main__ import LEARNERS
 
-pytest.importorskip("setuptools", minversion="77", reason="pyproject's license needs setuptools 77")
+pytest.importorskip("hatchling")
 
 ROOT = Path(__file__).resolve().parents[1]
-BUILD = "from setuptools.build_meta import build_{0}; build_{0}('dist')"  # as pip does, without its isolation
+BUILD = "from hatchling.build import build_{0}; build_{0}('dist')"  # as pip does, without its isolation
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +36,7 @@ def repository() -> list[str]:
 @pytest.fixture(scope="module")
 def source(repository: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy, in which a build may leave what it likes."""
-    copy = tmp_path_factory.mktemp("source")
+    copy = tmp_path_factory.mktemp("clones") / "diffsim"
     for name in repository:
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, copy / name)
@@ -41,8 +44,9 @@ def source(repository: list[str], tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def build(kind: str, source: Path) -> Path:
+    shutil.rmtree(source / "dist", ignore_errors=True)
     subprocess.run([sys.executable, "-c", BUILD.format(kind)], cwd=source, capture_output=True, check=True)
-    (path,) = (source / "dist").glob("*.whl" if kind == "wheel" else "*.tar.gz")
+    (path,) = (source / "dist").glob("*.tar.gz" if kind == "sdist" else "*.whl")
     return path
 
 
@@ -63,5 +67,26 @@ def test_the_wheel_holds_the_package_and_the_licenses(repository: list[str], sou
 def test_the_source_distribution_holds_the_repository(repository: list[str], source: Path) -> None:
     with tarfile.open(build("sdist", source)) as archive:
         files = {member.name.partition("/")[2] for member in archive if member.isfile()}
-    extra = {name for name in files if name in ("PKG-INFO", "setup.cfg") or ".egg-info/" in name}
-    assert files - extra == {*repository}
+    assert files - {"PKG-INFO"} == {*repository}
+
+
+def test_an_editable_install_is_found_from_every_folder(source: Path, tmp_path: Path) -> None:
+    """From the clone's parent, too, where the clone's own folder has the name of the package."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path)], check=True)
+    with ZipFile(build("editable", source)) as wheel:
+        wheel.extractall(next((tmp_path / "lib").glob("python*/site-packages")))
+    program = "from importlib.util import find_spec; print(find_spec('diffsim').origin)"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    for folder in (source, source.parent, tmp_path):
+        command = [str(tmp_path / "bin" / "python"), "-c", program]
+        found = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True).stdout
+        assert Path(found.strip()) == source / "diffsim" / "__init__.py"
+
+
+def test_every_part_can_be_imported_by_its_name() -> None:
+    """No name of the package's front hides a subpackage."""
+    import diffsim.robot.scene as scene
+
+    assert scene.Scene is diffsim.Scene and diffsim.robot.scene is scene
+    for part in ("kernels", "planning", "robot", "sim", "tasks", "training", "view"):
+        assert importlib.import_module(f"diffsim.{part}") is getattr(diffsim, part)
