@@ -14,7 +14,6 @@ A machine that does something else meanwhile gives wrong numbers.
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import json
 import os
@@ -166,14 +165,13 @@ def mujoco_timer(scene: Scene, num_envs: int, timestep: float, substeps: int) ->
 
 
 def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
-    """Beside MuJoCo: with all models of its muscles and without, if a task has any; the hopper also on rough ground."""
+    """Beside MuJoCo: without its muscles, if a task has any; the hopper also on rough ground."""
     threads = THREADS if args.device == "cpu" else {args.device: 1}
     task, whole = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
     if "muscle" in whole.features:
-        scenes = {f"{kind} muscles": dataclasses.replace(whole, muscle_model=kind) for kind in ("linear", "hill")}
-        scenes["no muscles"] = whole.without("muscle")
+        scenes = {"muscles": whole, "no muscles": whole.without("muscle")}
     if name == "hopper":
         scenes["rough ground"] = whole.with_terrain(rough(0))
     kernels = [kernel for kernel in args.kernels if args.device == "cpu" or kernel != "scalar"]

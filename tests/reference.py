@@ -141,35 +141,13 @@ def joint_forces(
 
 def muscle_forces(scene: Scene, links: list[Link], ctrl: Array) -> Array:
     """(nv,) the tension of every muscle, times the rate of its length that each joint rate makes."""
-    length, slope, rate = np.nan_to_num(scene.hill[:, 0]), np.zeros((scene.nu, scene.nv)), np.zeros(scene.nu)
+    slope = np.zeros((scene.nu, scene.nv))
     for (i, j), (a, b), k in zip(scene.segment_link, scene.segment_position, scene.segment_muscle, strict=True):
-        (va, ja, _), (vb, jb, _) = (links[n].point(links[n].rotation @ p) for n, p in ((i, a), (j, b)))
+        (_, ja, _), (_, jb, _) = (links[n].point(links[n].rotation @ p) for n, p in ((i, a), (j, b)))
         apart = links[j].position + links[j].rotation @ b - links[i].position - links[i].rotation @ a
         if (distance := np.linalg.norm(apart)) > 0:
-            length[k] += distance
             slope[k] += apart / distance @ (jb - ja)
-            rate[k] += apart / distance @ (vb - va)
-    tension = scene.gear * ctrl + scene.motor_bias
-    for k in np.unique(scene.segment_muscle) if scene.muscle_model == "hill" else ():
-        _, per_length, offset, per_rate, low, high, passive, fast, strength = scene.hill[k]
-        x, v = per_length * length[k] + offset, per_rate * rate[k]
-        knees = [low, (1 + low) / 2, 1, (1 + high) / 2, high]
-        curve = interpolate_parabolas(x, knees, [0, 0.5, 1, 0.5, 0]) * (
-            np.clip(1 + v, 0, None) ** 2 if v < 0 else fast - np.clip(fast - 1 - v, 0, None) ** 2 / (fast - 1)
-        )
-        stretch = max(x - 1, 0) / (knees[3] - 1)
-        tension[k] = tension[k] * curve + strength * passive * (stretch**2 / 2 if stretch < 1 else stretch - 0.5)
-    return -tension @ slope
-
-
-def interpolate_parabolas(x: float, knees: list[float], values: list[float]) -> float:
-    """A bell of four parabolas through its knees, level at the first, the middle and the last."""
-    if not knees[0] <= x <= knees[-1]:
-        return 0.0
-    piece = max(n for n in range(4) if x >= knees[n])
-    level = [0, 2, 2, 4][piece]  # the end of the piece where it is level
-    part = (x - knees[level]) / (knees[piece + 1] - knees[piece])
-    return values[level] + (0.5 if values[level] == 0 else -0.5) * part**2
+    return -(scene.gear * ctrl + scene.motor_bias) @ slope
 
 
 def contact_law(scene: Scene, depth: float, velocity: Array, h: float = 0.0, theta: float = 0.0) -> tuple[Array, Array]:

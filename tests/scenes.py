@@ -193,27 +193,22 @@ GROUNDED = LEG.replace("<worldbody>", '<worldbody> <geom type="plane" size="1 1 
     'name="knee"', 'name="knee" limited="true" range="-40 40"'
 )
 CONSTANTS = {"k_n": 4e3, "k_d": 4e3, "k_t": 300, "mu": 0.6, "k_limit": 300, "d_limit": 200}
-MUSCLES = {"gluteus": (400, 0.18), "hamstring": (300, 0.52), "iliacus": (250, 0.55), "zigzag": (100, 1.1)}  # N, m
+MUSCLES = {"gluteus": 400, "hamstring": 300, "iliacus": 250, "zigzag": 100}  # N
 
 
-def leg(model: str, grounded: bool = False) -> str:
-    """Its MJCF with MuJoCo's <muscle> if "hill"; if "linear" with the same forces as plain actuators."""
+def leg(grounded: bool = False) -> str:
+    """Its MJCF, with muscles as plain actuators."""
     actuators = ['<motor joint="knee" gear="7"/>'] * (len(MUSCLES) + 1)
-    for n, (name, (force, length)) in enumerate(MUSCLES.items()):
-        if model == "hill":
-            lengths, curves = f"{0.6 * length} {1.3 * length}", 'range="0.6 1.5" vmax="3" fpmax="1.3" fvmax="1.3"'
-            muscle = f'<muscle tendon="{name}" force="{force}" lengthrange="{lengths}" {curves}/>'
-        else:
-            muscle = f'<general tendon="{name}" gainprm="{-force}" ctrllimited="true" ctrlrange="0 1"/>'
-        actuators[n + (n >= 2)] = muscle
-    custom = f'<text name="muscle_model" data="{model}"/>'
-    custom += "".join(f'<numeric name="{name}" data="{value}"/>' for name, value in CONSTANTS.items() if grounded)
+    for n, (name, force) in enumerate(MUSCLES.items()):
+        pull = f'<general tendon="{name}" gainprm="{-force}" ctrllimited="true" ctrlrange="0 1"/>'
+        actuators[n + (n >= 2)] = pull
+    custom = "".join(f'<numeric name="{name}" data="{value}"/>' for name, value in CONSTANTS.items() if grounded)
     return (GROUNDED if grounded else LEG).format(custom=custom, actuators="".join(actuators))
 
 
 @cache
-def leg_scene(model: str, grounded: bool = False) -> Scene:
-    return parse(leg(model, grounded))
+def leg_scene(grounded: bool = False) -> Scene:
+    return parse(leg(grounded))
 
 
 def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
@@ -225,11 +220,11 @@ def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple
 
 
 def varied_robot(name: str, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
-    """A robot for the factors, all of which matter in its states: "linear" and "hill" legs, "hopper"."""
+    """A robot for the factors, all of which matter in its states: "leg" or "hopper"."""
     if name == "hopper":
         scene = task_scene(name).with_penalty({"d_limit": 500.0})
         return scene, acting_states(scene, count, rng)
-    return grounded_states(leg_scene(name, grounded=True), count, rng)
+    return grounded_states(leg_scene(grounded=True), count, rng)
 
 
 # A pendulum on a cart that is pulled from the wall.

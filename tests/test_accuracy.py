@@ -334,14 +334,13 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "ball": r"\(var_m\)\.(ball_\w+|qpos_adr|inboard|outboard)\b",
     "muscle": r"\(var_m\)\.(pair_\w+|segment_\w+)\b",
     "drag": r"\(var_m\)\.drag_\w+\b",
-    "hill": r"\(var_m\)\.hill\b",
     "floating": r"\bquat",  # or a ball; every ball here is on a floating base
 }
 
 
-@pytest.mark.parametrize("name", [*TASKS, "linear", "hill"])
+@pytest.mark.parametrize("name", [*TASKS, "leg"])
 def test_kernels_hold_the_code_of_the_features_and_no_other(name):
-    scene = task_scene(name) if name in TASKS else leg_scene(name, grounded=name == "linear")
+    scene = task_scene(name) if name in TASKS else leg_scene(grounded=True)
     text = source(scene)
     for feature, pattern in CODE.items():
         assert bool(re.search(pattern, text)) == (feature in scene.features), feature

@@ -26,8 +26,8 @@ COUNT = BLOCK + 1
 
 def case(name: str, rng: np.random.Generator):
     """A scene and states of COUNT environments in which all of its laws act; most are other tests' scenes."""
-    if name == "hill":
-        return grounded_states(leg_scene(name, grounded=True), COUNT, rng)
+    if name == "leg":
+        return grounded_states(leg_scene(grounded=True), COUNT, rng)
     if name == "fish":
         scene = parse(FISH)
         return scene, tuple(np.resize(x, (COUNT, x.shape[1])) for x in states_of(scene, rng))
@@ -64,7 +64,7 @@ def step(scene, states, dtype, integration, weights=None, **options):
         pytest.param("hopper", EXTRAPOLATED, {"forces": True}, marks=pytest.mark.slow),
         pytest.param("fish", SEMI, {}, marks=pytest.mark.slow),
         pytest.param("half_cheetah", IMPLICIT, {}, marks=pytest.mark.slow),
-        pytest.param("hill", SEMI, {"factors": True}, marks=pytest.mark.slow),
+        pytest.param("leg", SEMI, {"factors": True}, marks=pytest.mark.slow),
         pytest.param("hopper on hills", SEMI, {}, marks=pytest.mark.slow),
         pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),
     ],

@@ -266,7 +266,7 @@ def test_few_passes_have_a_gradient_of_usual_size(rng):
 
 @pytest.mark.slow
 def test_muscle_gradient_is_that_of_differences(rng):
-    scene = leg_scene("linear", grounded=True)
+    scene = leg_scene(grounded=True)
     qpos, qvel, ctrl = free_states(scene, 8, rng)
     check_gradients(raise_ground(scene, qpos), (qpos, 0.1 * qvel, ctrl), rng)
 

@@ -27,7 +27,6 @@ from scenes import (
     check_that_ground_and_limits_act,
     free_states,
     in_free_flight,
-    leg,
     leg_scene,
     parse,
     pass_limits,
@@ -64,10 +63,9 @@ def mujoco_acceleration(scene, qpos, qvel, ctrl, forces=None):
     model = copy.copy(scene.mj_model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     muscles = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
-    if scene.muscle_model == "linear":  # a <muscle> of that force without its curves
-        model.actuator_gaintype[muscles] = mujoco.mjtGain.mjGAIN_FIXED
-        model.actuator_biastype[muscles] = mujoco.mjtBias.mjBIAS_NONE
-        model.actuator_gainprm[muscles, 0] = -2 * scene.gear[muscles]
+    model.actuator_gaintype[muscles] = mujoco.mjtGain.mjGAIN_FIXED  # that force without its curves
+    model.actuator_biastype[muscles] = mujoco.mjtBias.mjBIAS_NONE
+    model.actuator_gainprm[muscles, 0] = -2 * scene.gear[muscles]
     data, qacc = mujoco.MjData(model), np.empty_like(qvel)
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     for e in range(len(qpos)):
@@ -145,26 +143,18 @@ def test_gravity_compensation_and_a_free_joints_inertia_are_mujocos(rng):
     check_against_mujoco(scene, torch.float64, rng)
 
 
-@pytest.mark.parametrize("model", ["linear", "hill"])
-def test_muscles_pull_as_mujocos(model, rng):
-    """Moment arms, and for the Hill-type force also lengths and their rates, in every part of its curves."""
-    check_against_mujoco(leg_scene(model, grounded=model == "linear"), torch.float64, rng)
-
-
-def test_a_muscle_that_is_no_stronger_while_it_lengthens(rng):
-    """fvmax 1: half of a curve has no width."""
-    scene = parse(leg("hill").replace('fvmax="1.3"', 'fvmax="1"'))
-    check_against_mujoco(scene, torch.float64, rng)
+def test_muscles_pull_as_mujocos(rng):
+    check_against_mujoco(leg_scene(grounded=True), torch.float64, rng)
 
 
 def mujoco_tendons(scene, qpos):
-    """MuJoCo's ten_length (nt,), and the columns of its ten_J (nt, nv): ten_velocity under one joint rate at a time."""
+    """The columns of MuJoCo's ten_J (nt, nv): ten_velocity under one joint rate at a time."""
     data, arms = mujoco.MjData(scene.mj_model), []
     for rate in np.eye(scene.nv):
         data.qpos, data.qvel = qpos, rate
         mujoco.mj_forward(scene.mj_model, data)
         arms.append(data.ten_velocity.copy())
-    return data.ten_length, np.array(arms).T
+    return np.array(arms).T
 
 
 def joint_force(scene, qpos, change):
@@ -180,41 +170,16 @@ def test_moment_arms_are_mujocos_ten_j(rng):
     for qpos in free_states(scene, 4, rng)[0]:
         qacc = acceleration(scene, np.tile(qpos, (len(active), 1)), np.zeros((len(active), scene.nv)), active)
         arms = -joint_force(scene, qpos, qacc[1:] - qacc[0]) / (2 * scene.gear[:, None])
-        np.testing.assert_allclose(arms, mujoco_tendons(scene, qpos)[1], rtol=0, atol=1e-10)
-
-
-def test_lengths_are_mujocos_ten_length(rng):
-    """Read off a passive force that is set to 1 N plus 1 N/m of the length."""
-    scene = without_ground(leg_scene("hill"))
-    muscles, (poses, _, _) = np.delete(np.arange(scene.nu), 2), free_states(scene, 8, rng)  # 2 is the motor
-    still, idle = np.zeros((8, scene.nv)), np.full((8, scene.nu), -1.0)
-    idle[:, 2] = 0.0
-    hill = scene.hill.copy()
-    hill[:, 1:] = 1.0, 2.5, 1.0, 0.5, 3.0, 1.0, 1.3, 0.0  # f_P(l) = l - 1.5 beyond l = 2, of l = length + 2.5
-    slack = acceleration(dataclasses.replace(scene, hill=hill), poses, still, idle)
-    for tendon, k in enumerate(muscles):
-        stiff = hill.copy()
-        stiff[k, -1] = 1.0  # N
-        qacc = acceleration(dataclasses.replace(scene, hill=stiff), poses, still, idle) - slack
-        for qpos, change in zip(poses, qacc, strict=True):
-            lengths, arms = mujoco_tendons(scene, qpos)
-            pull = -joint_force(scene, qpos, change) @ arms[tendon] / (arms[tendon] @ arms[tendon])
-            np.testing.assert_allclose(pull - 1.0, lengths[tendon], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(arms, mujoco_tendons(scene, qpos), rtol=0, atol=1e-10)
 
 
 def test_muscle_on_the_world_pulls_as_mujocos(rng):
     check_against_mujoco(parse(CRANE), torch.float64, rng)
 
 
-@pytest.mark.parametrize("text, model", [("", "linear"), ('<text name="muscle_model" data="hill"/>', "hill")])
-def test_an_mjcf_asks_for_hill_type_muscles(text, model, rng):
-    """The same <muscle> has MuJoCo's curves where the file says so, and its maximum force alone elsewhere."""
+def test_a_muscle_pulls_with_its_maximum_force_alone(rng):
     muscle = '<muscle name="winch" tendon="rope" force="9" lengthrange=".5 3" range="0.6 1.5"/>'
-    mjcf = re.sub("<motor.*/>", muscle, CRANE).replace("<worldbody>", f"<custom> {text} </custom> <worldbody>")
-    scene = parse(mjcf)
-    assert scene.muscle_model == model and ("hill" in scene.features) == (model == "hill")
-    if model == "linear":  # a leg above has the curves
-        check_against_mujoco(scene, torch.float64, rng)
+    check_against_mujoco(parse(re.sub("<motor.*/>", muscle, CRANE)), torch.float64, rng)
 
 
 # Against the plain NumPy reference
@@ -252,9 +217,8 @@ def test_ball_joint_takes_implicit_steps_as_the_reference(theta, rng):
     check_against_reference(scene, *free_states(scene, 4, rng), "implicit", 4, theta)
 
 
-@pytest.mark.parametrize("model", ["linear", "hill"])
-def test_muscle_steps_are_the_references(model, rng):
-    scene = leg_scene(model, grounded=model == "linear")
+def test_muscle_steps_are_the_references(rng):
+    scene = leg_scene(grounded=True)
     check_against_reference(scene, *free_states(scene, 4, rng), "semi_implicit", 16)
 
 

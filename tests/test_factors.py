@@ -21,7 +21,7 @@ SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
 
 
 @pytest.mark.parametrize("integration", SETTINGS)
-@pytest.mark.parametrize("name", ["linear", "hopper"])
+@pytest.mark.parametrize("name", ["leg", "hopper"])
 def test_steps_are_the_references(name, integration, rng):
     scene, states = varied_robot(name, 4, rng)
     factors = rng.uniform(0.5, 2.0, (4, len(FACTORS)))
@@ -46,7 +46,7 @@ def test_factors_of_one_change_no_bit(rng):
 
 def test_each_environment_and_step_has_its_own(rng):
     """Steps of a window see what was written in place before them, and so do their adjoints."""
-    scene, states = varied_robot("linear", 2, rng)
+    scene, states = varied_robot("leg", 2, rng)
     sim = Simulator(scene, 2, SETTINGS[0], horizon=2, dtype=torch.float64, factors=True)
     q, v, u = (torch.tensor(x, requires_grad=True) for x in states)
     per_step = rng.uniform(0.5, 2.0, (2, 2, len(FACTORS)))
@@ -116,7 +116,7 @@ def test_wrong_factors_are_refused():
 
 
 def test_kernels_without_factors_do_not_know_them():
-    scene = leg_scene("linear", grounded=True)
+    scene = leg_scene(grounded=True)
     plain, varied = source(scene), source(scene, varied=True)
     for name in ("contact_constants_adjoint", "limit_constants_gain", "(var_m).carried"):
         assert name in varied and name not in plain

@@ -50,13 +50,13 @@ def test_accelerations_are_mujocos(name, rng):
     assert relative_error(qacc, acceleration(scene, *states)) > 0.01
 
 
-@pytest.mark.parametrize("name, integration", [("linear", SETTINGS[1]), ("hopper", SETTINGS[0])])
+@pytest.mark.parametrize("name, integration", [("leg", SETTINGS[1]), ("hopper", SETTINGS[0])])
 def test_steps_are_the_references(name, integration, rng):
     """The leg's with factors besides the forces."""
     if name == "hopper":
         scene, states = SCENES[name], acting_states(SCENES[name], 4, rng)
     else:
-        scene, states = grounded_states(leg_scene(name, grounded=True), 4, rng)
+        scene, states = grounded_states(leg_scene(grounded=True), 4, rng)
     factors, forces = rng.uniform(0.5, 2.0, (4, len(FACTORS))), wrenches(scene, 4, rng)
     given = {} if name == "hopper" else {"factors": factors}
     ends = run(scene, *states, forces=forces, integration=integration, **given)
@@ -75,13 +75,13 @@ def test_gradients_are_those_of_differences(name, rng):
 
 
 def test_gradients_on_the_ground_with_factors_are_those_of_differences(rng):
-    scene, states = grounded_states(leg_scene("linear", grounded=True), 8, rng)
+    scene, states = grounded_states(leg_scene(grounded=True), 8, rng)
     optional = {"factors": rng.uniform(0.5, 2.0, (8, len(FACTORS))), "forces": wrenches(scene, 8, rng)}
     check_gradients(scene, states, rng, optional, integration=SETTINGS[1])
 
 
 def test_no_force_changes_no_bit(rng):
-    scene, states = grounded_states(leg_scene("linear", grounded=True), 16, rng)
+    scene, states = grounded_states(leg_scene(grounded=True), 16, rng)
     results = []
     for forces in (False, True):
         sim = Simulator(scene, 16, SETTINGS[1], dtype=torch.float64, factors=True, forces=forces)
@@ -171,7 +171,7 @@ def test_wrong_forces_are_refused():
 
 
 def test_kernels_without_forces_do_not_know_them():
-    scene = leg_scene("linear", grounded=True)
+    scene = leg_scene(grounded=True)
     plain, forced = source(scene, varied=True), source(scene, varied=True, forced=True)
     for name in ("add_forces", "add_forces_adjoint", "(var_m).body_com"):
         assert name in forced and name not in plain

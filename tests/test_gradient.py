@@ -36,7 +36,6 @@ from diffsim.tasks import TASKS
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
 CASES = [(name, *kind) for kind in INTEGRATORS for name in (DISTINCT if kind[0] == "implicit" else ROBOTS)]
 LARGE = "humanoid", "humanoid_mtu", "swimmer"  # whose implicit kernels no other test needs
-HILL = ("hill", "semi_implicit", 0.0)  # its muscles do not meet the integrator
 ONE = Integration(substeps=1)
 STEPS = {"factors": 1e-5, "forces": 1e-2}  # of differences
 
@@ -127,19 +126,14 @@ def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
     check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(integrator, theta=theta))
 
 
-@pytest.mark.parametrize("model", ["linear", pytest.param("hill", marks=pytest.mark.slow)])
-def test_muscle_gradient_is_that_of_differences(model, rng):
-    scene = leg_scene(model, grounded=model == "linear")
+def test_muscle_gradient_is_that_of_differences(rng):
+    scene = leg_scene(grounded=True)
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))
 
 
 @pytest.mark.parametrize(
     "name, integrator, theta",
-    [
-        *(("linear", *kind) for kind in INTEGRATORS),
-        *(("hopper", *kind) for kind in INTEGRATORS),
-        pytest.param(*HILL, marks=pytest.mark.slow),
-    ],
+    [(name, *kind) for name in ("leg", "hopper") for kind in INTEGRATORS],
 )
 def test_gradient_in_factors_is_that_of_differences(name, integrator, theta, rng):
     """Of every factor by itself; and in state and control where the factors are not one."""

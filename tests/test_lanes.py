@@ -103,7 +103,7 @@ def motors_among_muscles() -> diffsim.Scene:
 
 
 @pytest.mark.parametrize("team", TEAMS)
-@pytest.mark.parametrize("scene", [task_scene("ant"), leg_scene("hill"), motors_among_muscles()])
+@pytest.mark.parametrize("scene", [task_scene("ant"), leg_scene(), motors_among_muscles()])
 def test_a_motors_gradient_is_written_by_a_lane_that_has_its_link(scene: diffsim.Scene, team: tuple[int, int]) -> None:
     model = model_of(scene, divide(scene, *team), wp.float64, "cpu")
     slots = model.motor_slot.numpy().reshape(team[0], scene.nu)

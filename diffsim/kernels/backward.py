@@ -43,10 +43,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     Model, law_of, solve_with_factor = t.Model, environment_law(spec), factor_solve(spec)
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
-    muscle, constraint = muscle_law(spec, adjoint=True), constraint_law(spec)
+    muscle, constraint = muscle_law(spec), constraint_law(spec)
     CONSTRAINED, SOLVES, DAMPED, NV = spec.constrained, spec.solves, spec.damped, spec.nv
-    CONTACT, DRIVEN, CLAMP, MUSCLE, HILL, LIMIT = (
-        name in spec.features for name in ("contact", "motor", "clamp", "muscle", "hill", "limit")
+    CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT = (
+        name in spec.features for name in ("contact", "motor", "clamp", "muscle", "limit")
     )
     LIMIT = LIMIT and not spec.constrained  # the penalty law
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
@@ -143,17 +143,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             pull = wp.zeros(shape=NU, dtype=T)
             adj_pull = wp.zeros(shape=NU, dtype=T)
             muscle.activate(m, law, lane, ctrl, e, pull)
-            tension = pull
-            by_length = pull
-            by_rate = pull
-            path = pull
-            power = pull
-        if wp.static(HILL):
-            tension = wp.zeros(shape=NU, dtype=T)
-            by_length = wp.zeros(shape=NU, dtype=T)
-            by_rate = wp.zeros(shape=NU, dtype=T)
-            power = wp.zeros(shape=NU, dtype=T)
-            path = wp.zeros(shape=NU, dtype=T)
         if wp.static(CONSTRAINED):
             B = wp.zeros(shape=SLOTS, dtype=vec6)  # as in the forward kernel, and its adjoint
             adj_b = wp.zeros(shape=SLOTS, dtype=vec6)
@@ -295,9 +284,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, at, n, forces, e, R, x, W, adj_w, adj_p, adj_forces)
             if wp.static(MUSCLE):
-                muscle.add_muscles_adjoint(
-                    m, lane, pull, tension, by_length, by_rate, path, power, R, x, V, W, adj_v, adj_w, adj_p, adj_pull
-                )
+                muscle.add_muscles_adjoint(m, lane, pull, R, x, W, adj_w, adj_p, adj_pull)
             # 4. inward: sum over subtrees, project on the joints
             if wp.static(SHARERS > 1):
                 sums.sharers.add_vectors(adj_a)

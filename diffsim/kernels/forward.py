@@ -37,10 +37,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
-    muscle, base, constraint = muscle_law(spec, adjoint=False), base_inertia(spec), constraint_law(spec)
-    CONTACT, MOTOR, CLAMP, MUSCLE, HILL = (
-        name in spec.features for name in ("contact", "motor", "clamp", "muscle", "hill")
-    )
+    muscle, base, constraint = muscle_law(spec), base_inertia(spec), constraint_law(spec)
+    CONTACT, MOTOR, CLAMP, MUSCLE = (name in spec.features for name in ("contact", "motor", "clamp", "muscle"))
     NU, FLOATING, IMPLICIT, FORCED = spec.nu, spec.floating, spec.implicit, spec.forced > 0
     # With MuJoCo's constraints a substep takes several solves.
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
@@ -186,13 +184,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
             muscle.activate(m, law, lane, ctrl, e, pull)
-            tension = pull
-            lengths = pull
-            rates = pull
-        if wp.static(HILL):
-            tension = wp.zeros(shape=NU, dtype=T)
-            lengths = wp.zeros(shape=NU, dtype=T)
-            rates = wp.zeros(shape=NU, dtype=T)
         if wp.static(MOTOR):
             joint.drive(m, law, lane, n, ctrl, e, motor)
         for i in range(1, n):
@@ -259,7 +250,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(FORCED):
                 force.add_forces(m, at, n, forces, e, R, x, loads)
             if wp.static(MUSCLE):
-                muscle.add_muscles(m, lane, pull, tension, lengths, rates, R, x, V, loads)
+                muscle.add_muscles(m, lane, pull, R, x, loads)
             # 2. inward: articulated inertias. With constraints each pass is a step of Newton's method, the first as if
             # all of them stuck. MuJoCo's implicit damping is one pass more: (M + h b) change = -h b a.
             begin = 0

@@ -16,7 +16,7 @@ from diffsim.robot.scene import Scene
 @cache
 def scene_types(dtype: type) -> SimpleNamespace:
     """Warp's vector types of a scene's numbers, and their struct."""
-    vec3, vec4, vec9, vec11 = (wp.types.vector(n, dtype) for n in (3, 4, 9, 11))
+    vec3, vec4, vec11 = (wp.types.vector(n, dtype) for n in (3, 4, 11))
     mat3 = wp.types.matrix((3, 3), dtype)
 
     @wp.struct
@@ -74,7 +74,6 @@ def scene_types(dtype: type) -> SimpleNamespace:
         segment_a: wp.array(dtype=vec3)
         segment_b: wp.array(dtype=vec3)
         segment_muscle: wp.array(dtype=int)
-        hill: wp.array(dtype=vec9)
         contact_begin: wp.array(dtype=int)  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
         contact_position: wp.array(dtype=vec3)
         contact_radius: wp.array(dtype=dtype)
@@ -100,7 +99,7 @@ def scene_types(dtype: type) -> SimpleNamespace:
         k_t: dtype
         mu: dtype
 
-    return SimpleNamespace(vec3=vec3, vec4=vec4, vec9=vec9, vec11=vec11, mat3=mat3, Model=Model)
+    return SimpleNamespace(vec3=vec3, vec4=vec4, vec11=vec11, mat3=mat3, Model=Model)
 
 
 @cache
@@ -272,7 +271,6 @@ class _Writer:
             segment_a=scene.segment_position[order, 0],
             segment_b=scene.segment_position[order, 1],
             segment_muscle=scene.segment_muscle[order],
-            hill=scene.hill,
         )
 
     def put_contacts_and_bodies(self) -> None:

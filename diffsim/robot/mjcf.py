@@ -28,7 +28,6 @@ from diffsim.robot.constants import (
     numeric,
     pair_law,
     servos,
-    text,
 )
 from diffsim.robot.refuse import obstacles, overflows
 from diffsim.robot.report import approximations, troubles
@@ -273,13 +272,12 @@ class _Reader:
         """Columns (nu, ...); without a spring on their link, the constant forces of servos are the motors'."""
         m = self.m
         tendon, (low, high) = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, control_range(m)
-        link, scale, hill = np.zeros(m.nu, np.int32), np.zeros(m.nu), np.full((m.nu, 9), np.nan)
+        link, scale = np.zeros(m.nu, np.int32), np.zeros(m.nu)
         segments: list[Segment] = []
         for a in range(m.nu):
             if tendon[a]:
-                constant, pieces = self._path(m.actuator_trnid[a, 0], a)
-                segments += pieces
-                scale[a], hill[a] = self._muscle(a, constant)
+                segments += self._path(m.actuator_trnid[a, 0], a)
+                scale[a] = self._strength(a)
             else:
                 link[a], gear = self._gear(a)
                 scale[a] = gear * m.actuator_gainprm[a, 0]
@@ -292,8 +290,6 @@ class _Reader:
             "segment_link": np.array([s.links for s in segments], np.int32).reshape(-1, 2),
             "segment_position": np.array([s.ends for s in segments]).reshape(-1, 2, 3),
             "segment_muscle": np.array([s.actuator for s in segments], np.int32),
-            "hill": hill,
-            "muscle_model": text(m, "muscle_model", "linear"),
         }
 
     def _gear(self, a: int) -> tuple[int, float]:
@@ -304,31 +300,26 @@ class _Reader:
             axis = int(np.abs(m.actuator_gear[a, :3]).argmax())
         return self._link(joint) + axis, m.actuator_gear[a, axis]
 
-    def _muscle(self, a: int, constant: float) -> tuple[float, list[float]]:
-        """Force per activation, and the numbers of the Hill-type model; constant: length of the path within links."""
-        m, strength, gain = self.m, self._numeric("muscle_strength", 1.0), self.m.actuator_gainprm[a, :9]
+    def _strength(self, a: int) -> float:
+        """Force of a tendon's actuator per activation."""
+        m, strength, gain = self.m, self._numeric("muscle_strength", 1.0), self.m.actuator_gainprm[a]
         if motors(m)[a]:
-            return -strength * m.actuator_gear[a, 0] * gain[0], [np.nan] * 9
-        start, end, force, per_weight, lmin, lmax, vmax, fpmax, fvmax = gain
-        scale = strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
-        near, far = m.actuator_lengthrange[a]
-        fibre = (far - near) / (end - start)  # m, where the muscle is strongest
-        return scale, [constant, 1 / fibre, start - near / fibre, 1 / (fibre * vmax), lmin, lmax, fpmax, fvmax, scale]
+            return -strength * m.actuator_gear[a, 0] * gain[0]
+        force, per_weight = gain[2:4]
+        return strength * (force if force >= 0 else per_weight / m.actuator_acc0[a])
 
-    def _path(self, tendon: int, actuator: int) -> tuple[float, list[Segment]]:
-        """The length of a tendon within links, and its segments between two."""
+    def _path(self, tendon: int, actuator: int) -> list[Segment]:
+        """The segments of a tendon between two links."""
         m, points = self.m, list[tuple[int, Array]]()
         for site in m.wrap_objid[m.tendon_adr[tendon] :][: m.tendon_num[tendon]]:
             link, rotation, position = self.body[m.site_bodyid[site]]
             points.append((link, position + rotation @ m.site_pos[site]))
-        constant, segments = 0.0, list[Segment]()
+        segments = list[Segment]()
         for (i, a), (j, b) in zip(points, points[1:], strict=False):
-            if i == j:
-                constant += float(np.linalg.norm(b - a))
-            else:
+            if i != j:
                 ends = [a, b] if i < j else [b, a]
                 segments.append(Segment((min(i, j), max(i, j)), np.array(ends), actuator))
-        return constant, segments
+        return segments
 
     def _contacts(self, mass: float, slide: NDArray[np.bool_]) -> dict[str, Any]:
         m = self.m

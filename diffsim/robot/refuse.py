@@ -31,7 +31,7 @@ from diffsim.robot.constants import (
     servos,
     text,
 )
-from diffsim.robot.scene import MUSCLE_MODELS, PENALTY_CONSTANTS, Array, Scene
+from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
 
 Kind, Joint = mujoco.mjtObj, mujoco.mjtJoint
 Mask = NDArray[np.bool_]
@@ -84,11 +84,9 @@ def obstacles(m: mujoco.MjModel) -> list[str]:
 
 def overflows(scene: Scene) -> list[str]:
     """Likewise of actuators whose forces, products of the file's numbers, single precision does not hold."""
-    muscle = np.zeros(scene.nu, bool)
-    muscle[scene.segment_muscle] = "hill" in scene.features
     names = "stiffness", "damping", "spring_ref", "servo_stiffness", "servo_damping", "servo_ref"
     springs = np.array([getattr(scene, name) for name in names])[:, scene.motor_link]
-    numbers = np.column_stack((scene.gear, scene.motor_bias, *springs, np.where(muscle[:, None], scene.hill, 0.0)))
+    numbers = np.column_stack((scene.gear, scene.motor_bias, *springs))
     why = f"its force is beyond single precision, {GREATEST:.2g} N at most"
     return _lines(_where(scene.mj_model, Kind.mjOBJ_ACTUATOR, {why: ~_finite(numbers).all(1)}))
 
@@ -203,9 +201,8 @@ def _names(m: mujoco.MjModel) -> Iterator[Obstacle]:
         if len(values) > 1 or not all(0 <= value <= GREATEST for value in values):
             why = f"{' '.join(f'{v:g}' for v in values)}, must be one number, finite and not negative"
             yield Obstacle("numeric", repr(name), why)
-    model = text(m, "muscle_model", "linear")
-    if model not in MUSCLE_MODELS:
-        yield Obstacle("text", "'muscle_model'", f"{model!r}; choose from {', '.join(MUSCLE_MODELS)}")
+    if (model := text(m, "muscle_model", "linear")) != "linear":
+        yield Obstacle("text", "'muscle_model'", f"{model!r} is not simulated; a muscle's force is linear here")
 
 
 # Elements -------------------------------------------------------------------------------------------------------------
@@ -306,7 +303,6 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
     stiffness, damping = np.where(servos(m), -m.actuator_biasprm[:count, 1:3].T, 0.0)
     bounded, joint = m.actuator_forcelimited[:count] != 0, np.where(tendon, -1, m.actuator_trnid[:count, 0])
     shared = (joint[:, None] == joint).sum(1) > 1
-    hill = text(m, "muscle_model", "linear") == "hill"
     idle = tendon & ~motor & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
     rules = {
         f"only {ON_TENDON}": tendon & ~pulls,
@@ -315,7 +311,6 @@ def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
         "its damping (minus biasprm's third number) is {damping:g}, must not be negative": turns & (damping < 0),
         "forcerange of what pulls a tendon is not simulated": tendon & bounded,
         "forcerange is simulated of a joint's only actuator": turns & bounded & shared,
-        "muscle_model 'hill' needs a <muscle>": tendon & motor & hill,
         "its force follows from what it moves, and it moves nothing; give force": pulls & idle,
         "ctrlrange {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
     }

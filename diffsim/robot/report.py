@@ -68,7 +68,7 @@ def _parts(scene: Scene) -> Iterator[str]:
     )
     limited = np.count_nonzero(np.isfinite(scene.upper))
     muscles = len(np.unique(scene.segment_muscle))
-    shares = {"motors": scene.nu - muscles, f"muscles ({scene.muscle_model})": muscles}
+    shares = {"motors": scene.nu - muscles, "muscles": muscles}
     yield f"links      {scene.nlink - 1} of one degree of freedom, base {'floating' if scene.floating else 'fixed'}"
     yield f"joints     {', '.join(moving)}; {limited} limited"
     yield f"state      nq {scene.nq}, nv {scene.nv}"
@@ -191,8 +191,7 @@ def _actuators(scene: Scene) -> list[str]:
         sentences.append(f"A control of -1 to 1 is taken as it is by actuators without ctrlrange: {listed(free)}.")
     if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         sentences.append("A control sets the activation of a <muscle> at once.")
-        if scene.muscle_model != "hill":
-            sentences.append("A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves.")
+        sentences.append("A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves.")
     return sentences
 
 

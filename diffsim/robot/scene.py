@@ -31,8 +31,6 @@ PENALTY_CONSTANTS = {
 # What may differ between environments, see Simulator: each column of its factors multiplies one of these.
 FACTORS = (*PENALTY_CONSTANTS, "mass", "motor")
 
-MUSCLE_MODELS = ("linear", "hill")
-
 
 class SceneError(ValueError):
     """An MJCF file that is missing, broken, or holds something that is not simulated; names the element."""
@@ -104,8 +102,6 @@ class Scene:
     segment_link: Index  # (ns, 2)
     segment_position: Array  # (ns, 2, 3) the end points in the links' frames
     segment_muscle: Index  # (ns,) whose path it is
-    hill: Array  # (nu, 9) numbers of the Hill-type model (kernels/hill.py), NaN where not a <muscle>
-    muscle_model: str  # "linear" (the paper's: force = maximum force times activation) or "hill"
     spheres: Spheres
     # Those that have a spring and a damper, as they do not lie inside another one in every pose
     contact_link: Index  # (nc,)
@@ -124,12 +120,6 @@ class Scene:
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
     approximations: tuple[str, ...] = ()  # what the file asks for and is simulated only roughly, a sentence each
-
-    def __post_init__(self) -> None:
-        if self.muscle_model not in MUSCLE_MODELS:
-            raise ValueError(f"muscle_model is {self.muscle_model!r}; choose from {', '.join(MUSCLE_MODELS)}")
-        if self.muscle_model == "hill" and np.isnan(self.hill[self.segment_muscle]).any():
-            raise ValueError("muscle_model 'hill' needs a <muscle> for every actuator of a tendon")
 
     @property
     def nlink(self) -> int:
@@ -188,7 +178,6 @@ class Scene:
             "clamp": bool((np.isfinite(self.force_low) | np.isfinite(self.force_high)).any()),
             "motor": bool((self.motor_link > 0).any()),
             "muscle": len(self.segment_muscle) > 0,
-            "hill": len(self.segment_muscle) > 0 and self.muscle_model == "hill",
             "drag": self.density > 0 or self.viscosity > 0,
         }
         return frozenset(name for name, used in present.items() if used)

@@ -35,7 +35,7 @@ class Simulator:
     Attributes:
         factors: (N, 8) multipliers of the scene's constants, at first ones, columns in the order of scene.FACTORS:
             constants of contact and of all limits, mass and inertia of all links (not armature), force of all motors
-            and muscles (not the passive one of a Hill-type muscle). Change it in place or assign another tensor; a
+            and muscles. Change it in place or assign another tensor; a
             step uses those of its call and is differentiable in them. (N, 0) without the argument.
         forces: (N, nbody, 6) external force (N) and torque (N m) on each body, in world axes at its centre of mass, at
             first zero: MuJoCo's xfrc_applied, with the rows of scene.mj_model's bodies. What acts on the world or on a

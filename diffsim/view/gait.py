@@ -59,7 +59,7 @@ class Gait:
     trunk: float  # share of the frames in which the trunk, the body without a parent, touches the ground
     speed: float | None  # mean forward speed, m/s; None of a task that knows no way forward
     # Sum over motors and muscles of |force times mean rate over a control step|, which pays for positive and negative
-    # work alike, over m g v. None if the robot does not move forward, weighs nothing, or has Hill-type muscles.
+    # work alike, over m g v. None if the robot does not move forward or weighs nothing.
     cost_of_transport: float | None
     peak_joint_speed: float  # rad/s, of the fastest hinge or ball joint, a mean over one control step
     max_penetration: float  # m, how far a contact sphere of the scene reaches below the ground at most
@@ -124,7 +124,7 @@ def describe(scene: Scene, control_dt: float, episodes: Episodes, forward: int |
     standing = np.concatenate([feet[feet > 0] for feet in stance])
     trunk = _parents(scene.mj_model)[contact_bodies(scene)] == 0
     weight = float(scene.mass.sum() * np.linalg.norm(scene.gravity))
-    priced = distance > 0 and weight > 0 and "hill" not in scene.features and not servos(scene.mj_model).any()
+    priced = distance > 0 and weight > 0 and not servos(scene.mj_model).any()
     return Gait(
         feet=_feet([*limbs], [feet > 0 for feet in stance], control_dt),
         trunk=float((depth[:, trunk] > 0).any(1).mean()),

@@ -223,8 +223,8 @@ def test_unlimited_joint_has_infinite_bounds():
 
 
 def test_muscles():
-    """Segments between two links, by pairs of links; the rest of a path has a constant length."""
-    scene = leg_scene("hill")
+    """Segments between two links, by pairs of links."""
+    scene = leg_scene()
     pelvis, thigh, shin = 0, 3, 4
     np.testing.assert_array_equal(scene.motor_link, [0, 0, shin, 0, 0])
     np.testing.assert_allclose(scene.gear, [200, 150, 7, 125, 50])
@@ -233,16 +233,15 @@ def test_muscles():
     np.testing.assert_array_equal(scene.segment_link, pairs)
     np.testing.assert_array_equal(scene.segment_muscle, [0, 1, 3, 4, 1, 3, 4, 4])
     np.testing.assert_allclose(scene.segment_position[3], [[0.05, 0.1, 0.05], [-0.03, 0, -0.05]])
-    np.testing.assert_allclose(scene.hill[:, 0], [0, np.hypot(0.02, 0.15), np.nan, np.hypot(0.06, 0.1), 0])
-    assert {"muscle", "hill", "ball"} < scene.features and "hill" not in leg_scene("linear").features
+    assert {"muscle", "ball"} < scene.features
     bare = scene.without("muscle")
-    assert bare.features == scene.features - {"muscle", "hill"} and bare.nu == 5
+    assert bare.features == scene.features - {"muscle"} and bare.nu == 5
 
 
 def test_strength_of_muscles():
     strength = '<numeric name="muscle_strength" data="0.36"/>'
     scene = parse(tendon(actuator=f"<muscle {MUSCLE}/>", custom=strength))
-    np.testing.assert_allclose([scene.gear[0], scene.motor_bias[0], scene.hill[0, -1]], [0.9, 0.9, 1.8])
+    np.testing.assert_allclose([scene.gear[0], scene.motor_bias[0]], [0.9, 0.9])
     half = tendon(actuator=f'<muscle {MUSCLE} ctrllimited="true" ctrlrange="0 0.5"/>')
     np.testing.assert_allclose([parse(half).gear[0], parse(half).motor_bias[0]], [1.25, 1.25])
 

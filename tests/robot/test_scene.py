@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
-from scenes import CRANE, DISTINCT, ROBOTS, leg_scene, parse, task_scene
+from scenes import CRANE, DISTINCT, ROBOTS, parse, task_scene
 
 
 def test_distinct_robots_have_every_feature() -> None:
@@ -26,13 +24,6 @@ def test_features_of_the_tasks(name):
         "humanoid_mtu": {"floating", "ball", "hinge", "limit", "damping", "contact", "stiffness", "muscle"},
     }
     assert task_scene(name).features == expected[name]
-
-
-def test_hill_model_needs_muscles():
-    with pytest.raises(ValueError, match="<muscle>"):
-        dataclasses.replace(leg_scene("linear"), muscle_model="hill")
-    with pytest.raises(ValueError, match="'rubber'; choose from linear, hill"):
-        dataclasses.replace(leg_scene("linear"), muscle_model="rubber")
 
 
 def test_carrier_is_no_slide_that_a_muscle_of_the_world_could_notice():
