@@ -1,13 +1,14 @@
 """Imitation as in the PFPN paper: a policy sets the targets of servos 30 times a second. A humanoid and a dog.
 
-python pfpn.py --env benchmarks/servo_tasks.py:HumanoidServo --seed 1
-python pfpn.py --env benchmarks/servo_tasks.py:Dog --clip benchmarks/clips/dog_trot.npz --seed 1
-python benchmarks/servo_tasks.py                         records that clip again, from the shipped policy of go2
+python pfpn.py --env examples/servo_tasks.py:HumanoidServo --seed 1
+python pfpn.py --env examples/servo_tasks.py:Dog --clip examples/dog_trot.npz --seed 1
+python examples/servo_tasks.py                         records that clip again, from the shipped policy of go2
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import ClassVar
 
 import mujoco
@@ -80,6 +81,6 @@ def record(steps: int = 350, settling: int = 150) -> Clip:
 
 
 if __name__ == "__main__":
-    path = ASSETS.parents[1] / "benchmarks" / "clips" / "dog_trot.npz"
+    path = Path(__file__).with_name("dog_trot.npz")
     np.savez_compressed(path, qpos=record().qpos.numpy().astype(np.float32), fps=50)
     print(path)

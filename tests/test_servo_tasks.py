@@ -1,4 +1,4 @@
-"""benchmarks/servo_tasks.py: robots whose policies set the targets of servos 30 times a second."""
+"""examples/servo_tasks.py: robots whose policies set the targets of servos 30 times a second."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import servo_tasks
 import torch
-from common import ROOT
+from tables import ROOT
 
 from diffsim import read_clip
 from diffsim.tasks.base import ASSETS
 
-TROT = ROOT / "benchmarks" / "clips" / "dog_trot.npz"
+TROT = ROOT / "examples" / "dog_trot.npz"
 
 
 def test_servos_hold_targets_within_the_joints_limits_and_the_motors_torques() -> None:
