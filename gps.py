@@ -656,7 +656,7 @@ def evaluate(search: Search) -> Evaluation:
     others = dict(without_noise=without_noise, plan=search.plan_return, guides=search.guide_return[0])
     others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
     motion = qpos, action, system.copies(count, 1), system.control_dt
-    return Evaluation(returns, lengths, speed, *motion, others, forward)
+    return Evaluation(returns, lengths, speed, *motion, others)
 
 
 def train(args: Args, learner: type[Search] = Search) -> None:

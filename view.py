@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from diffsim import DiffEnv
 from diffsim.tasks import find_task
-from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.training import command, evaluate, fail, gait, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED
 from diffsim.view import render, web
 from diffsim.view.screen import Window
@@ -111,8 +111,8 @@ def show(args: Args) -> None:
     env = make_policy_env(saved, args.episodes, **changes)
     evaluation = evaluate(env, saved.network, args.seed)
     print(f"{task}, {name}, {args.episodes} episodes: {evaluation}")
-    if gait := evaluation.gait():
-        print(f"gait: {gait}")
+    if feet := evaluation.gait():
+        print(gait.table(feet))
     qpos, action = evaluation.median_episode(args.seconds)
     if args.video:
         print(f"video: {render.film(args.video, env.scene, qpos, env.control_dt, action, args.size)}")

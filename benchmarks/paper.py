@@ -247,7 +247,6 @@ def measure(args: Args, runner: Runner, cell: Cell) -> Row:
         "training (s)": float(progress[-1]["seconds"]),
         "return": own["return"],
         "speed": "" if own["speed"] is None else own["speed"],
-        "gait": own.get("gait", {}).get("verdict", ""),
     }
     row |= {"falls": mean(length < diffsim.TASKS[cell.task].episode_length for length in own["lengths"])}
     row |= {"kept": kept(own["return"], finest["return"]), "in the reference": reference["return"]}

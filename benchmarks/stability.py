@@ -32,8 +32,7 @@ from torch import Tensor
 
 import diffsim
 from diffsim import Scene, Simulator
-from diffsim.training import Count
-from diffsim.view import gait
+from diffsim.training import Count, gait
 
 PartName = Literal["step", "sweeps", "horizon", "long", "energy"]
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
@@ -127,7 +126,7 @@ def stored(scene: Scene, qpos: Tensor) -> Array:
     links = np.flatnonzero(np.isfinite(scene.upper))
     joints = qpos[:, scene.qpos_adr[links]].numpy()
     beyond = np.maximum(scene.lower[links] - joints, 0) + np.maximum(joints - scene.upper[links], 0)
-    ground = (np.maximum(gait.trace(scene, qpos.numpy()).depth, 0) ** 2).sum(1)
+    ground = (np.maximum(gait.trace(scene, qpos.numpy())[0], 0) ** 2).sum(1)
     return 0.5 * (scene.k_limit[links] * beyond**2).sum(1) + 0.5 * scene.k_n * ground
 
 
@@ -145,7 +144,7 @@ def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, 
     idle = torch.where(torch.tensor(scene.motor_link) > 0, 0.0, -1.0).double()  # without force: of a motor, of a muscle
     actions = idle.expand(60, case.n, scene.nu)
     height = 2 if scene.floating else 1  # in qpos; the planar robots' second slide
-    lowest = torch.tensor(-gait.trace(scene, qpos.numpy()).depth.max(1)) if scene.ncontact else 0.0
+    lowest = torch.tensor(-gait.trace(scene, qpos.numpy())[0].max(1)) if scene.ncontact else 0.0
     if sweep in CONSTANTS:
         name, start = CONSTANTS[sweep]
         changes: dict[str, Any] = {name: value * (getattr(scene, name) if start is None else start)}

@@ -43,10 +43,10 @@ import diffsim
 from diffsim import DiffEnv, Integration, Scene, Simulator, load_scene
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Task
-from diffsim.training import Count, Positive, fail
+from diffsim.training import Count, Positive, fail, gait
 from diffsim.training.checkpoint import HOME
 from diffsim.training.evaluation import FINER, SEED
-from diffsim.view import gait, render
+from diffsim.view import render
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -230,7 +230,7 @@ def measure(motion: Motion, scene: Scene, control_dt: float, forward: int | None
     deepest = np.zeros(0)
     if "contact" in scene.features:
         frames = np.arange(1, len(motion.qpos))[:, None] <= motion.lengths  # the states after each step
-        depth = gait.trace(scene, motion.qpos[1:][frames]).depth
+        depth = gait.trace(scene, motion.qpos[1:][frames])[0]
         deepest = np.concatenate([depth[:, foot].max(1) for foot in feet(scene)])
     middle, most = np.percentile(1e3 * deepest[deepest > 0], (50, 95)) if (deepest > 0).any() else ("", "")
     return row | {"penetration": middle, "penetration 95 %": most}

@@ -63,7 +63,7 @@ def loops(
             frames = [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in drawn]
         fps = 1 / (every * episodes.control_dt)
         first, last = 0, round(3.5 * fps)
-        if episodes.forward is not None:
+        if episodes.speed is not None:
             first, last = find_loop(frames, round(start * fps), *(round(length * fps) for length in seconds))
         path = save_video(FIGURES / f"{task}.gif", frames[first:last], fps)
         print(f"{path}, {(last - first) / fps:.2f} s, {path.stat().st_size / 1000:.0f} kB")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -18,15 +18,12 @@ from torch import Tensor, nn
 import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
-from diffsim.training import checkpoint
+from diffsim.training import checkpoint, gait
 from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.flags import Args, Flags, parse_penalty
 from diffsim.view import render
-
-if TYPE_CHECKING:
-    from diffsim.view.gait import Gait
 
 L = TypeVar("L", bound=Learner)
 
@@ -47,7 +44,6 @@ class Evaluation:
     scene: Scene  # to draw the episodes; of several terrains episode i has number i % M
     control_dt: float  # s
     others: dict[str, float] = field(default_factory=dict)  # what else a script measured, by name
-    forward: int | None = 0  # the task's way forward, see Task
 
     @property
     def length(self) -> float:
@@ -96,11 +92,9 @@ class Evaluation:
         steps = int(self.lengths[number])
         return self.qpos[:steps, number].numpy(force=True), self.action[:steps, number].numpy(force=True)
 
-    def gait(self) -> Gait | None:
-        """How the robot moves over the ground, see diffsim.view.gait.describe."""
-        from diffsim.view import gait  # no training needs it
-
-        return gait.describe(self.scene, self.control_dt, map(self.episode, range(len(self.returns))), self.forward)
+    def gait(self) -> dict[str, gait.Foot]:
+        """How each foot moves over the ground."""
+        return gait.measure(self.scene, self.control_dt, (self.episode(k)[0] for k in range(len(self.returns))))
 
     def save_video(self, path: Path, seconds: float = render.VIDEO_SECONDS) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
@@ -140,7 +134,7 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
     if forward is not None:
         distance = path[..., forward].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, forward]
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
-    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt, {}, forward)
+    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt)
 
 
 def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
@@ -224,9 +218,9 @@ def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **foun
     assert args.run_dir
     names = "env integrator substeps theta passes contact penalty early_termination clip device eval_episodes".split()
     settings = {name: getattr(args, name) for name in names} | dict(script=args.script(), iteration=iteration)
-    if gait := evaluation.gait():
-        print(f"gait: {gait}")
-        found["gait"] = dataclasses.asdict(gait) | {"verdict": gait.verdict}
+    if feet := evaluation.gait():
+        print(gait.table(feet))
+        found["gait"] = {name: foot._asdict() for name, foot in feet.items()}
     evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
     if args.capture_video:
         try:

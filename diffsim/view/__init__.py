@@ -1,1 +1,1 @@
-"""Pictures, videos, windows and web pages of robots, and what their gait looks like in numbers."""
+"""Pictures, videos and web pages of robots, and the page on which one drives them."""

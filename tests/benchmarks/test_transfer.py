@@ -15,8 +15,7 @@ from tables import markdown, read_csv
 
 import diffsim
 from diffsim import Integration, Simulator
-from diffsim.training import evaluate, load_policy, make_policy_env
-from diffsim.view import gait
+from diffsim.training import evaluate, gait, load_policy, make_policy_env
 
 POLICIES = Path(diffsim.__file__).parent / "policies"
 DT = 1 / 60
@@ -72,7 +71,7 @@ def test_the_summary_of_a_known_motion() -> None:
     """A stiff hopper glides along with its foot 10 mm deep, then 30 mm; the second episode ends after half of it."""
     env = diffsim.make("hopper", 2, stochastic_init=False, dtype=torch.float64)
     scene, rest = env.scene, env.qpos[:1].numpy()
-    depth = gait.trace(scene, rest).depth
+    depth = gait.trace(scene, rest)[0]
     t = DT * np.arange(61)
     qpos, qvel = np.tile(rest, (61, 2, 1)), np.zeros((61, 2, scene.nv))
     qpos[..., 0], qvel[..., 0] = 1.5 * t[:, None], 1.5
