@@ -11,7 +11,6 @@ what comes after the window. Windows as long as an episode (--horizon 1000) make
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, evaluate, evaluate_checkpoint
-from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
+from diffsim.training.flags import ParallelFlags
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
 
 # Windows: section 4.2 of the SHAC paper; everything else: its authors' released settings.
@@ -187,14 +186,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(run.eval_env, bptt.policy))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
-
+main = script(Args, train)
 
 if __name__ == "__main__":
     main()

@@ -12,8 +12,9 @@ importance-sampled policy search (Algorithm 1). The planner takes exact Jacobian
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,9 +33,9 @@ from diffsim.planning.restarts import best_of_random_starts, receding_horizon, s
 from diffsim.planning.system import System
 from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import find_task
-from diffsim.training import command, distributed, evaluate_checkpoint, fail
+from diffsim.training import distributed, evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
-from diffsim.training.flags import Flags, parse
+from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive, Repeats
 from diffsim.training.run import Run
@@ -671,11 +672,7 @@ def train(args: Args, learner: type[Search] = Search) -> None:
             run.log_evaluation(evaluate(search))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    evaluate_checkpoint(args, Search, evaluate) if args.evaluate else train(args)
-
+main = script(Args, train, partial(evaluate_checkpoint, learner=Search, method=evaluate))
 
 if __name__ == "__main__":
     main()

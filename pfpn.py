@@ -22,8 +22,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, Ensemble, Run, command, distributed, evaluate, evaluate_checkpoint, fail
-from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training import ClippedAdam, Ensemble, Run, distributed, evaluate, fail, script
+from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Positive, Repeats, SomeWidths
 from diffsim.training.regression import Regression
@@ -734,14 +734,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(run.eval_env, learner.policy))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
-
+main = script(Args, train)
 
 if __name__ == "__main__":
     main()

@@ -13,7 +13,6 @@ imitates the result. First order steps along the gradient of the return, second 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -24,8 +23,8 @@ from diffsim import DiffEnv
 from diffsim.planning import REAL, AfterStep, Cost, Dynamics, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, command, distributed, evaluate, evaluate_checkpoint, fail
-from diffsim.training.flags import Flags, parse
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, evaluate, fail, script
+from diffsim.training.flags import Flags
 from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
 
 # fmt: off
@@ -321,14 +320,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(run.eval_env, pods.policy))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
-
+main = script(Args, train)
 
 if __name__ == "__main__":
     main()

@@ -11,7 +11,6 @@ minibatches, and a learning rate that follows the policy's KL divergence, as the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,8 +19,8 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks import Task, find_task
-from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
-from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
@@ -307,14 +306,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(run.eval_env, ppo.policy))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
-
+main = script(Args, train)
 
 if __name__ == "__main__":
     main()

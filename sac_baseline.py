@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,9 +21,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail
+from diffsim.training import Run, distributed, evaluate, fail, script
 from diffsim.training.ensemble import Ensemble
-from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
@@ -295,14 +294,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(run.eval_env, sac.policy))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
-
+main = script(Args, train)
 
 if __name__ == "__main__":
     main()

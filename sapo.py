@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -23,9 +23,9 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
 from diffsim.tasks import TASKS, Task, find_task
-from diffsim.training import Run, command, distributed, evaluate, evaluate_checkpoint, fail, load_policy
+from diffsim.training import Run, distributed, evaluate, fail, load_policy, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
-from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
@@ -528,14 +528,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(run.eval_env, sapo.policy))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
-
+main = script(Args, train)
 
 if __name__ == "__main__":
     main()

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, ObsNormalizer, Regression, Run, command, evaluate, evaluate_checkpoint
-from diffsim.training.flags import ParallelFlags, parse
+from diffsim.training import ClippedAdam, ObsNormalizer, Regression, Run, evaluate, script
+from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
@@ -267,14 +266,7 @@ def train(args: Args) -> None:
             run.log_evaluation(evaluate(run.eval_env, shac.policy))
 
 
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(Args, argv)
-    if args.evaluate:
-        evaluate_checkpoint(args)
-    else:
-        train(args)
-
+main = script(Args, train)
 
 if __name__ == "__main__":
     main()

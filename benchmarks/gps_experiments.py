@@ -38,6 +38,7 @@ import diffsim
 import gps
 from diffsim.planning import REAL, LinearGaussian, nearest_feedback
 from diffsim.training import checkpoint, command, fail, load_policy, make_policy_env
+from diffsim.training import parse as parse_script
 from diffsim.training.evaluation import make_env
 
 GPS = json.loads((ROOT / "benchmarks" / "cases.json").read_text())["gps"]
@@ -278,7 +279,7 @@ def temperatures(env: str) -> Iterator[Row]:
     """
     (flags,) = jobs(Args(env=(env,), cases=("paper",), seeds=(1,))).values()
     words = ["--env", env, *CASES["paper"].split(), *flags, "--device", "cpu", "--threads", "1"]
-    args = gps.parse(gps.Args, words)
+    args = parse_script(gps.Args, words)
     search = gps.Search(args, make_env(args, 1))
     plan = search.plan("level", lambda _: None)
     search.network.sigma, best = (args.noise * plan.u[0].std(0)).clamp(min=1e-3), -plan.cost.item()

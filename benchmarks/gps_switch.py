@@ -24,7 +24,7 @@ from diffsim.planning import (
     save_demonstration,
     starting_actions,
 )
-from diffsim.training import command
+from diffsim.training import command, parse
 from diffsim.training.evaluation import make_env
 
 STEPS, HEIGHT = 300, 1.2  # of the whole example; target_height of the second gait, m (the first one's is 1.35)
@@ -34,7 +34,7 @@ SEED, STARTS = 2, 8  # of the second half's random actions; their number
 @command
 def main(output: Positional[Path]) -> None:
     torch.set_num_threads(1)
-    flags = gps.parse(gps.Args, f"--env walker --device cpu --threads 1 --target-height {HEIGHT}".split())
+    flags = parse(gps.Args, f"--env walker --device cpu --threads 1 --target-height {HEIGHT}".split())
     search, half, rng = gps.Search(flags, make_env(flags, 1)), STEPS // 2, torch.Generator().manual_seed(SEED)
     system, cost, W = search.system, search.cost, flags.window
     x, u = load_demonstration(system, ROOT / "benchmarks" / "plans" / "walker_500.npz", half)

@@ -25,6 +25,7 @@ from torch import Tensor
 
 sys.path.append(str(ROOT))
 import pfpn  # noqa: E402
+from diffsim.training import parse  # noqa: E402
 
 PartName = Literal["peaks", "noise"]
 PEAKS, NEAR = (-0.25, 0.75), 0.15
@@ -64,7 +65,7 @@ def reward(action: Tensor) -> Tensor:
 def learner_of(seed: int, *flags: str) -> pfpn.PPO:
     torch.manual_seed(seed)
     bandit: Any = Bandit()
-    return pfpn.PPO(pfpn.parse(pfpn.Args, [*SETTING.split(), *flags]), bandit)
+    return pfpn.PPO(parse(pfpn.Args, [*SETTING.split(), *flags]), bandit)
 
 
 def learn(policy: str, entropy: str, seed: int) -> dict[int, Tensor]:

@@ -22,7 +22,7 @@ import gps
 from diffsim.planning import LinearGaussian, gaussian_log_prob, load_demonstration, save_demonstration
 from diffsim.planning.lbfgs import maximise
 from diffsim.planning.terrains import named_terrains
-from diffsim.training import evaluate, load_policy, make_policy_env
+from diffsim.training import evaluate, load_policy, make_policy_env, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from diffsim.view import render
@@ -44,7 +44,7 @@ environment = cache(diffsim.make)
 
 
 def make_search(env: str, flags: str = "") -> gps.Search:
-    return gps.Search(gps.parse(gps.Args, ["--env", env, "--device", "cpu", *flags.split()]), environment(env, 1))
+    return gps.Search(parse(gps.Args, ["--env", env, "--device", "cpu", *flags.split()]), environment(env, 1))
 
 
 # Importance sampling

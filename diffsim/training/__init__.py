@@ -8,10 +8,11 @@ from __future__ import annotations
 from diffsim.training import distributed
 from diffsim.training.checkpoint import Learner, SavedPolicy, export_onnx, export_policy, load_policy
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
-from diffsim.training.errors import UsageError, command, fail
+from diffsim.training.errors import UsageError, fail
 from diffsim.training.evaluation import Evaluation, evaluate, evaluate_checkpoint, make_policy_env
 from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
+from diffsim.training.main import command, script
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import (
     Count,

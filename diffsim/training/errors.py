@@ -1,16 +1,8 @@
-"""Errors of a script's user, and the end of a script in one line."""
+"""Errors of a script's user: a message of one line is all that is shown of them."""
 
 from __future__ import annotations
 
-import functools
-import gc
-import os
-import re
-import sys
-import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import NoReturn, ParamSpec
+from typing import NoReturn
 
 import torch
 
@@ -19,9 +11,6 @@ from diffsim.robot.scene import SceneError, TerrainError
 from diffsim.sim.launcher import TooLargeError
 from diffsim.startup import KernelCacheError
 from diffsim.tasks import TaskError
-from diffsim.training import distributed
-
-P = ParamSpec("P")
 
 
 class UsageError(ValueError):
@@ -38,50 +27,3 @@ EXPECTED = (
 def fail(message: object) -> NoReturn:
     """Raise a UsageError; a script that is a `command` ends with it."""
     raise UsageError(str(message))
-
-
-def command(main: Callable[P, None]) -> Callable[P, None]:
-    """Make a script's main end the process with one line on stderr where its user is at fault.
-
-    The exit code is 2 for an expected error and 130 for Ctrl-C. Other errors keep their traceback. Only the first rank
-    prints. A reader of stdout that has read enough, as `head` does, ends the script silently.
-    """
-
-    @functools.wraps(main)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        report, threading.excepthook = threading.excepthook, _report_in_thread
-        if main.__module__ == "__main__":
-            gc.freeze()  # what a script has imported stays: the collector need not look through it
-        try:
-            main(*args, **kwargs)
-        except BrokenPipeError:
-            pass
-        except KeyboardInterrupt:
-            _end("interrupted", 130)
-        except EXPECTED as error:
-            _end(error, 2)
-        except (RuntimeError, MemoryError) as error:
-            wanted = re.search(r"can't allocate memory.* (\d+) bytes", str(error))  # torch's words on a CPU
-            if wanted is None and not isinstance(error, MemoryError):
-                raise
-            size = f" for {float(wanted[1]) / 1e9:,.1f} GB more" if wanted else ""
-            _end(f"not enough memory{size}: choose smaller sizes", 2)
-        finally:
-            threading.excepthook = report
-            try:
-                sys.stdout.flush()
-            except BrokenPipeError:  # and no complaint when Python flushes once more at its end
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-    return run
-
-
-def _end(message: object, code: int) -> NoReturn:
-    if distributed.rank() == 0:
-        print(f"{Path(sys.argv[0]).name}: {str(message).partition(chr(10))[0]}", file=sys.stderr)
-    raise SystemExit(code) from None
-
-
-def _report_in_thread(args: threading.ExceptHookArgs) -> None:
-    if type(args.thread).__name__ != "_AsyncWriterThread":  # tensorboard's raises its error in the main thread again
-        threading.__excepthook__(args)

@@ -18,6 +18,7 @@ from tables import markdown, read_csv, write_csv
 import bptt
 import diffsim
 import gps
+from diffsim import training
 
 SMALL = (
     "--env cartpole --horizon 12 --restarts 2 --screening 2 --ilqr-iterations 10 --pretraining 20 --hidden 8 "
@@ -115,7 +116,7 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
 
 def parse(env: str, case: str, *flags: str) -> None:
     kind = gps_variants.VariantArgs if case in gps_variants.CASES else gps.Args
-    gps.parse(kind, ["--env", env, *experiments.CASES[case].split(), *flags])
+    training.parse(kind, ["--env", env, *experiments.CASES[case].split(), *flags])
 
 
 def test_the_list_holds_the_runs_that_the_page_shows() -> None:
@@ -131,7 +132,7 @@ def test_the_list_holds_the_runs_that_the_page_shows() -> None:
     files = {path.stem for path in (experiments.ROOT / "benchmarks" / "plans").glob("*.npz")}
     assert files == {*experiments.PLANS, "swimmer_500", "humanoid_500", "walker_switch_300"}
     for flags in experiments.PLANS.values():
-        gps.parse(gps.Args, flags.split())
+        training.parse(gps.Args, flags.split())
     for env, case, *flags in {(*name.split("__")[:2], *flags) for name, flags in jobs.items()}:  # seeds share them
         parse(env, case, *flags)
 
