@@ -26,11 +26,11 @@ from typing import Annotated
 import numpy as np
 import torch
 import tyro
+from cells import Case, Runner, ScriptFlags
 from common import Line, Panel, check_names, checkpoint_of, parse, plot
 from gps_variants import CASES as VARIANTS
 from gps_variants import VariantArgs
 from groups import grouped, middle, numbers
-from runner import Case, Runner, ScriptFlags
 from tables import ROOT, Row, markdown, origins, read_csv, write_csv
 from torch import Tensor
 

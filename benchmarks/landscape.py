@@ -22,9 +22,9 @@ from typing import Literal
 
 import numpy as np
 import torch
+from cells import Case, Runner, ScriptFlags
 from common import TASKS, Line, Panel, TaskName, Tasks, can_draw, plot, run
 from motions import Array, shac
-from runner import Case, Runner, ScriptFlags
 from tables import ROOT, Row, markdown
 from torch import Tensor
 from torch.func import functional_call, vmap

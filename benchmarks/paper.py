@@ -32,10 +32,24 @@ import fingerprints
 import numpy as np
 import tables
 import transfer
-from common import TASKS, check_names, load_case, run
+from cells import (
+    CASES,
+    LEARNERS,
+    RETURNS,
+    Case,
+    Curve,
+    Runner,
+    ScriptFlags,
+    checked,
+    curve,
+    draw,
+    evaluation,
+    finer,
+    passing,
+    spread,
+)
+from common import LEARNT, TASKS, Tasks, check_names, load_case, run
 from groups import Cells, grouped, middle, numbers
-from learning import CASES, LEARNERS, RETURNS, draw
-from runner import Case, Curve, Runner, ScriptFlags, checked, curve, evaluation, finer, passing
 from tables import ROOT, Row, markdown, read_csv
 
 import diffsim
@@ -56,6 +70,8 @@ class Group(NamedTuple):
     page: str = "experiments.md"
     timed: bool = True  # or its cells may share their machine, and have no seconds
     picture: bool = False  # of the curves, under the group's name
+    ratios: bool = False  # the table has these of its two learners' best returns
+    older: bool = False  # its results are in the csv files that the page names, measured before there were cells
 
 
 GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
@@ -111,8 +127,9 @@ def same_numbers(revision: str, learner: str, task: str) -> bool:
 
 @dataclass
 class Args(ScriptFlags):
+    env: Tasks = LEARNT  # tasks
     runs: Path = ROOT / "runs" / "paper"  # directory of the runs: {runs}/{machine}/{learner}/{task}__{seed}
-    only: tuple[str, ...] = tuple(GROUPS)  # groups
+    only: tuple[str, ...] = tuple(name for name in GROUPS if not GROUPS[name].older)  # groups
     learners: tuple[str, ...] = ()  # learners (default: all of a group)
     seeds: tuple[int, ...] = ()  # seeds (default: all of a group)
     machine: str = ""  # whose cells these are (default: that of --device)
@@ -269,23 +286,43 @@ def points(args: Args, cell: Cell) -> list[Row]:
     return [about | {name: rows[k][name] for name in columns} for k in chosen]
 
 
-def pictured(args: Args, name: str) -> None:
-    """Draw the curves of learners whose seeds are all there, of tasks that have any; against seconds if it is timed."""
-    group, args = GROUPS[name], replace(args, machine=GROUPS[name].machine)
-    rows, known = args.read("curves"), paces(args.directory)
+def curves(args: Args, name: str) -> dict[tuple[str, str], list[Curve]]:
+    """By learner and task, of a group's seeds, where all of them are there; with seconds if the group is timed."""
+    group = GROUPS[name]
+    directory = args.directory.parent / group.machine
+    rows, known = read_csv(directory / "curves.csv"), paces(directory)
     for row in rows:
         pace = known.get((row["learner"], row["task"]))
         if pace and not row["seconds"]:
             row["seconds"] = str(pace.seconds(float(row["iteration"])))
         row["seconds"] = row["seconds"] if group.timed else ""
-    found = grouped((row for row in rows if int(row["seed"]) <= group.seeds), "learner", "task", "seed")
+    found = dict[tuple[str, str], list[Curve]]()
+    for (learner, task, seed), own in grouped(rows, *KEY).items():
+        if learner in group.learners and task in group.tasks and int(seed) <= group.seeds:
+            found.setdefault((learner, task), []).append(curve(own))
+    return {key: runs for key, runs in found.items() if len(runs) == group.seeds}
 
-    def of(learner: str, task: str) -> list[Curve]:
-        own = [curve(rows) for about, rows in found.items() if about[:2] == (learner, task)]
-        return own if len(own) == group.seeds else []
 
-    if there := [task for task in group.tasks if any(of(learner, task) for learner in group.learners)]:
-        draw(args.picture(name), group.learners, there, of)
+def pictured(args: Args, name: str) -> None:
+    """Draw the curves of learners whose seeds are all there, of tasks that have any."""
+    group, found = GROUPS[name], curves(args, name)
+    args = replace(args, machine=group.machine)
+    if there := [task for task in group.tasks if any((learner, task) in found for learner in group.learners)]:
+        draw(args.picture(name), group.learners, there, lambda learner, task: found.get((learner, task), []))
+
+
+def ratios(args: Args, name: str) -> list[Row]:
+    """The best return of a group's first learner over that of its second, within the control steps that all made."""
+    (first, second), found, rows = GROUPS[name].learners, curves(args, name), list[Row]()
+    for task in GROUPS[name].tasks:
+        both = [found.get((learner, task), []) for learner in (first, second)]
+        if all(both):
+            end = min(run["control_steps"][-1] for runs in both for run in runs)
+            best = [[float(np.nanmax(run["return"][run["control_steps"] <= end])) for run in runs] for runs in both]
+            row: dict[str, object] = {"task": task, "control steps": f"{end / 1e6:.3g} M"}
+            row |= {learner: spread(values) for learner, values in zip((first, second), best, strict=True)}
+            rows.append(row | {"ratio": f"{mean(best[0]) / mean(best[1]):.2f}"})
+    return rows
 
 
 def line(rows: Sequence[Cells]) -> Row:
@@ -323,6 +360,8 @@ def table(args: Args, name: str) -> list[Row]:
 
 def printed(args: Args, name: str) -> str:
     """A group's table, without tasks that have a single line, which compares nothing."""
+    if GROUPS[name].ratios:
+        return markdown(ratios(args, name))
     rows = table(args, name)
     count = Counter(row["task"] for row in rows)
     return markdown([row for row in rows if count[row["task"]] > 1], None if GROUPS[name].timed else UNTIMED)
@@ -397,7 +436,8 @@ def main(args: Args) -> None:
             if any(group.picture for group in cell.groups):
                 args.replace("curves", points(args, cell), KEY)
     for name in args.only:
-        args.publish(name, printed(args, name), GROUPS[name].page, everywhere=True)
+        shown = printed(args, name)
+        args.publish(name, shown, GROUPS[name].page if "|" in shown else "", everywhere=True)
         if GROUPS[name].picture:
             pictured(args, name)
     rows = sorted(args.read("pace"), key=lambda row: TASKS.index(row["task"]))

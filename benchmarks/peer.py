@@ -18,8 +18,8 @@ from typing import Literal
 
 import torch
 import warp as wp
+from cells import ScriptFlags
 from common import Part, measured, run
-from runner import ScriptFlags
 from speed import timed, windows
 from tables import Row, read_csv
 from torch import Tensor

@@ -17,9 +17,9 @@ from pathlib import Path
 from statistics import mean, pstdev
 from typing import NamedTuple
 
+from cells import Case, Runner, ScriptFlags
 from common import check_names, run
 from groups import grouped, numbers
-from runner import Case, Runner, ScriptFlags
 from tables import Row, markdown, read_csv
 
 

@@ -34,9 +34,9 @@ import mujoco
 import torch
 import tyro
 import warp as wp
+from cells import ScriptFlags
 from common import TASKS, Panel, Part, TaskName, lines, measured, plot, run
 from motions import shac
-from runner import ScriptFlags
 from tables import ROOT, Row, read_csv
 
 import diffsim

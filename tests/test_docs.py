@@ -6,12 +6,11 @@ import ast
 import csv
 import functools
 import json
-import math
 import re
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from statistics import mean, median, pstdev
+from statistics import median
 from typing import NamedTuple
 
 import pytest
@@ -25,7 +24,6 @@ LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo", "sac", "mbpo", "pfpn", "human
 CHECKED = [README, *(ROOT / "docs" / f"{name}.md" for name in (*LEARNERS, "robustness"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CASES = json.loads((ROOT / "benchmarks" / "cases.json").read_text())
-EXPERIMENTS, RETURNS = CASES["experiments"], CASES["returns"]
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 
@@ -36,7 +34,6 @@ class Table(NamedTuple):
     header: list[str]
     rows: list[list[str]]
     source: Path | None  # the csv file named between the table and the next table or heading
-    curves: str = ""  # the machine whose training curves are named there
 
     def columns(self) -> list[str]:
         """Those that the csv file has, too."""
@@ -49,9 +46,8 @@ def tables(page: Path) -> Iterator[Table]:
         header, _, *joined = ([plain(cell) for cell in line.strip()[1:-1].split("|")] for line in block.splitlines())
         rows = [row for cells in joined for row in seeds(header, cells)]
         below = re.split(r"^#", text, flags=re.MULTILINE)[0]
-        source = re.search(r"results/\w+/(?!cells)\w+\.csv", below)  # lines of cells: tests/benchmarks/test_paper.py
-        curves = re.search(r"results/([\w<>]+)/<learner>_<task>\.csv", below)
-        yield Table(header, rows, ROOT / source[0] if source and not curves else None, curves[1] if curves else "")
+        source = re.search(r"results/\w+/(?!cells|curves)\w+\.csv", below)  # these: tests/benchmarks/test_paper.py
+        yield Table(header, rows, ROOT / source[0] if source else None)
 
 
 def seeds(header: list[str], cells: list[str]) -> list[list[str]]:
@@ -96,45 +92,6 @@ def test_tables_agree_with_the_csv_files_that_they_name(page: Path) -> None:
             assert any(all(same(shown[c], line[c]) for c in columns) for line in measured), f"{table.source}: {shown}"
 
 
-@pytest.mark.parametrize("page", CHECKED, ids=lambda page: page.stem)
-def test_tables_agree_with_the_training_curves_that_they_name(page: Path) -> None:
-    for table in tables(page):
-        for row in table.rows if table.curves else ():
-            shown = dict(zip(table.header, row, strict=True))
-            machine = shown.get("machine", table.curves)
-            measured = summary(ROOT / "results" / machine / f"{shown['learner']}_{shown['task']}.csv", shown)
-            shared = {name: shown[name] for name in measured if shown.get(name)}
-            assert shared and shared == {name: measured[name] for name in shared}, f"{machine}: {shown}"
-
-
-def summary(path: Path, shown: Mapping[str, str]) -> dict[str, str]:
-    """What a table's row may show of a file of training curves: medians over its seeds, of the best return the mean."""
-    runs: dict[str, list[dict[str, str]]] = {}
-    for line in read_csv(path):
-        runs.setdefault(line["seed"], []).append(line)
-
-    def last(name: str) -> float:
-        ends = [values[-1] for run in runs.values() if (values := [line[name] for line in run if line[name]])]
-        return median(map(float, ends)) if ends else math.nan
-
-    def passing(name: str) -> float:
-        target = float(shown.get("target", "inf"))
-        above = ([line for line in run if line["return"] and float(line["return"]) >= target] for run in runs.values())
-        return median(float(lines[0][name] or "nan") if lines else math.inf for lines in above)
-
-    best = [max(float(line["return"]) for line in run if line["return"]) for run in runs.values()]
-    found = {
-        "seeds": f"{len(runs)}",
-        "best return of training": f"{mean(best):.0f}" + (f" ± {pstdev(best):.0f}" if len(best) > 1 else ""),
-        "iterations": f"{last('iteration'):g}",
-        "control steps": f"{last('control_steps') / 1e6:.3g} M",
-        "last evaluation": f"{last('eval_return'):.0f}",
-        "steps to target": f"{passing('control_steps') / 1e6:.3g} M",
-        "s to target": f"{passing('seconds'):.0f}",
-    }
-    return {name: "never" if text in ("inf", "inf M") else text for name, text in found.items()}
-
-
 ORIGIN = re.compile(r"# [^;]+; python .*torch .*warp .*; revision [^;]+; python \w+")
 
 
@@ -163,13 +120,11 @@ def test_every_csv_file_says_where_it_comes_from() -> None:
 
 
 def test_every_csv_file_is_shown_or_needed() -> None:
-    """A page or the log names it, it has curves of a learner that an experiment draws, or a picture has its name."""
+    """A page or the log names it, or a picture has its name."""
     text = "".join(page.read_text() for page in PAGES)
-    drawn = {name for case in EXPERIMENTS.values() for name in case["learners"]}
     pictures = {path.stem for path in (ROOT / "docs" / "figures").rglob("*.png")}
     for path in sorted((ROOT / "results").rglob("*.csv")):
-        curves = any(path.stem == f"{name}_{task}" for name in drawn for task in RETURNS)
-        assert path.name in text or curves or path.stem in pictures, f"no page shows {path}"
+        assert path.name in text or path.stem in pictures, f"no page shows {path}"
 
 
 SIMULATOR = [ROOT / "docs" / f"{name}.md" for name in ("accuracy", "stability", "performance")]
@@ -288,7 +243,7 @@ def classes(path: Path) -> dict[str, ast.ClassDef]:
 
 
 SHARED = classes(ROOT / "diffsim" / "training" / "flags.py")
-BENCHMARKS = [ROOT / "benchmarks" / f"{name}.py" for name in ("common", "runner", "motions")]
+BENCHMARKS = [ROOT / "benchmarks" / f"{name}.py" for name in ("common", "cells", "motions")]
 SHARED |= {name: node for path in BENCHMARKS for name, node in classes(path).items()}
 SCRIPTS = [*ROOT.glob("*.py"), *ROOT.glob("benchmarks/*.py"), *ROOT.glob("tools/*.py")]
 
@@ -362,22 +317,23 @@ def test_commands_of_results_run_today() -> None:
 @functools.cache
 def choices(script: Path, flag: str) -> set[str]:
     """The values that a benchmark's flag takes: names of cases.json, or the words of its Literal PartName."""
-    if script.name == "learning.py":
-        return {"--experiment": {*EXPERIMENTS}, "--algorithm": {*CASES["learners"]}}.get(flag, set())
+    if script.name == "paper.py":
+        return {"--only": {*CASES["paper"]["groups"]}, "--learners": {*CASES["learners"]}}[flag]
     assigned = (node for node in ast.parse(script.read_text()).body if isinstance(node, ast.Assign))
     parts = [node.value for node in assigned if ast.unparse(node.targets[0]) == "PartName"]
     return {word.value for node in parts for word in ast.walk(node) if isinstance(word, ast.Constant)}
 
 
 @each_page
-def test_parts_experiments_and_learners_exist(page: Path) -> None:
+def test_parts_groups_and_learners_exist(page: Path) -> None:
     for words in commands(page):
         scripts = [word for word in words if re.fullmatch(r"benchmarks/\w+\.py", word)]
         own, flag = words[: words.index("--")] if "--" in words else words, ""
-        for word in own if scripts or words[:1] == ["--experiment"] else ():
+        for word in own if scripts else ():
             flag = word if word.startswith("--") else flag
-            if flag in ("--parts", "--experiment", "--algorithm") and word != flag:
-                script = ROOT / (scripts or ["benchmarks/learning.py"])[0]
+            script = ROOT / scripts[0]
+            of_paper = script.name == "paper.py" and flag in ("--only", "--learners")
+            if (flag == "--parts" or of_paper) and word != flag:
                 assert word in choices(script, flag), f"{page.name}: {script.name} has no {flag} {word}"
 
 

@@ -129,8 +129,8 @@ def test_a_sentinel_beyond_the_published_range_breaks_the_chain(
     monkeypatch.setattr(paper, "begin", lambda *_: {})
     monkeypatch.setattr(paper, "evaluation", lambda folder: {"return": returns[folder.name.partition("__")[0]]})
     monkeypatch.setattr("tables.replace_csv", lambda path, rows, *_: written.extend(rows))
-    monkeypatch.setattr("runner.Runner.train", lambda *_: True)
-    monkeypatch.setattr("runner.Runner.evaluate", lambda *_: True)
+    monkeypatch.setattr("cells.Runner.train", lambda *_: True)
+    monkeypatch.setattr("cells.Runner.evaluate", lambda *_: True)
     args = paper.Args(update_results=True, machine="cpu")
     for value, kept in ((5.0, True), (7.0, False), (3.0, False)):
         returns["ant"] = value

@@ -13,8 +13,8 @@ import fingerprints
 import paper
 import pytest
 import tables
+from cells import Runner
 from learners import refusal
-from runner import Runner
 
 LINK = {"revision": "HEAD", "parent": "HEAD", "equal": " ".join(fingerprints.CASES), "differ": ""}
 SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4")
@@ -37,7 +37,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
 def test_every_cell_is_there_once_the_first_seeds_first() -> None:
     found = list(paper.cells(paper.Args()))
     assert len(found) == len({*found}) and [cell.seed for cell in found] == sorted(cell.seed for cell in found)
-    for group in paper.GROUPS.values():
+    for group in (group for group in paper.GROUPS.values() if not group.older):
         assert group.machine in ("cpu", "h200") and group.seeds >= 3
         for learner in group.learners:
             assert paper.Cell(group.machine, learner, group.tasks[-1], group.seeds) in found
@@ -93,7 +93,8 @@ def test_pages_show_the_lines_of_the_cells() -> None:
     for name, group in paper.GROUPS.items():
         text = (common.DOCS / group.page).read_text()
         for part in re.findall(rf"<!-- {name} -->\n(.*?)<!-- /{name} -->", text, re.DOTALL):
-            assert part == paper.printed(args, name)
+            if "|" in (expected := paper.printed(args, name)) or not group.older:
+                assert part == expected
             shown += len(paper.table(args, name))
     assert shown
 
@@ -122,7 +123,7 @@ def test_readme_shows_medians_of_five_seeds_for_every_task() -> None:
 
 def test_a_picture_has_the_curves_of_whole_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Seconds are of cells and groups that are timed and had their machine alone; all seeds of the group are drawn."""
-    args = paper.Args(runs=tmp_path / "runs", output=tmp_path / "results")
+    args = paper.Args(runs=tmp_path / "runs", output=tmp_path / "h200")
     cells = [paper.Cell("h200", learner, "ant", seed) for learner in ("shac", "ppo_4096") for seed in (1, 2)]
     for cell in (*cells, paper.Cell("h200", "sapo", "hopper", 1)):
         folder = cell.case(args.runs).folder
@@ -136,7 +137,7 @@ def test_a_picture_has_the_curves_of_whole_lines(tmp_path: Path, monkeypatch: py
         assert [row["return"] for row in other] == [row["return"] for row in chosen] and "seconds" not in other[0]
 
     drawn = list[list[list[common.Panel]]]()
-    monkeypatch.setattr("learning.plot", lambda path, grid, size: drawn.append(grid))
+    monkeypatch.setattr("cells.plot", lambda path, grid, size: drawn.append(grid))
     place = paper.Args(output=args.output, machine="h200")
     for cell in cells:
         tables.replace_csv(place.csv("curves"), paper.points(args, cell), paper.KEY)

@@ -1,6 +1,7 @@
-"""Runs of the scripts, each in a folder of its own: what was interrupted goes on, what has finished is kept.
+"""Trainings by the scripts, each in a folder of its own: what was interrupted goes on, what has finished is kept.
 
-All is read from the files that the scripts write.
+All is read from the files that the scripts write. Learners, scripts with flags, and the returns to compare are in
+cases.json.
 """
 
 from __future__ import annotations
@@ -10,24 +11,37 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean, pstdev
 from typing import Any, NamedTuple
 
 import common
 import numpy as np
-from tables import ROOT, read_csv
+from common import Line, Panel, plot
+from tables import ROOT
 
 import diffsim
 from diffsim.sim.launcher import available_cores
 from diffsim.training import checkpoint
-from diffsim.training.evaluation import FINER, kept
+from diffsim.training.evaluation import FINER
 
-COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return")  # kept of progress.csv
+COLUMNS = ("iteration", "control_steps", "seconds", "return")  # of progress.csv, which a curve has
 Curve = dict[str, np.ndarray]
+
+
+class Returns(NamedTuple):
+    """A task's returns; those published are of Georgiev et al. 2024, "Adaptive Horizon Actor-Critic", 10 seeds."""
+
+    target: int  # to which learners are compared
+    timed: Sequence[int] = ()  # those whose passing is timed
+    published: Mapping[str, int] = {}  # by learner: SHAC's and PPO's; drawn
+
+
+CASES = json.loads(Path(__file__).with_name("cases.json").read_text())
+RETURNS = {name: Returns(**case) for name, case in CASES["returns"].items()}
+LEARNERS: dict[str, str] = CASES["learners"]  # script and flags
 
 
 @dataclass
@@ -53,21 +67,6 @@ class Runner:
     @property
     def time_is_up(self) -> bool:
         return time.monotonic() >= self.stop_at
-
-    def run(self, cases: Iterable[Case], evaluate_only: bool = False) -> None:
-        """Train and evaluate all, some at a time, as far as the time limit allows."""
-
-        def finish(case: Case) -> None:
-            ready = (case.folder / "checkpoint.pt").is_file() if evaluate_only else self.train(case)
-            if ready and self.evaluate(case):
-                print(f"{case.folder}: return {evaluation(case.folder)['return']:.1f}", flush=True)
-
-        pool = ThreadPoolExecutor(self.jobs)
-        try:
-            list(pool.map(finish, cases))
-        except KeyboardInterrupt:  # the scripts got it too, and save
-            pool.shutdown(cancel_futures=True)
-            sys.exit("interrupted; the same command goes on")
 
     def train(self, case: Case, until: int = 0) -> bool:
         """From where it stands to an iteration, 0: the last; whether it got there."""
@@ -128,15 +127,6 @@ def evaluation(folder: Path, iteration: int | None = None) -> dict[str, Any]:
     return found if found and iteration in (None, found["settings"]["iteration"]) else {}
 
 
-def folders(directory: Path, env: str) -> list[Path]:
-    """Those of a task's runs, by their seeds."""
-    return sorted(directory.glob(f"{env}__*"), key=lambda folder: int(seed(folder)))
-
-
-def seed(folder: Path) -> str:
-    return folder.name.rpartition("__")[2]
-
-
 def curve(rows: Sequence[Mapping[str, str]]) -> Curve:
     """The columns of progress.csv as arrays, from the first finished episode on; NaN where there is no number."""
     rows = [row for row in rows if row.get("return")]
@@ -149,48 +139,40 @@ def passing(runs: Sequence[Curve], target: float, x: str) -> list[float]:
     return [float(run[x][at[0]]) if len(at) else math.inf for run, at in zip(runs, first, strict=True)]
 
 
-def summary(directory: Path, env: str, targets: Sequence[float]) -> dict[str, object]:
-    """Medians over the runs of a task that have been evaluated in all ways, and each one's return; empty if none has.
+def timed(runs: Sequence[Curve]) -> list[Curve]:
+    """The runs that had the machine to themselves. The csv files have no seconds of the others."""
+    return [run for run in runs if not np.isnan(run["seconds"]).any()]
+
+
+def spread(values: Sequence[float]) -> str:
+    return f"{mean(values):.0f} ± {pstdev(values):.0f}" if len(values) > 1 else f"{values[0]:.0f}"
+
+
+def draw(path: Path, learners: Sequence[str], tasks: Sequence[str], of: Callable[[str, str], list[Curve]]) -> None:
+    """Each seed (thin) and the median (bold) against control steps and seconds, on log axes if ends lie far apart.
 
     Args:
-        targets: returns whose passing is timed.
+        of: the curves of a learner on a task.
     """
-    task, runs, rows = diffsim.TASKS[env], [], []
-    for folder in folders(directory, env):
-        if own := evaluation(folder):
-            how = own["settings"]
-            checks = [evaluation(finer(folder, n), how["iteration"]) for n in checked(env, how)]
-            if all(checks):
-                progress = read_csv(folder / "progress.csv")
-                rows.append(next(row for row in progress if int(row["iteration"]) == how["iteration"]))
-                runs.append((seed(folder), own, *checks, curve(progress)))
-    if not runs:
-        return {}
-    seeds, owns, finers, references, curves = zip(*runs, strict=True)
-    own, finest, reference = (median(found["return"] for found in each) for each in (owns, finers, references))
-    alone = [float(row["seconds"]) for row in rows if row["seconds"]]  # runs that shared their machine have none
-    timed = [curve for curve in curves if not np.isnan(curve["seconds"]).any()]
-    falls = (mean(length < task.episode_length for length in found["lengths"]) for found in owns)
-    return {
-        "integrator": how["integrator"],
-        "substeps": how["substeps"],
-        "seeds": " ".join(seeds),
-        "iterations": f"{median(int(row['iteration']) for row in rows):g}",
-        "training (s)": f"{median(alone):.0f}" if alone else "",
-        "return": f"{own:.0f}",
-        "each seed": " ".join(f"{found['return']:.0f}" for found in owns),
-        f"explicit, substeps x{FINER}": f"{finest:.0f}",
-        "kept": f"{kept(own, finest):.3f}",
-        "in the reference": f"{reference:.0f}",
-        "speed (m/s)": " ".join(f"{found['speed']:.2f}" for found in owns if found["speed"] is not None),
-        "falls per episode": " ".join(f"{share:.2f}" for share in falls),
-        "return passes": "; ".join(words(target, passing(timed, target, "seconds")) for target in targets if timed),
-    }
-
-
-def words(target: float, seconds: Sequence[float]) -> str:
-    """When the median run passes a return, and where it does not, how many do."""
-    passed = [s for s in seconds if s < math.inf]
-    if median(seconds) < math.inf:
-        return f"{target:g} after {median(seconds):.0f} s"
-    return f"{target:g} by {len(passed)} of {len(seconds)}, after {min(passed):.0f} s" if passed else f"{target:g} not"
+    grid = list[list[Panel]]()
+    for x, text in (("control_steps", "control steps"), ("seconds", "seconds of training")):
+        panels = list[Panel]()
+        for env in tasks:
+            lines, begins, ends, published = list[Line](), list[float](), list[float](), RETURNS[env].published
+            for k, learner in enumerate(learners):
+                runs = of(learner, env)
+                if runs := timed(runs) if x == "seconds" else runs:
+                    shared = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
+                    middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
+                    lines += [Line(run[x], run["return"], f"C{k}-", width=0.5) for run in runs]
+                    lines.append(Line(shared, middle, f"C{k}-", learner, width=2))
+                    begins.append(shared[0])
+                    ends.append(shared[-1])
+            for learner in (learner for learner in learners if ends and learner in published):
+                value, style = [published[learner]] * 2, f"C{learners.index(learner)}--"
+                lines.append(Line((min(begins), max(ends)), value, style, f"{learner}, published", 0.8))
+            log = "x" if ends and max(ends) > 10 * min(ends) else ""
+            panels.append(Panel(lines, env, text, "" if panels else "return of training episodes", log))
+        if any(panel.lines for panel in panels):  # not where all runs shared their machine, and have no seconds
+            grid.append(panels)
+    plot(path, grid, (3.4, 2.9) if len(tasks) > 1 else (6.0, 3.8))
