@@ -13,13 +13,13 @@ ValueError, with what is allowed, for what is not finite or not within the bound
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from diffsim.robot.scene import Array, Scene
-from diffsim.sim.integration import is_real
 
 MOST_SEGMENTS = 10_000  # of rough ground
 
@@ -46,7 +46,7 @@ def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float 
         degrees: the steepest slope, below 90; they are uniform between it and its opposite.
         length: of all segments together, along x [m]: one to MOST_SEGMENTS segments.
     """
-    if not is_real(seed) or not float(seed).is_integer() or seed < 0:
+    if not isinstance(seed, Real) or not float(seed).is_integer() or seed < 0:
         raise ValueError(f"seed is {seed!r}, must be an integer of at least 0")
     _check("segment", segment, "be positive and finite", above=0)
     _check("length", length, "be positive and finite", above=0)
@@ -136,5 +136,5 @@ def _slope(degrees: float) -> float:
 def _check(
     name: str, value: object, wanted: str, above: float = -math.inf, below: float = math.inf, but: float = math.nan
 ) -> None:
-    if not is_real(value) or not above < value < below or value == but:  # type: ignore[operator]
+    if not isinstance(value, Real) or not above < value < below or value == but:  # type: ignore[operator]
         raise ValueError(f"{name} is {value!r}, must {wanted}")

@@ -326,7 +326,11 @@ def test_blocks_in_single_precision_are_close(rng):
     [
         (pendulum(), Integration("mujoco", 4, passes=0), "passes is 0, must be an integer of at least 1"),
         (pendulum(), Integration("mujoco", 4, theta=0.5), "only the implicit integrator has a theta"),
-        (pendulum('frictionloss="1"'), Integration(), "semi_implicit has no frictionloss .joint 'hinge'.; mujoco has"),
+        (
+            pendulum('frictionloss="1"'),
+            Integration(),
+            "soft contact has no frictionloss .joint 'hinge'.; choose MuJoCo's contact",
+        ),
         (
             pendulum('range="-.1 .1" margin=".2"'),
             Integration("mujoco", 4),

@@ -7,28 +7,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from functools import cache
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim.robot.constants import declared_pairs, disabled_flags, enabled_flags, ground_pairs, label, listed, pair_law
-from diffsim.robot.scene import Array, Scene, SceneError
+from diffsim.robot.contact import ground_pairs, pair_law
+from diffsim.robot.elements import disabled_flags, enabled_flags, label, listed
+from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Constraints, Scene, SceneError
 
 # MuJoCo's own bounds: of an impedance, and of the friction of a contact that has any
 LEAST, MOST, LEAST_FRICTION = 1e-4, 0.9999, 1e-5
-
-
-class Constraints(NamedTuple):
-    """Numbers of MuJoCo's constraints, for one length of a substep."""
-
-    # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
-    # midpoint and power; margin [m]
-    contact: Array
-    limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
-    loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
 
 
 def constrained(scene: Scene, seconds: float) -> Scene:
@@ -56,41 +45,28 @@ def constrained(scene: Scene, seconds: float) -> Scene:
     )
 
 
-def check_springs(scene: Scene, integrator: str) -> None:
-    """Raises SceneError where another integrator lacks what the file asks for."""
+def check_soft(scene: Scene) -> None:
+    """Raises SceneError where soft contact lacks what the file asks for, or the file a constant of soft contact."""
     m = scene.mj_model
     joints = np.unique(m.dof_jntid[m.dof_frictionloss > 0]).tolist()
     if joints:
         names = listed(label(m, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in joints)
-        raise SceneError(f"{scene.name}: the integrator {integrator} has no frictionloss (joint {names}); mujoco has")
+        raise SceneError(f"{scene.name}: soft contact has no frictionloss (joint {names}); choose MuJoCo's contact")
+    unnamed = [name for name in PENALTY_CONSTANTS if np.isnan(getattr(scene, name)).any()]
+    if missing := [name for name in unnamed if scene.ncontact or name.endswith("_limit")]:
+        raise SceneError(
+            f"{scene.name}: soft contact needs {', '.join(missing)}; choose MuJoCo's contact, give them as penalty, "
+            f'or name them in the file: <custom><numeric name="{missing[0]}" data="1e4"/></custom>'
+        )
 
 
 def _contact(m: mujoco.MjModel, ground: int, geom: int, fastest: float) -> Array:
     law = pair_law(m, ground, geom)
     weight = m.body_invweight0[m.geom_bodyid[[ground, geom]], 0].sum()
     friction = max(law.friction, LEAST_FRICTION) if law.condim > 1 else 0.0
-    numbers = _numbers(law.solref, law.solimp, weight, contact_margin(m, ground, geom), fastest)
+    numbers = _numbers(law.solref, law.solimp, weight, law.margin, fastest)
     numbers[2:4] = friction, 1 / m.opt.impratio
     return numbers
-
-
-def contact_margin(m: mujoco.MjModel, ground: int, geom: int) -> float:
-    """Of a contact of these two: the distance at which it begins [m]."""
-    if (pair := declared_pairs(m).get((min(ground, geom), max(ground, geom)))) is not None:
-        return float(m.pair_margin[pair] - (0.0 if _margins_add() else m.pair_gap[pair]))
-    margin, gap = m.geom_margin[[ground, geom]], m.geom_gap[[ground, geom]]
-    return float(margin.sum() if not margin.any() or _margins_add() else margin.max() - gap.max())
-
-
-@cache
-def _margins_add() -> bool:
-    """Whether a contact acts within the sum of its geoms' margins; in older versions it is the larger, less the gap."""
-    geom = '<geom type="{}" size="1 1 1" margin="1"/>'
-    body = f"<body><freejoint/>{geom.format('sphere')}</body>"
-    m = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geom.format('plane')}{body}</worldbody></mujoco>")
-    data = mujoco.MjData(m)
-    mujoco.mj_forward(m, data)
-    return bool(data.contact[0].includemargin > 1.5)
 
 
 def _obstacles(scene: Scene) -> Iterator[str]:

@@ -13,54 +13,35 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.constants import (
-    PairLaw,
-    at_rest,
-    contact_constants,
-    contact_points,
-    control_range,
-    disabled_flags,
-    floating,
-    ground_pairs,
-    limit_constants,
-    mobilities,
-    motors,
-    numeric,
-    pair_law,
-    servos,
-)
-from diffsim.robot.refuse import obstacles, overflows
-from diffsim.robot.report import approximations, troubles
+from diffsim.robot.contact import contact_points, ground_pairs
+from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, numeric, servos
+from diffsim.robot.refuse import beyond, obstacles
+from diffsim.robot.report import approximations, slowness
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
-
-MOST_BYTES = 2e6  # of an MJCF without its meshes; MuJoCo takes half a minute for them
 
 
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
-    """Read an MJCF file or copy a model; a warning tells of a robot that leaves the finite numbers at once or is slow.
+    """Read an MJCF file or copy a model; a warning tells of a robot that is slow.
 
     Raises:
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
     """
     if isinstance(path, mujoco.MjSpec):
         path = path.compile()
-    file = Path(path if isinstance(path, str | os.PathLike) else path.names.partition(b"\0")[0].decode())
-    given = isinstance(path, mujoco.MjModel)
-    if not given and not file.is_file():
+    if isinstance(path, mujoco.MjModel):
+        file, model = Path(path.names.partition(b"\0")[0].decode()), copy.copy(path)
+    elif (file := Path(path)).is_file():
+        try:
+            model = mujoco.MjModel.from_xml_path(str(file))
+        except ValueError as error:
+            raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
+    else:
         raise SceneError(f"robot file {str(path)!r} does not exist")
-    if not given and file.stat().st_size > MOST_BYTES:
-        raise SceneError(
-            f"robot file {str(path)!r} has {file.stat().st_size / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:g}"
-        )
-    try:
-        model = copy.copy(path) if given else mujoco.MjModel.from_xml_path(str(file))
-    except ValueError as error:
-        raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
     _obey_flags(model)
     _refuse(file, obstacles(model))
     scene = _Reader(model, file).scene()
-    _refuse(file, overflows(scene))
-    for sentence in troubles(scene):
+    _refuse(file, beyond(scene))
+    for sentence in slowness(scene):
         warnings.warn(f"{file.name}: {sentence}", stacklevel=2)
     return dataclasses.replace(scene, approximations=approximations(scene))
 
@@ -144,7 +125,11 @@ class _Reader:
             **joints,
             **inertias,
             **self._actuators(springs),
-            **self._contacts(float(inertias["mass"].sum()), joints["slide"]),
+            **self._contacts(joints["slide"]),
+            k_n=self._numeric("k_n", np.nan),
+            k_d=self._numeric("k_d", np.nan),
+            k_t=self._numeric("k_t", np.nan),
+            mu=self._numeric("mu", np.nan),
             body_link=np.array([link for link, _, _ in self.body], np.int32),
             body_com=np.array([p + r @ com for (_, r, p), com in zip(self.body, m.body_ipos, strict=True)]),
             gravity=np.array(m.opt.gravity),
@@ -182,7 +167,6 @@ class _Reader:
         joint = m.dof_jntid[dof]
         ball, limited = m.jnt_type[joint] == kind.mjJNT_BALL, m.jnt_limited[joint] != 0
         nth, at = dof - m.jnt_dofadr[joint], m.jnt_qposadr[joint]
-        k_limit, d_limit = self._limits()
 
         def column(values: Array, base: float = 0.0) -> Array:
             return np.concatenate((np.full((1, *values.shape[1:]), base), values))
@@ -196,8 +180,8 @@ class _Reader:
             **{name: column(values, base) for name, (values, base) in self._springs(joint, ball).items()},
             "lower": column(np.where(limited, m.jnt_range[joint, 0], -np.inf), -np.inf),
             "upper": column(np.where(limited, m.jnt_range[joint, 1], np.inf), np.inf),
-            "k_limit": column(np.where(limited, k_limit[dof], 0.0)),
-            "d_limit": column(np.where(limited, d_limit[dof], 0.0)),
+            "k_limit": column(np.where(limited, self._numeric("k_limit", np.nan), 0.0)),
+            "d_limit": column(np.where(limited, self._numeric("d_limit", np.nan), 0.0)),
         }
 
     def _springs(self, joint: NDArray[np.int32], ball: NDArray[np.bool_]) -> dict[str, tuple[Array, float]]:
@@ -321,19 +305,12 @@ class _Reader:
                 segments.append(Segment((min(i, j), max(i, j)), np.array(ends), actuator))
         return segments
 
-    def _contacts(self, mass: float, slide: NDArray[np.bool_]) -> dict[str, Any]:
+    def _contacts(self, slide: NDArray[np.bool_]) -> dict[str, Any]:
         m = self.m
-        data, pairs = at_rest(m), ground_pairs(m)
+        pairs = ground_pairs(m)
         every = [sphere for _, geom in pairs for sphere in self._spheres(geom)]
         spheres = self._outer_spheres(every, slide)
-        points = []  # the lowest one of each sphere in the reference pose
-        for sphere in spheres:
-            body = m.geom_bodyid[sphere.geom]
-            _, rotation, position = self.body[body]
-            centre = data.xpos[body] + data.xmat[body].reshape(3, 3) @ rotation.T @ (sphere.centre - position)
-            points.append((body, centre - [0.0, 0.0, sphere.radius]))
-        laws = [pair_law(m, pairs[0][0], sphere.geom) for sphere in spheres]
-        return self._contact_constants(mass, points, laws) | {
+        return {
             "spheres": Spheres(
                 np.array([sphere.link for sphere in every], np.int32),
                 np.array([sphere.centre for sphere in every]).reshape(-1, 3),
@@ -343,21 +320,7 @@ class _Reader:
             "contact_link": np.array([sphere.link for sphere in spheres], np.int32),
             "contact_position": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
             "contact_radius": np.array([sphere.radius for sphere in spheres]),
-            "ground_height": float(data.geom_xpos[pairs[0][0], 2]) if pairs else 0.0,
-        }
-
-    def _contact_constants(self, mass: float, points: list[tuple[int, Array]], laws: list[PairLaw]) -> dict[str, float]:
-        """k_n, k_d, k_t, mu after the lowest point's law; a file that names k_n alone keeps the damping ratio."""
-        if not points:
-            return dict.fromkeys(("k_n", "k_d", "k_t", "mu"), 0.0)
-        law = laws[min(range(len(points)), key=lambda k: round(float(points[k][1][2]), 9))]
-        default = contact_constants(mass, mobilities(self.m, points), law.solref)
-        k_n = self._numeric("k_n", default["k_n"])
-        return {
-            "k_n": k_n,
-            "k_d": self._numeric("k_d", default["k_d"] * (k_n / default["k_n"] if default["k_n"] > 0 else 1.0)),
-            "k_t": self._numeric("k_t", default["k_t"]),
-            "mu": self._numeric("mu", law.friction if law.condim > 1 else 0.0),
+            "ground_height": float(at_rest(m).geom_xpos[pairs[0][0], 2]) if pairs else 0.0,
         }
 
     def _spheres(self, geom: int) -> list[Sphere]:
@@ -384,13 +347,6 @@ class _Reader:
             apart = np.linalg.norm(centres[others] - centres[k], axis=1)
             kept[k] = not (apart + radii[k] <= radii[others] + 1e-6).any()
         return sorted((spheres[k] for k in np.flatnonzero(kept)), key=lambda sphere: sphere.link)
-
-    def _limits(self) -> tuple[Array, Array]:
-        """k_limit, d_limit (nv,); a file that names k_limit alone keeps the damping ratio."""
-        k, d = limit_constants(self.m)
-        k_limit = np.array([self._numeric("k_limit", x) for x in k])
-        ratio = np.divide(k_limit, k, out=np.ones_like(k), where=k > 0)
-        return k_limit, np.array([self._numeric("d_limit", x) for x in d * ratio])
 
     def _numeric(self, name: str, default: float) -> float:
         values = numeric(self.m, name)

@@ -1,115 +1,67 @@
-"""What an MJCF file asks for and the simulator does not do, and numbers that no robot has, by their elements' names.
-
-Each check lists reasons with a mask of the elements that they hold for.
-"""
+"""What an MJCF file asks for and the simulator does not do: rows of (kind, which, why), which become lines."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+import dataclasses
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.robot.constants import (
-    POINTS,
-    asked,
+from diffsim.robot.contact import POINTS, declared_pairs, ground_pairs, pair_law
+from diffsim.robot.elements import (
     at_rest,
-    declared_pairs,
     disabled_flags,
     enabled_flags,
     floating,
-    ground_pairs,
     label,
     listed,
     mass_matrix,
     motors,
     numeric,
-    pair_law,
     servos,
-    text,
 )
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
 
 Kind, Joint = mujoco.mjtObj, mujoco.mjtJoint
 Mask = NDArray[np.bool_]
-NUMERICS = (*PENALTY_CONSTANTS, "muscle_strength")
-TEXTS = ("muscle_model",)
+# The kind of an element, a mask of those elements or their names, and what is not simulated of them
+Row = tuple[mujoco.mjtObj | str, ArrayLike, str]
 
 # Flags that the reader obeys, and flags that choose between MuJoCo's own numerical methods.
 OBEYED = {"constraint", "contact", "damper", "equality", "frictionloss", "gravity", "limit", "passive", "spring"}
 METHODS = {"autoreset", "clampctrl", "eulerdamp", "filterparent", "island", "midphase", "multiccd", "nativeccd"}
 METHODS |= {"refsafe", "sensor", "warmstart"}
 EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", "nativeccd", "sleep"}
-
-# Attributes of elements that are not simulated, and the arrays that are not 0 where one is set.
-UNSIMULATED = {
-    Kind.mjOBJ_TENDON: {
-        f"{field} of a tendon": f"tendon_{field}"
-        for field in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited", "springyield")
-    },
-    Kind.mjOBJ_ACTUATOR: {
-        "damping": "actuator_damping actuator_dampingpoly",
-        "armature": "actuator_armature",
-        "delay": "actuator_delay actuator_history",
-    },
-    Kind.mjOBJ_GEOM: {"adhesion": "geom_adhesion", "surfacevel": "geom_surfacevel"},
-}
-
-MASSES = (1e-4, 1e6)  # kg, of a whole robot
-MOST_POINTS = 10_000  # of contact; 20 s to read
-GREATEST = float(np.finfo(np.float32).max)
-
-
-class Obstacle(NamedTuple):
-    """Why an element keeps a file from being simulated."""
-
-    kind: str
-    name: str
-    why: str
+# Fields of a scene that may be infinite, and that are NaN where the file does not name them
+UNLIMITED, UNNAMED = {"lower", "upper", "force_low", "force_high"}, PENALTY_CONSTANTS
 
 
 def obstacles(m: mujoco.MjModel) -> list[str]:
     """One line per reason, with the names of all elements that it holds for; empty if the file can be simulated."""
-    for names in (m.names, m.text_data):
-        try:
-            names.decode()
-        except UnicodeDecodeError as error:
-            name = names[: error.end].rpartition(b"\0")[2] + names[error.end :].partition(b"\0")[0]
-            return [f"names must be in UTF-8, and {name.decode('latin-1')!r} is not; save the file in that encoding"]
-    return _lines(obstacle for check in (*NUMBERS, *ELEMENTS) for obstacle in check(m))
+    lines = []
+    for rows in (_file, _bodies, _joints, _inertia, _tendons, _actuators, _contacts):
+        for kind, which, why in rows(m):
+            if isinstance(kind, str):
+                names = list(map(str, np.atleast_1d(which)))
+            else:
+                names = [label(m, kind, index) for index in np.flatnonzero(which).tolist()]
+                kind = str(kind).rsplit("mjOBJ_", 1)[-1].lower()
+            if names:
+                lines.append(f"{kind} {listed(names)}: {why}")
+    return lines
 
 
-def overflows(scene: Scene) -> list[str]:
-    """Likewise of actuators whose forces, products of the file's numbers, single precision does not hold."""
-    names = "stiffness", "damping", "spring_ref", "servo_stiffness", "servo_damping", "servo_ref"
-    springs = np.array([getattr(scene, name) for name in names])[:, scene.motor_link]
-    numbers = np.column_stack((scene.gear, scene.motor_bias, *springs))
-    why = f"its force is beyond single precision, {GREATEST:.2g} N at most"
-    return _lines(_where(scene.mj_model, Kind.mjOBJ_ACTUATOR, {why: ~_finite(numbers).all(1)}))
-
-
-def _lines(found: Iterable[Obstacle]) -> list[str]:
-    lines: dict[tuple[str, str], dict[str, None]] = {}
-    for kind, name, why in found:
-        lines.setdefault((kind, why), {})[name] = None
-    return [f"{kind} {listed(names)}: {why}" for (kind, why), names in lines.items()]
-
-
-def _where(
-    m: mujoco.MjModel, kind: mujoco.mjtObj, rules: Mapping[str, ArrayLike], **values: NDArray[Any]
-) -> Iterator[Obstacle]:
-    """The elements of a kind for which a mask of the rules is true; values fill their fields in the reasons."""
-    for why, mask in rules.items():
-        for index in np.flatnonzero(np.asarray(mask)).tolist():
-            filled = why.format(**{key: column[index] for key, column in values.items()})
-            yield Obstacle(_name(kind), label(m, kind, index), filled)
-
-
-def _name(kind: mujoco.mjtObj) -> str:
-    return str(kind).rsplit("mjOBJ_", 1)[-1].lower()
+def beyond(scene: Scene) -> list[str]:
+    """Likewise of arrays whose numbers are none, or too large for the kernels' single precision."""
+    names = []
+    for name, values in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
+        if isinstance(values, float | np.ndarray) and np.asarray(values).dtype == np.float64:
+            within = np.abs(values) <= np.finfo(np.float32).max
+            within |= (name in UNLIMITED) & np.isinf(values) | (name in UNNAMED) & np.isnan(values)
+            names += [name] * (not np.all(within))
+    return [f"{', '.join(names)}: not finite in single precision"] if names else []
 
 
 def _any(m: mujoco.MjModel, fields: str) -> Mask:
@@ -119,166 +71,78 @@ def _any(m: mujoco.MjModel, fields: str) -> Mask:
     return np.logical_or.reduce(masks) if masks else np.zeros(1, bool)
 
 
-# Numbers --------------------------------------------------------------------------------------------------------------
-
-
-def _finite(values: ArrayLike) -> Mask:
-    """Elementwise, in the single precision of the kernels."""
-    return np.abs(values) <= GREATEST
-
-
-def _numbers(m: mujoco.MjModel) -> dict[mujoco.mjtObj, dict[str, Array]]:
-    """What must be finite, by kind and attribute; (n,) or (n, ...) each."""
-    fields = {
-        Kind.mjOBJ_BODY: ("body", "pos quat mass inertia ipos iquat gravcomp"),
-        Kind.mjOBJ_GEOM: ("geom", "pos quat size friction solref solimp solmix margin gap"),
-        Kind.mjOBJ_PAIR: ("pair", "friction solref solimp margin gap"),
-        Kind.mjOBJ_SITE: ("site", "pos"),
-        Kind.mjOBJ_JOINT: ("jnt", "pos axis range actfrcrange stiffness solref solimp margin"),
-        Kind.mjOBJ_ACTUATOR: ("actuator", "gear ctrlrange forcerange gainprm biasprm lengthrange"),
-    }
-    table = {k: {f: getattr(m, f"{prefix}_{f}") for f in names.split()} for k, (prefix, names) in fields.items()}
-    table[Kind.mjOBJ_JOINT] |= {"ref": m.qpos0[m.jnt_qposadr], "springref": m.qpos_spring[m.jnt_qposadr]}
-    for field in ("armature", "damping", "frictionloss"):
-        table[Kind.mjOBJ_JOINT][field] = getattr(m, f"dof_{field}")[m.jnt_dofadr]
-    return table
-
-
-def _not_finite(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    for kind, fields in _numbers(m).items():
-        wrong = {field: (~_finite(values)).any(tuple(range(1, values.ndim))) for field, values in fields.items()}
-        yield from _where(m, kind, {f"{field} is not finite": mask for field, mask in wrong.items()})
-    for field in ("gravity", "density", "viscosity"):
-        if not _finite(getattr(m.opt, field)).all():
-            yield Obstacle("option", field, "not finite")
-
-
-def _negative(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    signed = {Kind.mjOBJ_JOINT: ("armature", "damping", "stiffness"), Kind.mjOBJ_GEOM: ("friction", "solmix")}
-    signed |= {Kind.mjOBJ_PAIR: ("friction",), Kind.mjOBJ_BODY: ("gravcomp",)}
-    for kind, field in ((kind, field) for kind, fields in signed.items() for field in fields):
-        values = _numbers(m)[kind][field]
-        least = values.min(tuple(range(1, values.ndim)))
-        yield from _where(m, kind, {field + " is {least:g}, must not be negative": least < 0}, least=least)
-    for field in ("density", "viscosity"):
-        if getattr(m.opt, field) < 0:
-            yield Obstacle("option", field, f"{getattr(m.opt, field):g}, must not be negative")
-
-
-def _masses(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    moving = np.where(m.body_weldid != 0, m.body_mass, 0.0)
-    if moving.any() and not MASSES[0] <= moving.sum() <= MASSES[1]:
-        least, most = MASSES
-        why = f"the robot weighs {moving.sum():.3g} kg, most of it here; must be {least:g} to {most:g} kg"
-        yield from _where(m, Kind.mjOBJ_BODY, {why: np.arange(m.nbody) == moving.argmax()})
-    if not m.nv or any(_not_finite(m)) or (m.dof_armature < 0).any():
-        return
-    matrix = mass_matrix(m)
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0))
-    shared = np.zeros(m.nv, bool)
-    if np.isfinite(matrix).all() and scale.all():
-        values, shapes = np.linalg.eigh(matrix / np.outer(scale, scale))
-        shared = (abs(shapes[:, 0]) > 0.1) & (values[0] < 1e-7)
-    for body in range(m.nbody):  # MuJoCo's matrix takes the slides of a body for independent
-        slides = np.flatnonzero((m.jnt_bodyid == body) & (m.jnt_type == Joint.mjJNT_SLIDE))
-        dofs = m.jnt_dofadr[slides]
-        if len(slides) > np.linalg.matrix_rank(m.jnt_axis[slides], tol=1e-6) and not m.dof_armature[dofs].all():
-            shared[dofs] = True
-    rules = {"it moves no inertia": scale == 0, "these joints together have a motion without inertia": shared}
-    joints = {why: np.isin(range(m.njnt), m.dof_jntid[mask]) for why, mask in rules.items()}
-    yield from _where(m, Kind.mjOBJ_JOINT, joints)
-
-
-def _names(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    for kind, ours, count in ((Kind.mjOBJ_NUMERIC, NUMERICS, m.nnumeric), (Kind.mjOBJ_TEXT, TEXTS, m.ntext)):
-        for index in range(count):
-            name = mujoco.mj_id2name(m, kind, index)
-            if name not in ours and (near := difflib.get_close_matches(name.lower(), ours, 1, 0.65)):
-                why = f"not one of {', '.join(ours)}; did you mean {near[0]!r}? Else rename it"
-                yield Obstacle(_name(kind), repr(name), why)
-    for name in NUMERICS:
-        values = numeric(m, name)
-        if len(values) > 1 or not all(0 <= value <= GREATEST for value in values):
-            why = f"{' '.join(f'{v:g}' for v in values)}, must be one number, finite and not negative"
-            yield Obstacle("numeric", repr(name), why)
-    if (model := text(m, "muscle_model", "linear")) != "linear":
-        yield Obstacle("text", "'muscle_model'", f"{model!r} is not simulated; a muscle's force is linear here")
-
-
-# Elements -------------------------------------------------------------------------------------------------------------
-
-
-def _options(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    for flag in sorted(disabled_flags(m) - OBEYED - METHODS):
-        yield Obstacle("option flag", flag, "cannot be disabled here")
-    for flag in sorted(enabled_flags(m) - EXTRAS):
-        yield Obstacle("option flag", flag, "cannot be enabled here")
-    if np.any(m.opt.wind):
-        yield Obstacle("option", "wind", "only a fluid at rest is simulated")
+def _file(m: mujoco.MjModel) -> Iterator[Row]:
     group = np.array(m.actuator_group)
     off = (group >= 0) & (group < 31) & ((m.opt.disableactuator >> group.clip(0, 30)) & 1 == 1)
-    yield from _where(m, Kind.mjOBJ_ACTUATOR, {"its group is in actuatorgroupdisable; remove the actuator": off})
+    constants = {name: numeric(m, name) for name in (*PENALTY_CONSTANTS, "muscle_strength")}
+    wrong = [name for name, values in constants.items() if len(values) > 1 or (values < 0).any()]
+    yield "option flag", sorted(disabled_flags(m) - OBEYED - METHODS), "cannot be disabled here"
+    yield "option flag", sorted(enabled_flags(m) - EXTRAS), "cannot be enabled here"
+    yield "option", ["wind"] * bool(np.any(m.opt.wind)), "only a fluid at rest is simulated"
+    fluid = [name for name in ("density", "viscosity") if getattr(m.opt, name) < 0]
+    yield "option", fluid, "must not be negative"
+    yield "numeric", wrong, "must be one number, not negative"
+    yield "file", ["without a joint"] * (not m.njnt), "there is nothing to simulate"
+    yield Kind.mjOBJ_EQUALITY, m.eq_active0, "equality constraints are not simulated"
+    yield Kind.mjOBJ_FLEX, np.ones(m.nflex), "deformable bodies are not simulated"
+    yield Kind.mjOBJ_PLUGIN, np.ones(m.nplugin), "plugins are not simulated"
+    yield Kind.mjOBJ_ACTUATOR, off, "its group is in actuatorgroupdisable; remove the actuator"
 
 
-def _unsimulated(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    for kind, present, what in (
-        (Kind.mjOBJ_EQUALITY, m.eq_active0, "equality constraints"),
-        (Kind.mjOBJ_FLEX, np.ones(m.nflex), "deformable bodies"),
-        (Kind.mjOBJ_PLUGIN, np.ones(m.nplugin), "plugins"),
-    ):
-        yield from _where(m, kind, {f"{what} are not simulated": present})
-    for kind, attributes in UNSIMULATED.items():
-        rules = {f"{attribute} is not simulated": _any(m, fields) for attribute, fields in attributes.items()}
-        yield from _where(m, kind, rules)
-
-
-def _bodies(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    if not m.njnt:
-        yield Obstacle("file", "without a joint", "there is nothing to simulate")
+def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
     second = np.zeros(m.nbody, bool)
     if (m.jnt_type == Joint.mjJNT_FREE)[:1].any():
         others = m.jnt_bodyid[m.jnt_type != Joint.mjJNT_FREE]
         second[others] = m.body_rootid[others] != m.body_rootid[m.jnt_bodyid[0]]
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
-    rules = {
-        "mocap is not simulated": m.body_mocapid >= 0,
-        "a second base beside a floating one": second,
-        "in a fluid each body needs a joint; merge its geoms": welded & fluid,
-    }
-    yield from _where(m, Kind.mjOBJ_BODY, rules)
-    yield from _where(m, Kind.mjOBJ_GEOM, {"fluidshape ellipsoid is not simulated": m.geom_fluid[:, 0] * fluid})
+    yield Kind.mjOBJ_BODY, m.body_mocapid >= 0, "mocap is not simulated"
+    yield Kind.mjOBJ_BODY, second, "a second base beside a floating one"
+    yield Kind.mjOBJ_BODY, welded & fluid, "in a fluid each body needs a joint; merge its geoms"
+    yield Kind.mjOBJ_GEOM, m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
+    yield Kind.mjOBJ_GEOM, _any(m, "geom_adhesion"), "adhesion is not simulated"
+    yield Kind.mjOBJ_GEOM, _any(m, "geom_surfacevel"), "surfacevel is not simulated"
 
 
-def _joints(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    dof, limited, (low, high) = m.jnt_dofadr, m.jnt_limited != 0, m.jnt_range.T
+def _joints(m: mujoco.MjModel) -> Iterator[Row]:
+    kind, dof, limited = Kind.mjOBJ_JOINT, m.jnt_dofadr, m.jnt_limited != 0
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
-    loss = m.dof_frictionloss[dof]
-    inertial = (m.dof_armature[dof] != 0) & (m.opt.density + m.opt.viscosity > 0)
-    compensated = m.jnt_actgravcomp & m.jnt_actfrclimited
+    armature, damping, loss = (getattr(m, f"dof_{name}")[dof] for name in ("armature", "damping", "frictionloss"))
+    fluid = m.opt.density + m.opt.viscosity > 0
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
     plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
     tendons = (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON).any()
     curved = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(_any(m, "dof_dampingpoly"))])
-    rules = {
-        "damping and stiffness are linear here, one number each": curved | _any(m, "jnt_stiffnesspoly"),
-        "springs that yield are not simulated": _any(m, "jnt_springyield") | plastic,
-        "frictionloss {loss:g} is negative": loss < 0,
-        "the limit of a ball joint is not simulated": ball & limited,
-        "actuatorfrcrange beside muscles is not simulated": (m.jnt_actfrclimited != 0) & tendons,
-        "a free joint has no stiffness or frictionloss here": free & ((m.jnt_stiffness != 0) | (loss != 0)),
-        "armature of a free joint in a fluid is not simulated": free & inertial,
-        "actuatorgravcomp within actuatorfrcrange is not simulated": compensated,
-        "one free joint, of the first moving body, is simulated": free & ~first,
-        "range {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
-    }
-    yield from _where(m, Kind.mjOBJ_JOINT, rules, low=low, high=high, loss=loss)
-    wrong = np.array([_wrong(solref) for solref in m.jnt_solref], str)
-    yield from _where(m, Kind.mjOBJ_JOINT, {"solreflimit {wrong}": limited & (wrong != "")}, wrong=wrong)
+    negative = np.minimum.reduce((m.jnt_stiffness, armature, damping, loss)) < 0
+    bounded = m.jnt_actfrclimited != 0
+    yield kind, negative, "armature, damping, stiffness and frictionloss must not be negative"
+    yield kind, curved | _any(m, "jnt_stiffnesspoly"), "damping and stiffness are linear here, one number each"
+    yield kind, _any(m, "jnt_springyield") | plastic, "springs that yield are not simulated"
+    yield kind, ball & limited, "the limit of a ball joint is not simulated"
+    yield kind, limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
+    yield kind, bounded & tendons, "actuatorfrcrange beside muscles is not simulated"
+    yield kind, bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
+    yield kind, free & ((m.jnt_stiffness != 0) | (loss != 0)), "a free joint has no stiffness or frictionloss here"
+    yield kind, free & (armature != 0) & fluid, "armature of a free joint in a fluid is not simulated"
+    yield kind, free & ~first, "one free joint, of the first moving body, is simulated"
 
 
-def _tendons(m: mujoco.MjModel) -> Iterator[Obstacle]:
+def _inertia(m: mujoco.MjModel) -> Iterator[Row]:
+    matrix = mass_matrix(m) if m.nv else np.eye(0)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0))
+    shared = np.zeros(m.nv, bool)
+    if np.isfinite(matrix).all() and scale.all() and m.nv:
+        values, shapes = np.linalg.eigh(matrix / np.outer(scale, scale))
+        shared[:] = (abs(shapes[:, 0]) > 0.1) & (values[0] < 1e-7)
+    joints = np.arange(m.njnt)
+    yield Kind.mjOBJ_JOINT, np.isin(joints, m.dof_jntid[scale == 0]), "it moves no inertia"
+    yield Kind.mjOBJ_JOINT, np.isin(joints, m.dof_jntid[shared]), "these joints together have a motion without inertia"
+
+
+def _tendons(m: mujoco.MjModel) -> Iterator[Row]:
     """One without force of its own and without actuator has no effect, whatever its path."""
+    for name in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited", "springyield"):
+        yield Kind.mjOBJ_TENDON, _any(m, f"tendon_{name}"), f"{name} of a tendon is not simulated"
     spatial, held = np.ones(m.ntendon, bool), np.zeros(m.nsite, bool)
     for tendon in np.unique(m.actuator_trnid[m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]).tolist():
         path = slice(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
@@ -286,35 +150,30 @@ def _tendons(m: mujoco.MjModel) -> Iterator[Obstacle]:
         if spatial[tendon]:
             held[m.wrap_objid[path]] = True
     world = (m.body_weldid[m.site_bodyid] == 0) & floating(m)
-    why = "only spatial tendons through sites, without pulleys or wrapping geoms"
-    yield from _where(m, Kind.mjOBJ_TENDON, {why: ~spatial})
-    yield from _where(m, Kind.mjOBJ_SITE, {"a muscle of a floating robot cannot hold on to the world": held & world})
+    yield Kind.mjOBJ_TENDON, ~spatial, "only spatial tendons through sites, without pulleys or wrapping geoms"
+    yield Kind.mjOBJ_SITE, held & world, "a muscle of a floating robot cannot hold on to the world"
 
 
 ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
 ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
 
 
-def _actuators(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    count = len(m.actuator_trntype)  # a PID has several of nu controls
+def _actuators(m: mujoco.MjModel) -> Iterator[Row]:
+    kind, count = Kind.mjOBJ_ACTUATOR, len(m.actuator_trntype)  # a PID has several of nu controls
     tendon, motor = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, motors(m)
     pulls, turns = _pulls(m, count), _turns(m)
-    low, high = m.actuator_ctrlrange[:count].T
-    stiffness, damping = np.where(servos(m), -m.actuator_biasprm[:count, 1:3].T, 0.0)
+    negative = servos(m) & (m.actuator_biasprm[:count, 1:3] > 0).any(1)
     bounded, joint = m.actuator_forcelimited[:count] != 0, np.where(tendon, -1, m.actuator_trnid[:count, 0])
     shared = (joint[:, None] == joint).sum(1) > 1
     idle = tendon & ~motor & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
-    rules = {
-        f"only {ON_TENDON}": tendon & ~pulls,
-        f"only {ON_JOINT}, without activation dynamics, or muscles on tendons": ~tendon & ~turns,
-        "its stiffness (minus biasprm's second number) is {stiffness:g}, must not be negative": turns & (stiffness < 0),
-        "its damping (minus biasprm's third number) is {damping:g}, must not be negative": turns & (damping < 0),
-        "forcerange of what pulls a tendon is not simulated": tendon & bounded,
-        "forcerange is simulated of a joint's only actuator": turns & bounded & shared,
-        "its force follows from what it moves, and it moves nothing; give force": pulls & idle,
-        "ctrlrange {low:g} {high:g} is empty": (low >= high) & ((low != 0) | (high != 0)),
-    }
-    yield from _where(m, Kind.mjOBJ_ACTUATOR, rules, low=low, high=high, stiffness=stiffness, damping=damping)
+    for name, fields in {"damping": "damping actuator_dampingpoly", "armature": "armature", "delay": "delay"}.items():
+        yield kind, _any(m, f"actuator_{fields}"), f"{name} is not simulated"
+    yield kind, tendon & ~pulls, f"only {ON_TENDON}"
+    yield kind, ~tendon & ~turns, f"only {ON_JOINT}, without activation dynamics, or muscles on tendons"
+    yield kind, turns & negative, "stiffness and damping of a servo must not be negative"
+    yield kind, tendon & bounded, "forcerange of what pulls a tendon is not simulated"
+    yield kind, turns & bounded & shared, "forcerange is simulated of a joint's only actuator"
+    yield kind, pulls & idle, "its force follows from what it moves, and it moves nothing; give force"
 
 
 def _turns(m: mujoco.MjModel) -> Mask:
@@ -341,45 +200,28 @@ def _pulls(m: mujoco.MjModel, count: int) -> Mask:
     return np.where(motors(m), shortens, muscle & (gear == 1) & (0 <= low) & (low < high) & (high <= 1))
 
 
-def _contacts(m: mujoco.MjModel) -> Iterator[Obstacle]:
-    data, pairs = at_rest(m), ground_pairs(m)
-    touching = np.zeros(m.ngeom, bool)
+def _contacts(m: mujoco.MjModel) -> Iterator[Row]:
+    data, pairs, only_drawn = at_rest(m), ground_pairs(m), "; set contype and conaffinity to 0 if only drawn"
+    touching, shaped, mixed = np.zeros(m.ngeom, bool), np.ones(m.ngeom, bool), np.zeros(m.ngeom, bool)
     touching[[ground for ground, _ in pairs]] = True
-    plane, only_drawn = m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, "; set contype and conaffinity to 0 if only drawn"
-    other = ~plane | (touching.sum() > 1)
+    other = (m.geom_type != mujoco.mjtGeom.mjGEOM_PLANE) | (touching.sum() > 1)
     tilted = ~np.isclose(data.geom_xmat[:, 2::3], [0.0, 0.0, 1.0]).all(1)
-    one_plane = f"contact is simulated with one ground plane only{only_drawn}"
-    rules = {one_plane: touching & other, "the ground plane must be horizontal": touching & ~other & tilted}
-    yield from _where(m, Kind.mjOBJ_GEOM, rules)
-    points = sum(len(POINTS.get(m.geom_type[geom], ())) for _, geom in pairs)
-    if points > MOST_POINTS:
-        yield Obstacle("contact", f"{points} points", f"at most {MOST_POINTS} are simulated{only_drawn}")
-        return
-    laws = {geom: pair_law(m, ground, geom) for ground, geom in pairs}
-    geoms = list(laws)
-    wrong, shaped = np.full(m.ngeom, "", "U80"), np.ones(m.ngeom, bool)
-    wrong[geoms] = [_wrong(law.solref) for law in laws.values()]
-    shaped[geoms] = np.isin(m.geom_type[geoms], list(POINTS))
-    rules = {f"its shape cannot touch the ground here{only_drawn}": ~shaped, "solref {wrong}": wrong != ""}
-    yield from _where(m, Kind.mjOBJ_GEOM, rules, wrong=wrong)
+    for ground, geom in pairs:
+        shaped[geom] = m.geom_type[geom] in POINTS
+        mixed[geom] = _mixed(pair_law(m, ground, geom).solref)
+    negative = (m.geom_friction.min(1) < 0) | (m.geom_solmix < 0)
     ends = {tuple(sorted(pair)) for pair in pairs}
-    on_ground = np.array([k for pair, k in declared_pairs(m).items() if pair in ends], int)
+    declared = np.isin(range(m.npair), [k for pair, k in declared_pairs(m).items() if pair in ends])
+    yield Kind.mjOBJ_GEOM, negative, "friction and solmix must not be negative"
+    yield Kind.mjOBJ_GEOM, touching & other, f"contact is simulated with one ground plane only{only_drawn}"
+    yield Kind.mjOBJ_GEOM, touching & ~other & tilted, "the ground plane must be horizontal"
+    yield Kind.mjOBJ_GEOM, ~shaped, f"its shape cannot touch the ground here{only_drawn}"
+    yield Kind.mjOBJ_GEOM, mixed, "solref mixes a positive with another number"
     first, second = m.pair_friction[:, :2].T
-    rules = {
-        "friction {first:g} {second:g} differs by direction; it is isotropic here": first != second,
-        "solreffriction is not simulated": m.pair_solreffriction.any(1),
-    }
-    rules = {why: mask & np.isin(range(m.npair), on_ground) for why, mask in rules.items()}
-    yield from _where(m, Kind.mjOBJ_PAIR, rules, first=first, second=second)
+    yield Kind.mjOBJ_PAIR, declared & (m.pair_friction.min(1) < 0), "friction must not be negative"
+    yield Kind.mjOBJ_PAIR, declared & (first != second), "friction differs by direction; it is isotropic here"
+    yield Kind.mjOBJ_PAIR, declared & m.pair_solreffriction.any(1), "solreffriction is not simulated"
 
 
-def _wrong(solref: ArrayLike) -> str:
-    """What is wrong with a solref, if anything."""
-    first, second = np.asarray(solref).tolist()
-    if (first > 0) != (second > 0):
-        return "mixes a positive with another number"
-    return "" if _finite(asked((first, second))).all() else "is beyond single precision; MuJoCo's default is 0.02 1"
-
-
-NUMBERS = _not_finite, _negative, _masses, _names
-ELEMENTS = _options, _unsimulated, _bodies, _joints, _tendons, _actuators, _contacts
+def _mixed(solref: Array) -> Mask:
+    return (solref[..., 0] > 0) != (solref[..., 1] > 0)

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from numbers import Real
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffsim.sim.integration import is_real
-
-if TYPE_CHECKING:
-    from diffsim.robot.constraint import Constraints
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
-# Constants of contact (Eq. 3) and limits (Eq. 4), with their units. <custom><numeric name="k_n" data="2e4"/></custom>
-# in the MJCF sets one, constants.py those that the file does not name.
+# Constants of soft contact (Eq. 3) and limits (Eq. 4), with their units. In the MJCF
+# <custom><numeric name="k_n" data="2e4"/></custom> sets one.
 PENALTY_CONSTANTS = {
     "k_n": "N/m",
     "k_d": "N s/m^2",
@@ -47,6 +43,16 @@ class Spheres(NamedTuple):
     centre: Array  # (n, 3)
     radius: Array  # (n,)
     geom: Index  # (n,) what they are part of
+
+
+class Constraints(NamedTuple):
+    """Numbers of MuJoCo's constraints, for one length of a substep."""
+
+    # (nc, 11) k [1/s^2] and b [1/s]; friction; 1 / impratio; inverse weight [1/kg]; the impedance's ends, width [m],
+    # midpoint and power; margin [m]
+    contact: Array
+    limit: Array  # (nlink, 11) the same of each joint, in its units; friction and impratio are of no use
+    loss: Array  # (nlink, 3) of each joint's dry friction: its bound [N or N m], D [kg or kg m^2] and b [1/s]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,7 +100,7 @@ class Scene:
     lower: Array  # bounds of the joint, infinite where unlimited
     upper: Array
     k_limit: Array  # stiffness and
-    d_limit: Array  # damping of the joint's limits (Eq. 4)
+    d_limit: Array  # damping of the joint's limits (Eq. 4); NaN where the file does not name them
     motor_link: Index  # (nu,) whose joint has a force of gear * ctrl + motor_bias for ctrl in [-1, 1] over ctrlrange;
     gear: Array  # (nu,)
     motor_bias: Array  # (nu,) of a muscle the link is 0, and that is the maximum force times the activation
@@ -111,7 +117,7 @@ class Scene:
     body_com: Array  # (nbody, 3) its centre of mass in that link's frame
     gravity: Array
     ground_height: float
-    k_n: float  # stiffness, damping and friction of contact (Eq. 3)
+    k_n: float  # stiffness, damping and friction of contact (Eq. 3); NaN where the file does not name them
     k_d: float
     k_t: float
     mu: float
@@ -169,7 +175,7 @@ class Scene:
             "ball": self.nball > 0,
             "contact": self.ncontact > 0,
             "terrain": self.ncontact > 0 and self.terrain is not None,
-            "limit": bool((limited & ((self.k_limit > 0) | (self.d_limit > 0) | constrained)).any()),
+            "limit": bool((limited & ((self.k_limit != 0) | (self.d_limit != 0) | constrained)).any()),
             "frictionloss": self.constraints is not None and bool(self.constraints.loss[:, 0].any()),
             "gravcomp": bool(self.lift.any() and self.gravity.any()),
             "base_damping": bool(self.base_damping.any()),
@@ -231,7 +237,7 @@ class Scene:
         for name, value in constants.items():
             if name not in PENALTY_CONSTANTS:
                 raise ValueError(f"unknown penalty constant {name!r}; choose from {', '.join(PENALTY_CONSTANTS)}")
-            if not is_real(value) or not 0 <= value <= float(np.finfo(np.float32).max):
+            if not isinstance(value, Real) or not 0 <= value <= float(np.finfo(np.float32).max):
                 raise ValueError(f"penalty constant {name} is {value!r}, must be finite and not negative")
         changes: dict[str, Any] = {
             name: np.full(self.nlink, value) if name.endswith("_limit") else value for name, value in constants.items()

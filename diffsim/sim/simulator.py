@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 import torch
 
-from diffsim.robot.constraint import check_springs, constrained
+from diffsim.robot.constraint import check_soft, constrained
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory
@@ -75,7 +75,7 @@ class Simulator:
         if self.integration.integrator == "mujoco":
             scene = constrained(scene, control_dt / self.integration.substeps)
         else:
-            check_springs(scene, self.integration.integrator)
+            check_soft(scene)
         launcher = Launcher(scene, num_envs, self.options)
         stepper = ExtrapolatedStepper if self.integration.integrator == "extrapolated" else Stepper
         self._stepper = stepper(launcher, self.integration, control_dt, horizon)

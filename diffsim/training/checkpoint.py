@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim.env import DiffEnv
-from diffsim.robot.constants import control_range
+from diffsim.robot.elements import control_range
 from diffsim.tasks import TASKS
 from diffsim.training.errors import fail
 from diffsim.training.layers import First, Likeliest, ObsNormalizer

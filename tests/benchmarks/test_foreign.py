@@ -12,7 +12,7 @@ def test_a_folder_becomes_a_table(tmp_path, capsys):
     robots = {
         "servos": BOUNDED_SERVOS,
         "rubbed": pendulum('axis="0 1 0" frictionloss="1"'),
-        "bad": pendulum('damping="-1"'),
+        "bad": pendulum(rest='<actuator><velocity joint="hinge" kv="-2"/></actuator>'),
     }
     for name, mjcf in robots.items():
         (tmp_path / name).mkdir()
@@ -21,7 +21,7 @@ def test_a_folder_becomes_a_table(tmp_path, capsys):
     foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
     assert "2 of 3 load" in capsys.readouterr().out
     rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
-    assert rows["bad/scene.xml"]["refused"] == "joint: damping is -1, must not be negative"
+    assert rows["bad/scene.xml"]["refused"] == "actuator: stiffness and damping of a servo must not be negative"
     for name in ("servos", "rubbed"):
         assert rows[f"{name}/scene.xml"]["refused"] == ""
         assert float(rows[f"{name}/scene.xml"]["relative error of qacc"]) < 1e-9

@@ -20,9 +20,6 @@ from scenes import (
     tree_scene,
 )
 
-from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import SceneError
-
 
 def test_welded_bodies_are_merged():
     scene = parse(
@@ -244,16 +241,3 @@ def test_strength_of_muscles():
     np.testing.assert_allclose([scene.gear[0], scene.motor_bias[0]], [0.9, 0.9])
     half = tendon(actuator=f'<muscle {MUSCLE} ctrllimited="true" ctrlrange="0 0.5"/>')
     np.testing.assert_allclose([parse(half).gear[0], parse(half).motor_bias[0]], [1.25, 1.25])
-
-
-def test_missing_and_broken_files(tmp_path):
-    with pytest.raises(SceneError, match="nowhere.xml"):
-        load_scene(tmp_path / "nowhere.xml")
-    with pytest.raises(SceneError):
-        load_scene(tmp_path)
-    for text in ("<mujoco><worldbody>", "no xml at all", "<mujoco><worldbody><bogus/></worldbody></mujoco>", ""):
-        broken = tmp_path / "broken.xml"
-        broken.write_text(text)
-        with pytest.raises(SceneError, match="broken.xml") as error:
-            load_scene(broken)
-        assert "\n" not in str(error.value)
