@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from diffsim.env import DiffEnv
 from diffsim.robot.elements import control_range
 from diffsim.tasks import TASKS
+from diffsim.tasks.imitation.clip import Clip
 from diffsim.training.errors import fail
 from diffsim.training.layers import First, Likeliest, ObsNormalizer
 from diffsim.training.ranges import fits
@@ -115,7 +116,8 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
                 raise ValueError("compressed, which torch.save does not do")
             if archive.testzip() is not None:  # torch does not look at the checksums that it writes
                 raise ValueError("a wrong checksum")
-        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        with torch.serialization.safe_globals([Clip]):  # the one that the policy was trained on
+            state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         form = state["format"]
         if form == FORMAT:
             _check_structure(state)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zipfile
 from pathlib import Path
 from types import ModuleType
 
@@ -115,35 +114,24 @@ def test_velocities_are_those_that_mujoco_integrates(task: HumanoidImitation) ->
         np.testing.assert_allclose(qvel[t], np.mean(steps, 0), atol=1e-10)
 
 
-GOOD = stroll(2, 30, True)
+GOOD, WANTED = stroll(2, 30, True), r"must be an .npz file with qpos \(frames, nq\) and fps"
 
 
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        ({"fps": 30}, "has no qpos"),
-        ({"qpos": GOOD}, "needs its rate: either fps"),
-        ({"qpos": GOOD, "fps": 30, "dt": 1 / 30}, "needs its rate: either fps"),
-        ({"qpos": GOOD, "fps": 0}, "a frame takes nan s; the rate must be positive"),
-        ({"qpos": GOOD, "dt": -1.0}, "a frame takes -1 s"),
-        ({"qpos": GOOD, "fps": np.inf}, "a frame takes 0 s"),
-        ({"qpos": GOOD, "fps": "fast"}, r"fps is <U4 \(\), must be one real number"),
-        ({"qpos": GOOD, "fps": [30, 30]}, r"fps is int64 \(2,\), must be one real number"),
-        ({"qpos": GOOD.astype(str), "fps": 30}, "qpos is <U32 .* must be real numbers"),
-        ({"qpos": GOOD.astype(complex), "fps": 30}, "qpos is complex128 .* must be real numbers"),
-        ({"qpos": GOOD, "fps": 30, "loop": "False"}, r"loop is <U5 \(\), must be one real number"),
-        ({"qpos": GOOD, "fps": 30, "loop": np.nan}, "loop is nan, must be true or false"),
-        ({"qpos": GOOD, "fps": 1e-4}, "too long: 36000001 frames at 60 Hz, must be 6 to 216000"),
-        ({"qpos": GOOD, "fps": 1e-320}, "the rate must be positive and finite"),
-        ({"qpos": np.where(np.arange(NQ) == 0, 1e30, GOOD), "fps": 30}, "too large in frame 0; at most 10000 m from"),
-        ({"qpos": np.where(np.arange(NQ) == 0, 3e3 * GOOD, GOOD), "fps": 30}, "moves at up to .* at most 1000"),
+        ({"fps": 30}, WANTED),
+        ({"qpos": GOOD}, WANTED),
+        ({"qpos": GOOD, "fps": 0}, WANTED),
+        ({"qpos": GOOD, "fps": "fast"}, WANTED),
+        ({"qpos": np.array([{}]), "fps": 30}, WANTED),
+        ({"qpos": GOOD, "dt": -1.0}, "it has -3599 frames at 60 Hz, must be 6 to 216000"),
+        ({"qpos": GOOD, "fps": 1e-4}, "it has 36000001 frames at 60 Hz"),
+        ({"qpos": GOOD, "dt": np.nan}, "it has nan frames at 60 Hz"),
+        ({"qpos": GOOD[:2], "fps": 30}, "it has 3 frames at 60 Hz"),
         ({"qpos": GOOD[0], "fps": 30}, r"qpos is \(28,\), must be \(frames, nq\)"),
-        (
-            {"qpos": np.where(np.arange(61)[:, None] == 7, np.nan, GOOD), "fps": 30},
-            "not finite or too large in frame 7",
-        ),
+        ({"qpos": np.where(np.arange(61)[:, None] == 7, np.nan, GOOD), "fps": 30}, "qpos is not finite"),
         ({"qpos": GOOD * 0, "fps": 30}, "quaternion wxyz"),
-        ({"qpos": GOOD[:2], "fps": 30}, "too short: 3 frames at 60 Hz, must be 6 to"),
         ({"qpos": GOOD[:20], "fps": 30}, "its last frame differs from its first by up to .* add loop=False"),
         ({"qpos": GOOD[:, :-1], "fps": 30}, "qpos has 27 columns, the robot has 28"),
         ({"qpos": GOOD * np.where(np.arange(28) < 7, 1, 180 / np.pi), "fps": 30}, "beyond its limits .* in radians?"),
@@ -159,18 +147,8 @@ def test_what_is_no_clip_is_refused(tmp_path: Path) -> None:
         read_clip("nowhere")
     for name, content in (("text", b"hello"), ("empty", b""), ("broken", b"PK\x03\x04hello")):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match="is no .npz file"):
+        with pytest.raises(ValueError, match=WANTED):
             read_clip(tmp_path / name)
-    with pytest.raises(ValueError, match="is no .npz file"):
-        read_clip(write(tmp_path / "object.npz", qpos=np.array([{}]), fps=30))
-    np.save(tmp_path / "array.npy", GOOD)
-    with pytest.raises(ValueError, match="is no .npz file"):
-        read_clip(tmp_path / "array.npy")
-    header = {"descr": "<f8", "fortran_order": False, "shape": (2**40, NQ)}
-    with zipfile.ZipFile(tmp_path / "vast.npz", "w") as archive, archive.open("qpos.npy", "w") as member:
-        np.lib.format.write_array_header_1_0(member, header)
-    with pytest.raises(ValueError, match="is no .npz file of numbers, or one beyond 100 MB"):
-        read_clip(tmp_path / "vast.npz")
     with pytest.raises(ValueError, match="task 'ant' tracks no clip; humanoid_imitation does"):
         diffsim.make("ant", 1, clip="humanoid_run")
 
