@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -23,11 +21,10 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
 from diffsim.tasks import TASKS, Task, find_task
-from diffsim.training import Run, distributed, evaluate, fail, load_policy, script
+from diffsim.training import Run, distributed, evaluate, fail, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, seeing
-from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
 
 # SHAC's networks; docs/sapo.md has what was measured with these settings, which are those of its best results.
@@ -42,8 +39,8 @@ PER_TASK = {
     "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
     "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400, 16),
     "g1":           ((256, 128),    (256, 128), "silu", 2e-3, 1e-3, 0.9,  -2.0, -1.0, -1.0,  1, 1024,  800, 16),
-    "humanoid_imitation": ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
 }
+PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # How --accuracy default integrates, where that is not as in the paper.
 INTEGRATION = {name: TASKS[name].integration("fast") for name in ("hopper", "half_cheetah", "ant")}
 INTEGRATION |= {name: Integration("implicit", 16) for name in ("humanoid", "humanoid_mtu")}
@@ -56,7 +53,6 @@ ON_CPU = {
 }
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
-START_NOISE = 0.15  # standard deviation around the policy to start from, so that it is seen off its path too
 SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
 # fmt: on
 
@@ -87,10 +83,6 @@ class Args(ParallelFlags):
     """left and right are treated alike: what the policy does in a state it does in the mirrored state, mirrored"""
     symmetry_weight: Positive = 1.0
     """weight in the actor's loss of the squared difference between the two, with --symmetric"""
-    start_from: Path | None = None
-    """checkpoint of any script on this task, e.g. PPO's: the first iteration begins with imitating its policy"""
-    start_windows: Count = 160
-    """windows of imitation: in the first half that policy acts, in the second half the imitating one"""
     initial_target_entropy: Finite = -0.5
     """entropy per action, in nats, at which the temperature aims in the first iteration (per task)"""
     target_entropy: Finite = -0.5
@@ -147,10 +139,6 @@ class Args(ParallelFlags):
             fail(f"--symmetric: task {self.env!r} has no mirror image")
         if (self.num_envs // distributed.size()) % self.population:
             fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")
-        if self.start_from and not (self.resume or self.evaluate):
-            env = load_policy(self.start_from).args["env"]
-            if env != self.env:
-                fail(f"--start-from {self.start_from} is a policy for task {env!r}, not {self.env!r}")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -175,23 +163,24 @@ def critic(args: Args, obs_dim: int) -> nn.Sequential:
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian."""
-
-    body: Any
-    mean: Any
-    spread: Any
+    """pi(a|s) of K members, tanh of a Gaussian. Observations are normalized by the statistics of all members."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
-        width = args.actor_hidden[-1]
+        K, width = args.population, args.actor_hidden[-1]
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.actor_hidden, args.activation))
-        self.mean = nn.Linear(width, action_dim)
-        self.spread = spread(args, width, action_dim) if args.state_std else None
-        self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std), requires_grad=not args.state_std)
+        self.body = Ensemble([seeing(seen, mlp(seen or obs_dim, args.actor_hidden, args.activation)) for _ in range(K)])
+        self.mean = Ensemble([nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)])
+        spread = nn.Linear(width, action_dim)  # of the log standard deviation, which begins almost constant
+        with torch.no_grad():
+            spread.weight.mul_(0.1)
+            spread.bias.fill_(args.initial_log_std)
+        self.spread = Ensemble([nn.Sequential(spread)] * K) if args.state_std else None
+        start = torch.full((K, 1, action_dim), args.initial_log_std)
+        self.log_std = nn.Parameter(start, requires_grad=not args.state_std)
 
     def forward(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Of normalized observations (..., obs_dim): the actions, and minus their log density per action (...)."""
+        """Of normalized observations (K, B, obs_dim): the actions, and minus their log density per action (K, B)."""
         features = self.body(obs)
         log_std = self.log_std if self.spread is None else self.spread(features).clamp(*LOG_STD)
         u = self.mean(features) + log_std.exp() * noise
@@ -200,21 +189,12 @@ class Actor(nn.Module):
         return torch.tanh(u), surprise.mean(-1)
 
     def act(self, obs: Tensor) -> Tensor:
-        """The actions without noise, of normalized observations (..., obs_dim)."""
+        """The actions without noise, of normalized observations (K, B, obs_dim)."""
         return torch.tanh(self.mean(self.body(obs)))
 
-    def deterministic(self) -> nn.Sequential:
-        """The policy without noise, of observations as they come, with the same weights."""
-        return nn.Sequential(self.normalizer, *self.body, self.mean, nn.Tanh())
-
-
-def spread(args: Args, width: int, action_dim: int) -> nn.Linear:
-    """The layer of the log standard deviation, which begins almost constant."""
-    layer = nn.Linear(width, action_dim)
-    with torch.no_grad():
-        layer.weight.mul_(0.1)
-        layer.bias.fill_(args.initial_log_std)
-    return layer
+    def deterministic(self, member: int) -> nn.Sequential:
+        """A member's policy without noise, of observations as they come; a copy."""
+        return nn.Sequential(self.normalizer, *self.body[member], *self.mean[member], nn.Tanh())
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -234,65 +214,85 @@ class Rollout(NamedTuple):
 class SAPO:
     """All that the next iteration depends on, and its two halves.
 
-    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
+    K members learn side by side, each in its share of the environments, until the best one goes on in all of them. The
+    N environments are those of the members one after the other; networks take tensors (K, B, ...) of B samples each.
+    The halves change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
     """
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.args, self.env, obs_dim = args, env, env.task.obs_dim
-        self.actor = self.make_actor(obs_dim, env.scene.nu).to(env.device)
-        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * args.population)]).to(env.device)
+        self.args, self.env, K, obs_dim = args, env, args.population, env.task.obs_dim
+        self.actor = Actor(args, obs_dim, env.scene.nu, env.task.actor_dim).to(env.device)
+        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * K)]).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        log = torch.full((args.population,), math.log(args.initial_temperature))
+        log = torch.full((K,), math.log(args.initial_temperature))
         self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
-        self.actor_optimizer = self.make_optimizer(self.actor)
-        self.critic_optimizer = self.make_optimizer(self.critics)
-        self.temperature_optimizer = self.make_optimizer(self.temperature)
+        score = {"reward": torch.zeros(K), "tied": torch.zeros(())}  # running mean reward; whether all members are one
+        self.score = nn.ParameterDict(score).requires_grad_(False).to(env.device)
+        limits = args.max_grad_norm, args.betas, self.score["tied"]
+        self.actor_optimizer = EnsembleAdam(self.actor, K, *limits)
+        self.critic_optimizer = EnsembleAdam(self.critics, K, *limits)
+        self.temperature_optimizer = EnsembleAdam(self.temperature, K, *limits)
         self.temperature_optimizer.lr.fill_(args.temperature_lr)
         self.target_entropy = torch.zeros((), device=env.device)
-        samples = args.horizon * env.num_envs * (1 + args.symmetric)  # a window's, for the critics
-        self.obs = torch.zeros(samples, obs_dim, device=env.device)
-        self.value = torch.zeros(samples, device=env.device)
+        samples = args.horizon * env.num_envs * (1 + args.symmetric) // K  # a window's of a member, for its critics
+        self.obs = torch.zeros(K, samples, obs_dim, device=env.device)
+        self.value = torch.zeros(K, samples, device=env.device)
 
-    def make_actor(self, obs_dim: int, action_dim: int) -> Actor:
-        return Actor(self.args, obs_dim, action_dim, self.env.task.actor_dim)
+    @property
+    def optimizers(self) -> tuple[EnsembleAdam, ...]:
+        return self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
 
-    def make_optimizer(self, module: nn.Module) -> ClippedAdam:
-        limits = self.args.max_grad_norm, self.args.betas
-        return EnsembleAdam(module, 1, *limits) if module is self.critics else ClippedAdam(module, *limits)
+    @property
+    def best(self) -> int:
+        """The member with the largest recent reward."""
+        return int(self.score["reward"].argmax())
 
     @property
     def policy(self) -> nn.Sequential:
-        return self.actor.deterministic()
+        return self.actor.deterministic(self.best)
 
     def prepare(self, iteration: int) -> None:
-        """The iteration's learning rates and target entropy."""
+        """The iteration's learning rates and target entropy; before one of them the best member is selected."""
         args, done = self.args, (iteration - 1) / self.args.iterations
         self.actor_optimizer.lr.fill_(args.actor_lr + (args.final_lr - args.actor_lr) * done)
         self.critic_optimizer.lr.fill_(args.critic_lr + (args.final_lr - args.critic_lr) * done)
         begin, end = args.initial_target_entropy, args.target_entropy
         self.target_entropy.fill_(begin + (end - begin) * done)
+        if iteration == 1 + round(args.selection * args.iterations):
+            self.select(self.best)
+
+    def select(self, member: int) -> None:
+        """From now on all members are this one, and learn from the samples of all."""
+        for optimizer in self.optimizers:
+            optimizer.tie(member)
+        for p in self.targets.parameters():
+            members = p.unflatten(0, (self.args.critics, -1))
+            members.copy_(members[:, member, None].clone().expand_as(members))
+        self.score["tied"].fill_(1.0)
+
+    # The two halves of an iteration -----------------------------------------------------------------------------------
 
     def update_actor(self) -> dict[str, Tensor]:
         """Descend the soft loss of a window of all environments; keep the critics' samples of it."""
-        args = self.args
-        rollout = collect(self.env, self.act, args.horizon)
-        next_values = self.next_values(rollout)
-        reward = rollout.reward
-        if args.entropy:
-            weight = self.temperature["log"].detach().exp().repeat_interleave(len(reward[0]) // args.population)
+        args, K = self.args, self.args.population
+        rollout = self.collect()
+        next_values, reward = self.next_values(rollout), rollout.reward
+        if args.entropy:  # the soft reward
+            weight = self.temperature["log"].detach().exp().repeat_interleave(self.env.num_envs // K)
             reward = reward + weight * (1 + rollout.entropy) / 2
         loss = actor_loss(reward, next_values.mean(0), rollout.done, args.gamma)
         if args.symmetric:
             loss = loss + args.symmetry_weight * self.asymmetry(rollout.obs.detach())
-        norm = self.actor_optimizer.step(args.population * loss)
+        norm = self.actor_optimizer.step(K * loss)  # each member's mean over its own environments
         rollout = Rollout(*(tensor.detach() for tensor in rollout))
         self.keep(rollout, reward.detach(), next_values.detach())
-        entropy = self.flatten(rollout.entropy).mean(-1)
+        entropy, gained = (self.split(tensor).mean(-1) for tensor in (rollout.entropy, rollout.reward))  # (K,)
         self.temperature_optimizer.step((self.temperature["log"].exp() * (entropy - self.target_entropy)).sum())
+        self.score["reward"].lerp_(distributed.average(gained), SCORE_RATE)
         return {
             "losses/actor": loss.detach(),
             "grad/norm": norm,
-            "charts/reward": self.flatten(rollout.reward).mean(-1),
+            "charts/reward": gained.mean(),
             "charts/entropy": entropy.mean(),
             "charts/temperature": self.temperature["log"].detach().exp().mean(),
         }
@@ -309,83 +309,53 @@ class SAPO:
                 losses.append(errors.detach().mean())
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
-        optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
-        skipped = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
+        skipped = torch.stack([optimizer.skipped for optimizer in self.optimizers]).sum()
         return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
 
-    def act(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions (N, nu) and entropy (N,) of obs (N, obs_dim) and noise (N, nu)."""
-        return self.actor(self.actor.normalizer(obs), noise)
+    # Their parts ------------------------------------------------------------------------------------------------------
+
+    def collect(self) -> Rollout:
+        """H steps of all environments from where they stand, each with its member's policy."""
+        env, normalizer, members = self.env, self.actor.normalizer, (self.args.population, -1)
+        steps, obs = [], env.detach()
+        for noise in torch.randn(self.args.horizon, env.num_envs, env.scene.nu, device=env.device).unbind():
+            own = self.actor(normalizer(obs).unflatten(0, members), noise.unflatten(0, members))
+            action, entropy = (tensor.flatten(0, 1) for tensor in own)
+            next_obs, reward, terminated, truncated, info = env.step(action)
+            steps.append((obs, info["final_obs"], reward, entropy, terminated, terminated | truncated))
+            obs = next_obs
+        return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
+
+    def split(self, tensor: Tensor) -> Tensor:
+        """The samples of a window (H, N, ...) by members (K, B, ...)."""
+        return tensor.unflatten(1, (self.args.population, -1)).movedim(1, 0).flatten(1, 2)
 
     def values(self, critics: Ensemble, obs: Tensor) -> Tensor:
-        """Each critic's V (C, B) of normalized observations (B, obs_dim)."""
-        return critics(obs.expand(self.args.critics, *obs.shape)).squeeze(-1)
+        """Each critic's V (C, K, B) of normalized observations (K, B, obs_dim)."""
+        return critics(obs.repeat(self.args.critics, 1, 1)).squeeze(-1).unflatten(0, (self.args.critics, -1))
 
     def next_values(self, rollout: Rollout) -> Tensor:
         """Each critic's V(s_{t+1}) (C, H, N): of an episode's last state where its time ran out, zero if terminated."""
-        obs = self.flatten(self.actor.normalizer(rollout.next_obs))
-        values = self.unflatten(self.values(self.targets, obs))
+        values = self.values(self.targets, self.split(self.actor.normalizer(rollout.next_obs)))
+        values = values.unflatten(-1, (self.args.horizon, -1)).movedim(1, 2).flatten(2)
         return torch.where(rollout.terminated, torch.zeros_like(values), values)
-
-    def flatten(self, tensor: Tensor) -> Tensor:
-        """The samples of a window (H, N, ...) as networks take them, (B, ...)."""
-        return tensor.flatten(0, 1)
-
-    def unflatten(self, values: Tensor) -> Tensor:
-        """The other way, of values (C, B) -> (C, H, N)."""
-        return values.unflatten(-1, (self.args.horizon, -1))
 
     def keep(self, rollout: Rollout, reward: Tensor, next_values: Tensor) -> None:
         """A window's observations with their TD(lambda) returns, which the critics are to learn."""
-        args, normalizer, samples = self.args, self.actor.normalizer, rollout.obs
+        args, normalizer, obs = self.args, self.actor.normalizer, rollout.obs
         value = td_lambda(reward, next_values.amin(0), rollout.done, args.gamma, args.td_lambda)
         if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
-            samples = torch.stack((samples, self.env.task.mirror.obs(samples)), 1).flatten(0, 1)
+            obs = torch.stack((obs, self.env.task.mirror.obs(obs)), 1).flatten(0, 1)
             value = value.repeat_interleave(2, 0)
-        self.value.copy_(self.flatten(value))
-        self.obs.copy_(self.flatten(normalizer(samples)))
+        self.value.copy_(self.split(value))
+        self.obs.copy_(self.split(normalizer(obs)))
         normalizer.update(rollout.obs)
 
     def asymmetry(self, obs: Tensor) -> Tensor:
         """Mean squared difference between the actions in mirrored states and the mirrored actions, without noise."""
         mirror, normalizer = self.env.task.mirror, self.actor.normalizer
-        there, here = (self.actor.act(self.flatten(normalizer(x))) for x in (mirror.obs(obs), obs))
+        there, here = (self.actor.act(self.split(normalizer(x))) for x in (mirror.obs(obs), obs))
         return (there - mirror.action(here)).square().mean()
-
-    def imitate(self, policy: nn.Module, lead: bool) -> Tensor:
-        """A window from whose states the actor learns another policy's actions, and the critics the returns.
-
-        Either that policy acts in it, with noise, or the actor does, which shows it where its errors lead (Ross et al.
-        2011, https://arxiv.org/abs/1011.0686). Returns the mean squared error () before.
-        """
-        with torch.no_grad():
-
-            def act(obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-                return policy(obs) + START_NOISE * noise, torch.zeros_like(noise[:, 0])
-
-            rollout = collect(self.env, act if lead else self.act, self.args.horizon)
-            goal = self.flatten(policy(rollout.obs).clamp(-1.0, 1.0))
-            obs = self.flatten(self.actor.normalizer(rollout.obs))
-            self.keep(rollout, rollout.reward, self.next_values(rollout))
-        errors = []
-        for samples, actions in zip(obs.chunk(8, -2), goal.chunk(8, -2), strict=True):
-            mean, entropy = self.actor(samples, torch.zeros_like(actions))
-            errors.append((mean - actions).square().mean())
-            self.actor_optimizer.step(self.args.population * errors[-1] + 0 * entropy.sum())  # the noise stays
-        self.update_critic()
-        return errors[0].detach()
-
-
-def collect(env: DiffEnv, act: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], horizon: int) -> Rollout:
-    """H steps of all environments from where they stand; act makes actions and entropies of observations and noise."""
-    steps = []
-    obs = env.detach()
-    for noise in torch.randn(horizon, env.num_envs, env.scene.nu, device=env.device).unbind():
-        action, entropy = act(obs, noise)
-        next_obs, reward, terminated, truncated, info = env.step(action)
-        steps.append((obs, info["final_obs"], reward, entropy, terminated, terminated | truncated))
-        obs = next_obs
-    return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
@@ -408,122 +378,17 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
     return returns
 
 
-# A population ---------------------------------------------------------------------------------------------------------
-
-
-class Actors(Actor):
-    """The actors of K members, on (K, B, ...). Observations are normalized by the statistics of all."""
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
-        nn.Module.__init__(self)
-        K, width = args.population, args.actor_hidden[-1]
-        self.normalizer = ObsNormalizer(obs_dim)
-        bodies = [seeing(seen, mlp(seen or obs_dim, args.actor_hidden, args.activation)) for _ in range(K)]
-        self.body = Ensemble(bodies)
-        self.mean = Ensemble([nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)])
-        shared = nn.Sequential(spread(args, width, action_dim))
-        self.spread = Ensemble([shared] * K) if args.state_std else None
-        start = torch.full((K, 1, action_dim), args.initial_log_std)
-        self.log_std = nn.Parameter(start, requires_grad=not args.state_std)
-
-    def deterministic(self, member: int = 0) -> nn.Sequential:
-        return nn.Sequential(self.normalizer, *self.body[member], *self.mean[member], nn.Tanh())
-
-
-class Running(nn.Module):
-    """The running mean reward (K,) of each member; whether all are one ()."""
-
-    reward: Tensor
-    tied: Tensor
-
-    def __init__(self, members: int) -> None:
-        super().__init__()
-        self.register_buffer("reward", torch.zeros(members))
-        self.register_buffer("tied", torch.zeros(()))
-
-
-class Population(SAPO):
-    """K members that learn side by side, each in its share of the environments, until the best one goes on in all.
-
-    The N environments are those of the members one after the other; the critics are the first ones of all members, then
-    the second ones.
-    """
-
-    actor: Actors
-
-    def __init__(self, args: Args, env: DiffEnv) -> None:
-        self.score = Running(args.population).to(env.device)
-        super().__init__(args, env)
-        self.obs, self.value = (tensor.unflatten(0, (args.population, -1)) for tensor in (self.obs, self.value))
-
-    def make_actor(self, obs_dim: int, action_dim: int) -> Actors:
-        return Actors(self.args, obs_dim, action_dim, self.env.task.actor_dim)
-
-    def make_optimizer(self, module: nn.Module) -> EnsembleAdam:
-        args = self.args
-        return EnsembleAdam(module, args.population, args.max_grad_norm, args.betas, self.score.tied)
-
-    @property
-    def policy(self) -> nn.Sequential:
-        """Of the member with the largest reward."""
-        return self.actor.deterministic(int(self.score.reward.argmax()))
-
-    def prepare(self, iteration: int) -> None:
-        super().prepare(iteration)
-        if iteration == 1 + round(self.args.selection * self.args.iterations):
-            self.select(int(self.score.reward.argmax()))
-
-    def select(self, member: int) -> None:
-        """From now on all members are this one, and learn from the samples of all."""
-        for optimizer in (self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer):
-            assert isinstance(optimizer, EnsembleAdam)
-            optimizer.tie(member)
-        for p in self.targets.parameters():
-            members = p.unflatten(0, (self.args.critics, -1))
-            members.copy_(members[:, member, None].clone().expand_as(members))
-        self.score.tied.fill_(1.0)
-
-    def update_actor(self) -> dict[str, Tensor]:
-        metrics = super().update_actor()
-        self.score.reward.lerp_(distributed.average(metrics["charts/reward"]), SCORE_RATE)
-        return metrics | {"charts/reward": metrics["charts/reward"].mean()}
-
-    def act(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        members = self.args.population, -1
-        action, entropy = self.actor(self.actor.normalizer(obs).unflatten(0, members), noise.unflatten(0, members))
-        return action.flatten(0, 1), entropy.flatten()
-
-    def values(self, critics: Ensemble, obs: Tensor) -> Tensor:
-        """(K, B, obs_dim) -> (C, K, B)"""
-        values = critics(obs.repeat(self.args.critics, 1, 1))
-        return values.squeeze(-1).unflatten(0, (self.args.critics, -1))
-
-    def flatten(self, tensor: Tensor) -> Tensor:
-        """(H, N, ...) -> (K, B, ...)"""
-        return tensor.unflatten(1, (self.args.population, -1)).movedim(1, 0).flatten(1, 2)
-
-    def unflatten(self, values: Tensor) -> Tensor:
-        """(C, K, B) -> (C, H, N)"""
-        return super().unflatten(values).movedim(1, 2).flatten(2)
-
-
 # The run --------------------------------------------------------------------------------------------------------------
 
 
 def train(args: Args) -> None:
     run = Run(args)
     env = run.make_env(args.num_envs, args.horizon)
-    sapo = run.restore((Population if args.population > 1 else SAPO)(args, env))
+    sapo = run.restore(SAPO(args, env))
     update_actor, update_critic = run.capture(sapo.update_actor, env), run.capture(sapo.update_critic)
     for iteration in run:
         sapo.prepare(iteration)
-        windows = 0
-        if args.start_from and iteration == 1:
-            windows = args.start_windows
-            policy = load_policy(args.start_from).network.to(env.device)
-            errors = [sapo.imitate(policy, k < windows / 2) for k in range(windows)]
-            run.message(f"imitated {args.start_from}: squared error of the actions {errors[-1].item():.3g}")
-        run.log(update_actor() | update_critic(), (1 + windows) * args.horizon * args.num_envs)
+        run.log(update_actor() | update_critic())
         if run.evaluation_due:
             run.log_evaluation(evaluate(run.eval_env, sapo.policy))
 

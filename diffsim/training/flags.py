@@ -201,11 +201,12 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     if given.resume and "modules" not in saved:
         fail(f"{path} holds a policy alone, which can be evaluated but not resumed")
     hints = get_type_hints(kind, include_extras=True)
-    if unknown := [flag(name) for name in saved["args"] if name not in hints or name.isupper()]:
+    known = {name: value for name, value in saved["args"].items() if name in hints and not name.isupper()}
+    if given.resume and (unknown := [flag(name) for name in saved["args"] if name not in known]):
         fail(f"{path} was written by a {kind.script()}.py with other flags: {', '.join(unknown)}")
-    if wrong := [name for name, value in saved["args"].items() if not fits(hints[name], value)]:
+    if wrong := [name for name, value in known.items() if not fits(hints[name], value)]:
         fail(f"{path} is damaged: {', '.join(map(flag, wrong))} of another type")
-    defaults = kind(**saved["args"])
+    defaults = kind(**known)
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained
     if FILE.fullmatch(given.env) and FILE.fullmatch(defaults.env):

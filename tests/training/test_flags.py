@@ -274,10 +274,11 @@ def test_what_a_checkpoint_decides(capsys: pytest.CaptureFixture[str]) -> None:
             assert "--horizon" in line and "--num-envs 3, not 4" not in line.partition(";")[2]
 
 
-def test_a_checkpoint_with_flags_that_the_script_lacks_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    path = save(parse(shac.Args, ["--env", "cartpole"]), old_flag=3)
+def test_a_checkpoint_of_flags_that_the_script_lacks_is_only_evaluated(capsys: pytest.CaptureFixture[str]) -> None:
+    path = save(parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"]), old_flag=3)
     line = refusal(lambda: parse(shac.Args, ["--resume", str(path)]), capsys)
     assert line == f"script.py: {path} was written by a shac.py with other flags: --old-flag"
+    assert parse(shac.Args, ["--evaluate", str(path)]).gamma == 0.9
 
 
 def test_a_checkpoint_older_than_a_flag_has_its_default() -> None:
