@@ -23,7 +23,7 @@ from common import Part, measured, run
 from speed import timed, windows
 from tables import Row, read_csv
 from torch import Tensor
-from transfer import FASTEST, mujoco_model
+from worlds import FASTEST, mujoco_model
 
 import diffsim
 import ppo_baseline

@@ -28,6 +28,7 @@ from common import ABOUT, Case, Panel, lines, load_case, plot, run
 from groups import grouped
 from tables import Row, markdown
 from torch import Tensor
+from worlds import Here, State, Step, rollout, starts
 
 import diffsim
 from diffsim import DiffEnv, Scene, Simulator
@@ -59,67 +60,47 @@ class Args(common.CheckpointFlags):
     restitution: NonNegative = 0.0  # 0: the cube stays with the trunk; 1: it bounces off
 
 
-class State(NamedTuple):
-    """The state from which a policy goes on."""
-
-    qpos: Tensor  # (n, nq)
-    qvel: Tensor  # (n, nv)
-    action: Tensor  # (n, nu) the last one, which some tasks observe
-    memory: Tensor  # (n, num_memory) of the task
-
-
 class Walkers:
-    """Robots under their policy, which forces may push at a body. Nothing is reset: what has fallen lies there.
+    """Robots under their policy, which forces may push at a body; of env the task and the simulator are taken over."""
 
-    Of env the task and the simulator's settings are taken over.
-    """
-
-    def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int, state: State) -> None:
-        self.task, self.scene, self.control_dt, self.body = env.task, env.scene, env.control_dt, body
-        self.policy, self.start = policy, state
-        n, how = len(state.qpos), env.sim.integration
+    def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int, start: State) -> None:
+        self.task, self.policy, self.body, self.start, self.control_dt = env.task, policy, body, start, env.control_dt
+        n, how = len(start.qpos), env.sim.integration
         self.sim = Simulator(env.scene, n, how, env.control_dt, device=env.device, dtype=env.dtype, forces=True)
 
     def steps(self, seconds: float) -> int:
         return max(1, round(seconds / self.control_dt))
 
-    @torch.no_grad()
-    def walk(self, seconds: float, force: Tensor | None = None, pushed: int = 0) -> Iterator[tuple[State, Tensor]]:
-        """The state after each control step, and who has fallen by then (n,); force (n, 3) acts in the first steps."""
-        state, fallen = self.start, torch.zeros(len(self.start.qpos), dtype=torch.bool, device=self.sim.device)
-        obs, middle = self.task.observe_with(*state), state.qpos.new_full((len(state.qpos), self.task.num_noise), 0.5)
-        for step in range(self.steps(seconds)):
+    def walk(self, seconds: float, force: Tensor | None = None, pushed: int = 0) -> Iterator[Step]:
+        """Control steps, in whose first ones a force (n, 3) acts."""
+
+        def push(step: int, state: State) -> State:
             self.sim.forces[:, self.body, :3] = force if force is not None and step < pushed else 0.0
-            action = self.policy(obs).clamp(-1.0, 1.0)
-            memory = self.task.remember(state.memory, action, middle)  # sensors without noise, the same command
-            state = State(*self.sim.step(state.qpos, state.qvel, action), action, memory)
-            obs = self.task.observe_with(*state)
-            fallen = fallen | self.task.terminated(obs) | self.sim.nonfinite
-            yield state, fallen
+            return state
+
+        return rollout(Here(self.sim), self.task, self.policy, self.start, self.steps(seconds), push)
 
     def endure(self, seconds: float, force: Tensor, pushed: int) -> Tensor:
         """(n,) control steps until each robot falls; all of them if it does not."""
         steps = torch.zeros(len(self.start.qpos), dtype=torch.long, device=self.sim.device)
-        for _, fallen in self.walk(seconds, force, pushed):
-            steps += ~fallen
-            if fallen.all():
+        for step in self.walk(seconds, force, pushed):
+            steps += ~step.fallen
+            if step.fallen.all():
                 break
         return steps
 
 
-def starts(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> State:
+def walking(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> State:
     """The states of the robots that still walk after a time, drawn for each, within WALK."""
-    env.reset(seed=SEED)
-    no_action = torch.zeros(env.num_envs, env.scene.nu, dtype=env.dtype, device=env.device)
-    walkers = Walkers(env, policy, body, State(env.qpos, env.qvel, no_action, env.memory))
+    walkers = Walkers(env, policy, body, starts(env))
     first, last = map(walkers.steps, WALK)
     at = torch.randint(first, last + 1, (env.num_envs,), generator=torch.Generator().manual_seed(SEED)).to(env.device)
     found, standing = State(*(part.clone() for part in walkers.start)), torch.zeros_like(at, dtype=torch.bool)
-    for step, (state, fallen) in enumerate(walkers.walk(WALK[1]), 1):
-        now = at == step
-        for part, new in zip(found, state, strict=True):
+    for count, step in enumerate(walkers.walk(WALK[1]), 1):
+        now = at == count
+        for part, new in zip(found, step.state, strict=True):
             part[now] = new[now]
-        standing |= now & ~fallen
+        standing |= now & ~step.fallen
     return State(*(part[standing] for part in found))
 
 
@@ -186,7 +167,7 @@ def measure(case: Case, body: int, args: Args) -> None:
     """Both tests of one policy; the csv files have each push as soon as it is measured."""
     env, scene = case.env, case.env.scene
     policy = case.saved.network.to(env.device)
-    state = starts(env, policy, body)
+    state = walking(env, policy, body)
     count, mass = len(state.qpos), float(scene.mass.sum())
     if 2 * count < env.num_envs:
         fail(f"only {count} of {env.num_envs} walk for {WALK[0]:g} to {WALK[1]:g} s without a push")

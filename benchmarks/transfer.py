@@ -21,41 +21,28 @@ shows the same start here (left) and in MuJoCo (right).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
-from typing import NamedTuple
 
 import common
-import mujoco
 import numpy as np
-import torch
 from common import ABOUT, Case, load_case, run
 from groups import grouped, middle, numbers
 from numpy.typing import NDArray
 from tables import Row, markdown
-from torch import Tensor
+from worlds import Here, Motion, MuJoCo, World, travel
 
 import diffsim
-from diffsim import DiffEnv, Integration, Scene, Simulator, load_scene
-from diffsim.sim.launcher import available_cores
-from diffsim.tasks import Task
+from diffsim import DiffEnv, Integration, Scene, Simulator
 from diffsim.training import Count, Positive, fail, gait
 from diffsim.training.checkpoint import HOME
-from diffsim.training.evaluation import FINER, SEED
+from diffsim.training.evaluation import FINER
 from diffsim.view import render
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 KEY = (*ABOUT[:-1], "condition")
 SAME = "MuJoCo same"  # with the law and the substeps of contact mujoco
-FASTEST = 1e5  # m/s or rad/s; beyond it a robot is lost, as in Simulator
-
-mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable, which World.step says
 
 
 @dataclass
@@ -65,88 +52,6 @@ class Args(common.CheckpointFlags):
     friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # friction in MuJoCo, in multiples of the file's mu
     finer: Count = FINER  # steps of "finer" in multiples of the task's substeps
     video: Path | None = None  # write the episode of median return, here and in MuJoCo side by side: .mp4 or .gif
-
-
-# Worlds ---------------------------------------------------------------------------------------------------------------
-
-
-class Here:
-    """N robots in this simulator."""
-
-    def __init__(self, sim: Simulator) -> None:
-        self.sim = sim
-
-    @torch.no_grad()
-    def step(self, qpos: Array, qvel: Array, action: Array, alive: Flags) -> tuple[Array, Array, Flags]:
-        """qpos (N, nq) and qvel (N, nv) after a control step, and which robots (N,) left the finite numbers.
-
-        Those, and all that are not alive, stay as they were.
-        """
-        tensors = (torch.as_tensor(x, dtype=self.sim.dtype, device=self.sim.device) for x in (qpos, qvel, action))
-        new = [x.double().numpy(force=True) for x in self.sim.step(*tensors)]
-        q, v = (np.where(alive[:, None], after, before) for after, before in zip(new, (qpos, qvel), strict=True))
-        return q, v, alive & self.sim.nonfinite.numpy(force=True)
-
-
-def mujoco_model(scene: Scene, control_dt: float, substeps: int | None = None) -> mujoco.MjModel:
-    """A scene's file as MuJoCo reads it, with the fewest steps of equal length that are no longer than the file's.
-
-    Given substeps of a control step, with those and elliptic cones: the law of --contact mujoco.
-    """
-    model = mujoco.MjModel.from_xml_path(scene.path)
-    if substeps is not None:
-        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    model.opt.timestep = control_dt / (substeps or math.ceil(control_dt / model.opt.timestep - 1e-6))
-    return model
-
-
-class MuJoCo:
-    """N robots in MuJoCo with its own contact and limits on a scene's file, of whose friction `friction` is a factor.
-
-    That is the springs' mu of the file, whatever the scene's own is, or with own_friction what each geom has there. Of
-    substeps see mujoco_model.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        num_envs: int,
-        control_dt: float,
-        friction: float = 1.0,
-        own_friction: bool = False,
-        substeps: int | None = None,
-    ) -> None:
-        self.model = mujoco_model(scene, control_dt, substeps)
-        self.substeps = round(control_dt / self.model.opt.timestep)
-        if not own_friction:
-            self.model.geom_friction[:, 0] = load_scene(scene.path).mu
-        self.model.geom_friction[:, 0] *= friction
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
-        low, high = self.model.actuator_ctrlrange.T
-        self._middle, self._reach = (low + high) / 2, (high - low) / 2
-        self._pool = ThreadPoolExecutor(available_cores())
-
-    def step(self, qpos: Array, qvel: Array, action: Array, alive: Flags) -> tuple[Array, Array, Flags]:
-        """As in Here."""
-        ctrl, qpos, qvel, lost = self._middle + self._reach * action, qpos.copy(), qvel.copy(), np.zeros_like(alive)
-
-        def run(rows: Sequence[int]) -> None:
-            for k in rows:
-                data = self.data[k]
-                data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], qvel[k], ctrl[k]
-                mujoco.mj_step(self.model, data, self.substeps)  # without Python's lock
-                if (np.abs(data.qvel) < FASTEST).all() and np.isfinite(data.qpos).all():
-                    qpos[k], qvel[k] = data.qpos, data.qvel
-                else:
-                    lost[k] = True
-
-        rows, count = np.flatnonzero(alive).tolist(), available_cores()
-        list(self._pool.map(run, (rows[k::count] for k in range(count))))
-        return qpos, qvel, lost
-
-
-World = Here | MuJoCo
 
 
 # Motions --------------------------------------------------------------------------------------------------------------
@@ -163,58 +68,13 @@ def load(path: Path, args: Args) -> Case:
     return case
 
 
-class Motion(NamedTuple):
-    """The first episode of each of n robots in one world."""
-
-    qpos: Array  # (T + 1, n, nq) from the start on; valid up to an episode's length
-    qvel: Array  # (T + 1, n, nv)
-    returns: Array  # (n,)
-    lengths: np.ndarray  # (n,) control steps
-    fallen: Flags  # (n,) whether the episode ended with a fall
-
-
-@torch.no_grad()
-def act(
-    world: World, task: Task, policy: Callable[[Tensor], Tensor], qpos: Array, qvel: Array, nu: int, steps: int
-) -> Motion:
-    """Episodes of at most so many steps in a world, from qpos (n, nq) and qvel (n, nv).
-
-    The task, in float64 on the CPU, says what is observed and rewarded, and who has fallen.
-    """
-    n = len(qpos)
-    alive, fallen, returns, lengths = np.ones(n, bool), np.zeros(n, bool), np.zeros(n), np.zeros(n, int)
-    obs = task.observe(torch.from_numpy(qpos), torch.from_numpy(qvel), torch.zeros(n, nu, dtype=torch.float64))
-    path = [(qpos, qvel)]
-    for _ in range(steps):
-        action = policy(obs.float()).clamp(-1.0, 1.0).double()
-        qpos, qvel, lost = world.step(qpos, qvel, action.numpy(), alive)
-        path.append((qpos, qvel))
-        obs = task.observe(torch.from_numpy(qpos), torch.from_numpy(qvel), action)
-        returns += np.where(alive & ~lost, task.reward(obs, action).numpy(), 0.0)
-        lengths += alive
-        fallen |= alive & (lost | task.terminated(obs).numpy())
-        alive &= ~fallen
-        if not alive.any():
-            break
-    positions, rates = (np.stack(states) for states in zip(*path, strict=True))
-    return Motion(positions, rates, returns, lengths, fallen)
-
-
-def travel(case: Case, world: World, steps: int) -> Motion:
-    """A policy's episodes in a world, from the start states that all worlds share."""
-    env = case.env
-    env.reset(seed=SEED)
-    qpos, qvel = (state.double().numpy(force=True) for state in (env.qpos, env.qvel))
-    return act(world, type(env.task)(dtype=torch.float64), case.saved.network, qpos, qvel, env.scene.nu, steps)
-
-
 def speed(motion: Motion, control_dt: float, forward: int = 0) -> float:
     """Mean forward speed over all control steps of all episodes, m/s."""
     x = motion.qpos[..., forward]
     return float((np.take_along_axis(x, motion.lengths[None], 0)[0] - x[0]).sum() / (control_dt * motion.lengths.sum()))
 
 
-def feet(scene: Scene) -> list[Flags]:
+def feet(scene: Scene) -> list[NDArray[np.bool_]]:
     """Which of the contact spheres (nc,) are of each foot: a body at the end of a limb, which carries no other."""
     body, parents = gait.contact_bodies(scene), scene.mj_model.body_parentid
     return [body == k for k in np.unique(body) if k not in parents and parents[k]]

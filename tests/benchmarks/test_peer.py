@@ -8,7 +8,7 @@ import numpy as np
 import peer
 import pytest
 import torch
-import transfer
+import worlds
 from common import parse
 from learners import refusal
 from tables import read_csv
@@ -26,14 +26,13 @@ def test_a_step_is_mujoco_s_and_ours(name: peer.Name, share: float, tolerance: f
     """Through a fall to the ground, with a reset; and a robot that is lost stays where it was."""
     env = diffsim.make(name, 2, seed=0, contact="mujoco", max_episode_steps=40)
     other = peer.MuJoCoWarp(env.sim, name)
-    world = transfer.MuJoCo(env.scene, 2, env.control_dt, 1.0, True, env.sim.integration.substeps)
+    world = worlds.MuJoCo(env.scene, 2, env.control_dt, 1.0, True, env.sim.integration.substeps)
     errors, touching = [], 0
     for _ in range(60):
         action = 2 * torch.rand(2, env.scene.nu, generator=env.generator) - 1
-        state = (x.double().numpy() for x in (env.qpos, env.qvel, action))
-        expected = world.step(*state, np.ones(2, bool))[:2]
+        expected = world.step(env.qpos.double(), env.qvel.double(), action)[:2]
         found = [sim.step(env.qpos, env.qvel, action) for sim in (other, env.sim)]
-        errors.append([[np.abs(x.numpy() - y).max() for x, y in zip(f, expected, strict=True)] for f in found])
+        errors.append([[(x - y).abs().max().item() for x, y in zip(f, expected, strict=True)] for f in found])
         touching += sum(data.ncon for data in world.data)
         env.step(action)
     assert (np.quantile(errors, share, axis=0) < tolerance).all()  # rounding decides when a contact begins or slips

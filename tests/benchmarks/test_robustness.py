@@ -53,6 +53,9 @@ class Puck(Task):
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         return qvel[..., :2]
 
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        return obs[..., 0]
+
     def terminated(self, obs: Tensor) -> Tensor:
         return obs.abs().amax(-1) > FAST
 
@@ -67,7 +70,7 @@ def pucks() -> robustness.Walkers:
 
 def test_a_push_gives_a_free_body_its_impulse() -> None:
     force = torch.tensor([[3.0, 0.0, 0.0], [0.0, -5.0, 0.0], [1.0, 2.0, 3.0]])
-    states = [state for state, _ in pucks().walk(0.2, force, 6)]
+    states = [step.state for step in pucks().walk(0.2, force, 6)]
     assert len(states) == 12
     for k, state in enumerate(states, 1):
         torch.testing.assert_close(state.qvel[:, :3], force * min(k, 6) / 60 / 2)
@@ -139,7 +142,7 @@ def test_a_task_keeps_its_memory() -> None:
         return torch.zeros(len(obs), 0)
 
     first = env.reset(seed=SEED)[0][:, 0].long()
-    state = robustness.starts(env, policy, 1)
+    state = robustness.walking(env, policy, 1)
     assert torch.equal(torch.stack(seen), first + torch.arange(240)[:, None])
     reached = first + torch.randint(120, 241, (7,), generator=torch.Generator().manual_seed(SEED))
     steps = state.memory[:, 0].long()
