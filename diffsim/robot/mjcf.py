@@ -77,15 +77,6 @@ def _obey_flags(m: mujoco.MjModel) -> None:
         m.body_gravcomp[:] = 0
 
 
-class Sphere(NamedTuple):
-    """What may touch the ground, in the frame of its link; geom says what it is part of."""
-
-    link: int
-    centre: Array
-    radius: float
-    geom: int
-
-
 class Segment(NamedTuple):
     """A straight piece of a muscle's path between two links, the lower one first; ends in their frames."""
 
@@ -306,47 +297,44 @@ class _Reader:
         return segments
 
     def _contacts(self, slide: NDArray[np.bool_]) -> dict[str, Any]:
-        m = self.m
-        pairs = ground_pairs(m)
-        every = [sphere for _, geom in pairs for sphere in self._spheres(geom)]
-        spheres = self._outer_spheres(every, slide)
+        m, pairs = self.m, ground_pairs(self.m)
+        spheres = self._spheres([geom for _, geom in pairs])
+        outer = self._outer(spheres, slide)
         return {
-            "spheres": Spheres(
-                np.array([sphere.link for sphere in every], np.int32),
-                np.array([sphere.centre for sphere in every]).reshape(-1, 3),
-                np.array([sphere.radius for sphere in every]),
-                np.array([sphere.geom for sphere in every], np.int32),
-            ),
-            "contact_link": np.array([sphere.link for sphere in spheres], np.int32),
-            "contact_position": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
-            "contact_radius": np.array([sphere.radius for sphere in spheres]),
+            "spheres": spheres,
+            "contact_link": spheres.link[outer],
+            "contact_position": spheres.centre[outer],
+            "contact_radius": spheres.radius[outer],
             "ground_height": float(at_rest(m).geom_xpos[pairs[0][0], 2]) if pairs else 0.0,
         }
 
-    def _spheres(self, geom: int) -> list[Sphere]:
-        m = self.m
-        link, rotation, position = self.body[m.geom_bodyid[geom]]
-        axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
-        points, radius = contact_points(m, geom)
-        return [Sphere(link, centre + axes @ point, radius, geom) for point in points]
+    def _spheres(self, geoms: list[int]) -> Spheres:
+        m, centres, radii = self.m, [np.zeros((0, 3))], []
+        for geom in geoms:
+            _, rotation, position = self.body[m.geom_bodyid[geom]]
+            axes, centre = rotation @ _matrix(m.geom_quat[geom]), position + rotation @ m.geom_pos[geom]
+            points, radius = contact_points(m, geom)
+            centres.append(np.array([centre + axes @ point for point in points]))
+            radii.append(radius)
+        counts = [len(points) for points in centres[1:]]
+        links = np.array([self.body[m.geom_bodyid[geom]][0] for geom in geoms], np.int32)
+        geom_of = np.repeat(np.array(geoms, np.int32), counts)
+        return Spheres(np.repeat(links, counts), np.concatenate(centres), np.repeat(radii, counts), geom_of)
 
-    def _outer_spheres(self, spheres: list[Sphere], slide: NDArray[np.bool_]) -> list[Sphere]:
-        """Drop spheres that lie inside another one in every pose, so that overlapping capsules count once, by link."""
-        spheres = sorted(spheres, key=lambda sphere: -sphere.radius)
+    def _outer(self, spheres: Spheres, slide: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """By link, the spheres that do not lie inside another one in every pose: overlapping capsules count once."""
+        order = np.argsort(-spheres.radius, kind="stable")
         # Where each is in the frame of the first link that sees it at rest: a centre on a hinge's anchor stays there.
-        links, centres = [], np.zeros((len(spheres), 3))
-        for k, (link, centre, _, _) in enumerate(spheres):
-            while link > 0 and not slide[link] and np.linalg.norm(centre) < 1e-6:
-                centre, link = self.position[link], int(self.parent[link])
-            centres[k] = centre
-            links.append(link)
-        at, radii = np.array(links, int), np.array([sphere.radius for sphere in spheres])
-        kept = np.zeros(len(spheres), bool)
-        for k in range(len(spheres)):
+        at, centres, radii = spheres.link[order], spheres.centre[order], spheres.radius[order]
+        for k in range(len(order)):
+            while at[k] > 0 and not slide[at[k]] and np.linalg.norm(centres[k]) < 1e-6:
+                centres[k], at[k] = self.position[at[k]], self.parent[at[k]]
+        kept = np.zeros(len(order), bool)
+        for k in range(len(order)):
             others = np.flatnonzero(kept[:k] & (at[:k] == at[k]))
             apart = np.linalg.norm(centres[others] - centres[k], axis=1)
             kept[k] = not (apart + radii[k] <= radii[others] + 1e-6).any()
-        return sorted((spheres[k] for k in np.flatnonzero(kept)), key=lambda sphere: sphere.link)
+        return order[kept][np.argsort(spheres.link[order[kept]], kind="stable")]
 
     def _numeric(self, name: str, default: float) -> float:
         values = numeric(self.m, name)
