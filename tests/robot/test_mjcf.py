@@ -166,11 +166,23 @@ def test_spheres_inside_another_are_dropped():
 
 
 @pytest.mark.parametrize(
-    "name, count",
-    {"cartpole": 0, "hopper": 6, "half_cheetah": 16, "ant": 13, "humanoid": 35, "humanoid_mtu": 88}.items(),
+    "name, count, radii, places",
+    [
+        ("cartpole", 0, 0.0, 0.0),
+        ("hopper", 6, 0.31, 1.74),
+        ("half_cheetah", 16, 0.736, 4.454),
+        ("ant", 13, 1.21, 6.4),
+        ("humanoid", 35, 1.666, 7.48),
+        ("humanoid_mtu", 88, 0.0, 17.5319),
+    ],
 )
-def test_contact_spheres_of_the_tasks(name, count):
-    assert task_scene(name).ncontact == count
+def test_contact_spheres_of_the_tasks(name, count, radii, places):
+    """Their number, and sums that tell of a geom that is another one than the benchmark's."""
+    scene = task_scene(name)
+    assert scene.ncontact == count
+    np.testing.assert_allclose(
+        [scene.contact_radius.sum(), abs(scene.contact_position).sum()], [radii, places], atol=1e-3
+    )
 
 
 def test_only_what_may_touch_the_ground_touches():
