@@ -1,7 +1,7 @@
 """The numbers of a scene as the kernels read them: Warp's types, and a struct of arrays on a device."""
 
-from collections.abc import Iterable, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, cached_property
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,93 +13,208 @@ from diffsim.kernels.spec import KernelSpec
 from diffsim.robot.scene import Scene
 
 
+class _Numbers:
+    """What fields of a Model are made of. Of each lane's links there is a row of `slots` entries, the last ones unused
+    where a lane has fewer."""
+
+    def __init__(self, scene: Scene, division: Division) -> None:
+        self.scene, self.division = scene, division
+        threads, slots = division.threads_per_env, division.slots
+        self.link = padded(division.links, slots)  # of each entry, and
+        self.lane = np.repeat(np.arange(threads), slots)
+        self.slot = np.zeros((threads, scene.nlink), np.int32)  # of each lane's each link
+        for lane, row in enumerate(division.links):
+            self.slot[lane, row] = np.arange(len(row))
+        weighs = division.weighs
+        self.carried = np.array([i in weighs[lane] for lane, i in zip(self.lane, self.link, strict=True)], float)
+        self.axis = np.einsum("nij,nj->ni", scene.rotation, scene.axis)
+        self.position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * self.axis
+        self.balls = [np.flatnonzero(scene.ball[row] == 0).tolist() for row in division.links]
+
+    def slots_of(self, links: np.ndarray) -> np.ndarray:
+        """Of what each link points to, where the entry's lane has it."""
+        return self.slot[self.lane, links[self.link]]
+
+    def around_ball(self, k: int) -> np.ndarray:
+        """The k-th link of the ball joint that each link belongs to, or the link itself."""
+        return np.arange(self.scene.nlink) + np.where(self.scene.ball < 0, 0, k - self.scene.ball)
+
+    def carry(self, values: np.ndarray) -> np.ndarray:
+        """By entry, but zero on lanes that do not carry the link's mass."""
+        values = values[self.link]
+        return values * self.carried.reshape(-1, *[1] * (values.ndim - 1))
+
+    @cached_property
+    def turns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rodrigues for the angle q - ref, expanded by the sum formulas: the kernels then need no reference."""
+        s = self.scene
+        skew = np.cross(np.eye(3)[None], s.axis[:, None])  # skew(a) b = a x b
+        hinge = np.where(s.slide | (s.ball >= 0), 0.0, 1.0)[:, None, None]
+        r, square = s.rotation, skew @ skew
+        cos, sin = np.cos(s.joint_ref)[:, None, None], np.sin(s.joint_ref)[:, None, None]
+        return (
+            (r @ (np.eye(3) + hinge * square))[self.link],
+            (hinge * (r @ (skew * cos - square * sin)))[self.link],
+            (-hinge * (r @ (square * cos + skew * sin)))[self.link],
+        )
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """The carrier's at q = 0: along the slides that end there nothing turns, so the offsets add up as they are."""
+        frame, place = np.eye(3), np.zeros(3)
+        for i in range(1, self.scene.carrier + 1):
+            place += frame @ self.position[i]
+            frame = frame @ self.scene.rotation[i]
+        return place
+
+    @cached_property
+    def motor_slot(self) -> np.ndarray:
+        return self.slot[:, self.scene.motor_link]
+
+    @cached_property
+    def motor_lane(self) -> np.ndarray:
+        lane = (self.motor_slot > 0).argmax(0)
+        for k, hand in enumerate(self.division.muscles):
+            lane[hand] = k
+        return lane
+
+    @cached_property
+    def segments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Their order, by lane and then by the pair of links that they join; the pairs (lane, i, j), their starts."""
+        key = np.column_stack([self.motor_lane[self.scene.segment_muscle], self.scene.segment_link])
+        order = np.lexsort(key.T[::-1])
+        pairs, start = np.unique(key[order], axis=0, return_index=True)
+        return order, pairs, np.append(start, len(order))
+
+    @cached_property
+    def spheres(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.by_entry(self.division.spheres, self.scene.contact_link)
+
+    @cached_property
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """A body is on the lane that carries its link's mass."""
+        link = self.scene.body_link
+        return self.by_entry([np.flatnonzero(np.isin(link, row)) for row in self.division.weighs], link)
+
+    def by_entry(self, hands: Sequence[Iterable[int]], link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where each entry begins, and the things themselves, of things on links that are dealt to the lanes."""
+        rows = [
+            (lane * self.division.slots + self.slot[lane, link[k]], k) for lane, hand in enumerate(hands) for k in hand
+        ]
+        entry, things = np.array(sorted(rows), int).reshape(-1, 2).T
+        return np.searchsorted(entry, np.arange(len(self.link) + 1)), things
+
+    @cached_property
+    def terrain(self) -> np.ndarray:
+        vertices = np.zeros((1, 1, 2)) if self.scene.terrain is None else self.scene.terrain
+        along = np.diff(vertices, axis=1, append=vertices[:, -1:])
+        along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), np.finfo(float).tiny)
+        return np.concatenate([vertices, along], 2)
+
+
+Field = tuple[str, Callable[[_Numbers], Any]]
+
+
+def _links(kind: str, names: str) -> dict[str, Field]:
+    """Fields that are the scene's, of each entry's link."""
+    return {name: (kind, lambda n, name=name: getattr(n.scene, name)[n.link]) for name in names.split()}
+
+
+def _carried(kind: str, names: str) -> dict[str, Field]:
+    """The same, but zero on the lanes that do not carry the link's mass."""
+    return {name: (kind, lambda n, name=name: n.carry(getattr(n.scene, name))) for name in names.split()}
+
+
+def _scenes(kind: str, names: str) -> dict[str, Field]:
+    """Fields that are the scene's."""
+    return {name: (kind, lambda n, name=name: getattr(n.scene, name)) for name in names.split()}
+
+
+# The name of each field, its type (an array's ends in s, or ss with two dimensions), and where its numbers come from;
+# one whose source is None stays empty. Of each lane's each link there is entry lane * slots + slot.
+FIELDS: dict[str, Field] = {
+    "count": ("ints", lambda n: [len(row) for row in n.division.links]),  # links of each lane
+    "link": ("ints", lambda n: n.link),  # its number in the scene, which says where its joint is in qvel
+    "parent": ("ints", lambda n: n.slots_of(n.scene.parent)),  # a slot, as are inboard and outboard
+    **_links("ints", "slide"),
+    # R = R_parent (turn0 + sin q turn1 + cos q turn2); axis and position in the parent's frame
+    "turn0": ("mat3s", lambda n: n.turns[0]),
+    "turn1": ("mat3s", lambda n: n.turns[1]),
+    "turn2": ("mat3s", lambda n: n.turns[2]),
+    "position": ("vec3s", lambda n: n.position[n.link]),
+    "axis": ("vec3s", lambda n: n.axis[n.link]),
+    # read in scenes with ball joints only: the first link of each ball joint; of each link its place in qpos, the
+    # link that its joint hangs on, and the link that its joint turns
+    "ball_count": ("ints", lambda n: [len(row) for row in n.balls]),
+    "ball_slot": ("ints", lambda n: padded(n.balls, n.scene.nball)),
+    **_links("ints", "qpos_adr"),
+    "inboard": ("ints", lambda n: n.slots_of(n.scene.parent[n.around_ball(0)])),
+    "outboard": ("ints", lambda n: n.slots_of(n.around_ball(2))),
+    "carried": ("ints", lambda n: n.carried),  # 1 on the one lane that has its mass
+    **_carried("reals", "mass lift base_damping"),  # lift: read with gravity compensation only
+    **_carried("mat3s", "inertia"),
+    **_links("vec3s", "com lift_position"),
+    **_links("reals", "armature damping stiffness spring_ref lower upper k_limit d_limit"),
+    **_links(
+        "reals", "servo_stiffness servo_damping servo_ref force_low force_high"
+    ),  # read where actuators have bounds
+    "motor_slot": ("ints", lambda n: n.motor_slot.flatten()),  # of each lane's each motor, 0 if another has its link
+    "motor_lane": ("ints", lambda n: n.motor_lane),  # the lane that writes its gradient
+    **_scenes("reals", "gear motor_bias"),
+    # segments of muscles, from a in the frame of pair_link[2 k] to b in that of pair_link[2 k + 1];
+    # a lane's muscles are muscle[muscle_begin[lane]] .. muscle[muscle_begin[lane + 1] - 1]
+    "muscle_begin": ("ints", lambda n: np.cumsum([0, *map(len, n.division.muscles)])),
+    "muscle": ("ints", lambda n: sum(n.division.muscles, [])),
+    # its pairs of links are lane_begin[lane] .. lane_begin[lane + 1], the segments of pair k are pair_begin[k] ..
+    "lane_begin": ("ints", lambda n: np.searchsorted(n.segments[1][:, 0], np.arange(len(n.division.muscles) + 1))),
+    "pair_link": ("ints", lambda n: n.slot[n.segments[1][:, :1], n.segments[1][:, 1:]].flatten()),
+    "pair_begin": ("ints", lambda n: n.segments[2]),
+    "segment_a": ("vec3s", lambda n: n.scene.segment_position[n.segments[0], 0]),
+    "segment_b": ("vec3s", lambda n: n.scene.segment_position[n.segments[0], 1]),
+    "segment_muscle": ("ints", lambda n: n.scene.segment_muscle[n.segments[0]]),
+    "contact_begin": (
+        "ints",
+        lambda n: n.spheres[0],
+    ),  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
+    "contact_position": ("vec3s", lambda n: n.scene.contact_position[n.spheres[1]]),
+    "contact_radius": ("reals", lambda n: n.scene.contact_radius[n.spheres[1]]),
+    # MuJoCo's constraints, read by the integrator mujoco only: robot/constraint.py has their order
+    "contact_numbers": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.contact[n.spheres[1]]),
+    "limit_numbers": ("vec11s", lambda n: n.scene.constraints and n.scene.constraints.limit[n.link]),
+    "joint_loss": ("vec3s", lambda n: n.scene.constraints and n.scene.constraints.loss[n.link]),
+    "body_begin": ("ints", lambda n: n.bodies[0]),  # bodies of entry k are body_begin[k] .. body_begin[k + 1]
+    "body": ("ints", lambda n: n.bodies[1]),
+    "body_com": ("vec3s", lambda n: n.scene.body_com[n.bodies[1]]),
+    "drag_frame": ("mat3s", lambda n: n.scene.drag[0][n.link]),  # principal axes in the link's frame, see drag.py
+    "drag_viscous": ("vec3s", lambda n: n.carry(n.scene.drag[1])),  # (a, c, 0)
+    "drag_force": ("vec3s", lambda n: n.carry(n.scene.drag[2])),
+    "drag_torque": ("vec3s", lambda n: n.carry(n.scene.drag[3])),
+    # read in scenes with a terrain only: a row of each profile, or one for all environments, whose vertices are
+    # (x, z, unit vector along the segment that begins there)
+    "terrain": ("vec4ss", lambda n: n.terrain),
+    "carrier_along": ("real", lambda n: n.place[0]),  # x at q = 0
+    # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
+    "carrier_height": ("real", lambda n: n.place[2] - n.scene.ground_height),
+    **_scenes("vec3", "gravity"),
+    **_scenes("real", "k_n k_d k_t mu"),
+}
+
+
+def struct(name: str, fields: dict[str, Any]) -> Any:
+    """A Warp struct that has fields of these types."""
+    return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__, "__qualname__": name}))
+
+
 @cache
 def scene_types(dtype: type) -> SimpleNamespace:
     """Warp's vector types of a scene's numbers, and their struct."""
-    vec3, vec4, vec11 = (wp.types.vector(n, dtype) for n in (3, 4, 11))
-    mat3 = wp.types.matrix((3, 3), dtype)
-
-    @wp.struct
-    class Model:
-        # of each lane's each link: entry lane * slots + slot; parent, inboard and outboard are slots
-        count: wp.array(dtype=int)  # links of each lane
-        link: wp.array(dtype=int)  # its number in the scene, which says where its joint is in qvel
-        parent: wp.array(dtype=int)
-        slide: wp.array(dtype=int)
-        # R = R_parent (turn0 + sin q turn1 + cos q turn2); axis and position in the parent's frame
-        turn0: wp.array(dtype=mat3)
-        turn1: wp.array(dtype=mat3)
-        turn2: wp.array(dtype=mat3)
-        position: wp.array(dtype=vec3)
-        axis: wp.array(dtype=vec3)
-        # read in scenes with ball joints only: the first link of each ball joint; of each link its place in qpos, the
-        # link that its joint hangs on, and the link that its joint turns
-        ball_count: wp.array(dtype=int)
-        ball_slot: wp.array(dtype=int)
-        qpos_adr: wp.array(dtype=int)
-        inboard: wp.array(dtype=int)
-        outboard: wp.array(dtype=int)
-        carried: wp.array(dtype=int)  # 1 on the one lane that has its mass
-        mass: wp.array(dtype=dtype)
-        com: wp.array(dtype=vec3)
-        inertia: wp.array(dtype=mat3)
-        lift: wp.array(dtype=dtype)  # read with gravity compensation only
-        lift_position: wp.array(dtype=vec3)
-        base_damping: wp.array(dtype=dtype)  # read where a floating base has some
-        armature: wp.array(dtype=dtype)
-        damping: wp.array(dtype=dtype)
-        stiffness: wp.array(dtype=dtype)
-        spring_ref: wp.array(dtype=dtype)
-        # read where actuators have bounds only
-        servo_stiffness: wp.array(dtype=dtype)
-        servo_damping: wp.array(dtype=dtype)
-        servo_ref: wp.array(dtype=dtype)
-        force_low: wp.array(dtype=dtype)
-        force_high: wp.array(dtype=dtype)
-        lower: wp.array(dtype=dtype)
-        upper: wp.array(dtype=dtype)
-        k_limit: wp.array(dtype=dtype)
-        d_limit: wp.array(dtype=dtype)
-        motor_slot: wp.array(dtype=int)  # of each lane's each motor, 0 where another lane has its link
-        motor_lane: wp.array(dtype=int)  # the lane that writes its gradient
-        gear: wp.array(dtype=dtype)
-        motor_bias: wp.array(dtype=dtype)
-        # segments of muscles, from a in the frame of pair_link[2 k] to b in that of pair_link[2 k + 1];
-        # a lane's muscles are muscle[muscle_begin[lane]] .. muscle[muscle_begin[lane + 1] - 1]
-        muscle_begin: wp.array(dtype=int)
-        muscle: wp.array(dtype=int)
-        lane_begin: wp.array(dtype=int)  # its pairs of links are lane_begin[lane] .. lane_begin[lane + 1]
-        pair_link: wp.array(dtype=int)
-        pair_begin: wp.array(dtype=int)  # the segments of pair k are pair_begin[k] .. pair_begin[k + 1]
-        segment_a: wp.array(dtype=vec3)
-        segment_b: wp.array(dtype=vec3)
-        segment_muscle: wp.array(dtype=int)
-        contact_begin: wp.array(dtype=int)  # spheres of entry k are contact_begin[k] .. contact_begin[k + 1]
-        contact_position: wp.array(dtype=vec3)
-        contact_radius: wp.array(dtype=dtype)
-        # MuJoCo's constraints, read by the integrator mujoco only: robot/constraint.py has their order
-        contact_numbers: wp.array(dtype=vec11)
-        limit_numbers: wp.array(dtype=vec11)
-        joint_loss: wp.array(dtype=vec3)
-        body_begin: wp.array(dtype=int)  # bodies of entry k are body_begin[k] .. body_begin[k + 1]
-        body: wp.array(dtype=int)
-        body_com: wp.array(dtype=vec3)
-        drag_frame: wp.array(dtype=mat3)  # principal axes in the link's frame, see drag.py
-        drag_viscous: wp.array(dtype=vec3)  # (a, c, 0)
-        drag_force: wp.array(dtype=vec3)
-        drag_torque: wp.array(dtype=vec3)
-        # read in scenes with a terrain only: a row of each profile, or one for all environments, whose vertices are
-        # (x, z, unit vector along the segment that begins there)
-        terrain: wp.array2d(dtype=vec4)
-        carrier_along: dtype  # x at q = 0
-        gravity: vec3
-        carrier_height: dtype  # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
-        k_n: dtype
-        k_d: dtype
-        k_t: dtype
-        mu: dtype
-
-    return SimpleNamespace(vec3=vec3, vec4=vec4, vec11=vec11, mat3=mat3, Model=Model)
+    kinds: dict[str, Any] = {f"vec{n}": wp.types.vector(n, dtype) for n in (3, 4, 11)}
+    kinds |= {"real": dtype, "int": wp.int32, "mat3": wp.types.matrix((3, 3), dtype)}
+    arrays = {f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()}
+    arrays |= {f"{name}ss": wp.array2d(dtype=kind) for name, kind in kinds.items()}
+    return SimpleNamespace(
+        **kinds, Model=struct("Model", {name: (kinds | arrays)[kind] for name, (kind, _) in FIELDS.items()})
+    )
 
 
 @cache
@@ -107,47 +222,30 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     """Warp's types in a kernel: U of a scene's numbers, T of those that environments have of their own (wide.py)."""
     U = spec.dtype
     T = wp.float64 if spec.block > 1 else U
-
-    @wp.struct
-    class Law:
-        h: T  # s, of a substep
-        theta: T  # how implicit it is
-        k_n: T
-        k_d: T
-        k_t: T
-        mu: T
-        # factors of what each link has its own of, read where they vary only
-        k_limit: T
-        d_limit: T
-        mass: T
-        motor: T
-        block: int  # whose environments' rows of Model.terrain are read where there is one only
-
-    @wp.struct
-    class Load:  # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force
-        a: wp.types.matrix((3, 3), T)
-        b: wp.types.matrix((3, 3), T)
-        d: wp.types.matrix((3, 3), T)
-        f: wp.types.vector(6, T)
-
+    vec2, vec3, vec4, vec6 = (wp.types.vector(n, T) for n in (2, 3, 4, 6))
+    mat3, mat6, quat = wp.types.matrix((3, 3), T), wp.types.matrix((6, 6), T), wp.types.quaternion(T)
+    constants = dict.fromkeys("h theta k_n k_d k_t mu k_limit d_limit mass motor".split(), T)
     return SimpleNamespace(
         T=T,
         U=U,
-        Load=Load,
-        vec2=wp.types.vector(2, T),
-        vec3=wp.types.vector(3, T),
-        vec4=wp.types.vector(4, T),
-        vec6=wp.types.vector(6, T),
-        mat3=wp.types.matrix((3, 3), T),
-        mat6=wp.types.matrix((6, 6), T),
-        quat=wp.types.quaternion(T),
-        Place=wp.types.vector(2, T) if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
+        vec2=vec2,
+        vec3=vec3,
+        vec4=vec4,
+        vec6=vec6,
+        mat3=mat3,
+        mat6=mat6,
+        quat=quat,
+        Place=vec2 if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
         array=wp.array(dtype=T),
         array2=wp.array2d(dtype=U),  # a row for each environment
         array3=wp.array3d(dtype=T),  # checkpoints
         scene=scene_types(U),
         Model=scene_types(U).Model,
-        Law=Law,
+        # h: s, of a substep; theta: how implicit it is; constants of the laws, or factors of those that each link has
+        # its own of (k_limit to motor, read where they vary); whose environments' row of Model.terrain is read
+        Law=struct("Law", constants | {"block": int}),
+        # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force
+        Load=struct("Load", {"a": mat3, "b": mat3, "d": mat3, "f": vec6}),
     )
 
 
@@ -158,152 +256,18 @@ def by_name(*functions: wp.Function) -> SimpleNamespace:
 
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:
     """The scene's numbers as a Warp struct on a device."""
-    writer = _Writer(scene, division, dtype, device)
-    writer.put_tree()
-    writer.put_links()
-    writer.put_motors_and_muscles()
-    writer.put_contacts_and_bodies()
-    return writer.model
-
-
-class _Writer:
-    """Fills a Model: of each lane's links a row of `slots` entries, of which the last ones may be of no use."""
-
-    def __init__(self, scene: Scene, division: Division, dtype: type, device: str) -> None:
-        self.scene, self.division, self.device = scene, division, device
-        self.model_type = scene_types(dtype).Model
-        self.model = self.model_type()
-        threads, slots = division.threads_per_env, division.slots
-        self.link = padded(division.links, slots)  # of each entry, and
-        self.lane = np.repeat(np.arange(threads), slots)
-        self.slot = np.zeros((threads, scene.nlink), np.int32)  # of each lane's each link
-        for lane, row in enumerate(division.links):
-            self.slot[lane, row] = np.arange(len(row))
-
-    def put(self, **fields: Any) -> None:
-        """Sets fields of the model, with the types that it declares."""
-        for name, values in fields.items():
-            kind = self.model_type.vars[name].type
-            if isinstance(kind, wp.array):
-                values = np.ascontiguousarray(values, np.int32 if kind.dtype is wp.int32 else float)
-                # Warp gives an empty array no address; one unread element keeps the struct uniform.
-                values = values if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)
-                setattr(self.model, name, wp.array(values, dtype=kind.dtype, device=self.device))
-            else:
-                setattr(self.model, name, kind(values))
-
-    def put_tree(self) -> None:
-        """Which links are whose, and where their frames are."""
-        scene, link = self.scene, self.link
-        skew = np.cross(np.eye(3)[None], scene.axis[:, None])  # skew(a) b = a x b
-        hinge = np.where(scene.slide | (scene.ball >= 0), 0.0, 1.0)[:, None, None]
-        r, square = scene.rotation, skew @ skew
-        cos, sin = np.cos(scene.joint_ref)[:, None, None], np.sin(scene.joint_ref)[:, None, None]
-        axis = np.einsum("nij,nj->ni", r, scene.axis)
-        position = scene.position - np.where(scene.slide, scene.joint_ref, 0.0)[:, None] * axis
-        self.put(
-            count=[len(row) for row in self.division.links],
-            link=link,
-            parent=self.slot[self.lane, scene.parent[link]],
-            qpos_adr=scene.qpos_adr[link],
-            slide=scene.slide[link],
-            # Rodrigues for the angle q - ref, expanded by the sum formulas: the kernels then need no reference.
-            turn0=(r @ (np.eye(3) + hinge * square))[link],
-            turn1=(hinge * (r @ (skew * cos - square * sin)))[link],
-            turn2=(-hinge * (r @ (square * cos + skew * sin)))[link],
-            position=position[link],
-            axis=axis[link],
-        )
-        first, last = (np.arange(scene.nlink) + np.where(scene.ball < 0, 0, k - scene.ball) for k in (0, 2))
-        balls = [np.flatnonzero(scene.ball[row] == 0).tolist() for row in self.division.links]
-        self.put(
-            ball_count=[len(row) for row in balls],
-            ball_slot=padded(balls, scene.nball),
-            inboard=self.slot[self.lane, scene.parent[first][link]],
-            outboard=self.slot[self.lane, last[link]],
-        )
-        # Along the chain of slides that ends at the carrier nothing turns, so the offsets add up as they are.
-        frame, place = np.eye(3), np.zeros(3)
-        for i in range(1, scene.carrier + 1):
-            place += frame @ position[i]
-            frame = frame @ r[i]
-        self.put(carrier_along=place[0], carrier_height=place[2] - scene.ground_height, gravity=scene.gravity)
-
-    def put_links(self) -> None:
-        """Each link's joint, and its inertia and drag, which one lane carries."""
-        scene, link = self.scene, self.link
-        weighs = self.division.weighs
-        carried = np.array([i in weighs[lane] for lane, i in zip(self.lane, link, strict=True)], float)[:, None]
-        frame, viscous, force, torque = scene.drag
-        self.put(
-            carried=carried[:, 0],
-            **{name: getattr(scene, name)[link] * carried[:, 0] for name in ("mass", "lift", "base_damping")},
-            inertia=scene.inertia[link] * carried[:, None],
-            drag_frame=frame[link],
-            drag_viscous=viscous[link] * carried,
-            drag_force=force[link] * carried,
-            drag_torque=torque[link] * carried,
-        )
-        names = "com lift_position armature damping stiffness spring_ref lower upper k_limit d_limit servo_stiffness"
-        names += " servo_damping servo_ref force_low force_high"
-        self.put(**{name: getattr(scene, name)[link] for name in names.split()})
-
-    def put_motors_and_muscles(self) -> None:
-        scene, muscles = self.scene, self.division.muscles
-        motor_slot = self.slot[:, scene.motor_link]
-        lane = (motor_slot > 0).argmax(0)  # of each motor and muscle
-        for k, hand in enumerate(muscles):
-            lane[hand] = k
-        # Segments by lane, then by the pair of links that they join.
-        key = np.column_stack([lane[scene.segment_muscle], scene.segment_link])
-        order = np.lexsort(key.T[::-1])
-        pairs, start = np.unique(key[order], axis=0, return_index=True)
-        self.put(
-            gear=scene.gear,
-            motor_bias=scene.motor_bias,
-            motor_slot=motor_slot.flatten(),
-            motor_lane=lane,
-            muscle_begin=np.cumsum([0, *map(len, muscles)]),
-            muscle=sum(muscles, []),
-            lane_begin=np.searchsorted(pairs[:, 0], np.arange(len(muscles) + 1)),
-            pair_link=self.slot[pairs[:, :1], pairs[:, 1:]].flatten(),
-            pair_begin=np.append(start, len(order)),
-            segment_a=scene.segment_position[order, 0],
-            segment_b=scene.segment_position[order, 1],
-            segment_muscle=scene.segment_muscle[order],
-        )
-
-    def put_contacts_and_bodies(self) -> None:
-        """Both by lane, then by slot: a body is on the lane that carries its link's mass; and the ground."""
-        scene, d = self.scene, self.division
-        begin, sphere = self.by_entry(d.spheres, scene.contact_link)
-        self.put(
-            contact_begin=begin,
-            contact_position=scene.contact_position[sphere],
-            contact_radius=scene.contact_radius[sphere],
-            **{name: getattr(scene, name) for name in ("k_n", "k_d", "k_t", "mu")},
-        )
-        if scene.constraints is not None:
-            self.put(
-                contact_numbers=scene.constraints.contact[sphere],
-                limit_numbers=scene.constraints.limit[self.link],
-                joint_loss=scene.constraints.loss[self.link],
-            )
-        vertices = np.zeros((1, 1, 2)) if scene.terrain is None else scene.terrain
-        along = np.diff(vertices, axis=1, append=vertices[:, -1:])
-        along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), np.finfo(float).tiny)
-        self.put(terrain=np.concatenate([vertices, along], 2))
-        link = scene.body_link
-        begin, body = self.by_entry([np.flatnonzero(np.isin(link, row)) for row in d.weighs], link)
-        self.put(body_begin=begin, body=body, body_com=scene.body_com[body])
-
-    def by_entry(self, hands: Sequence[Iterable[int]], link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where each entry begins, and the things themselves, of things on links that are dealt to the lanes."""
-        rows = [
-            (lane * self.division.slots + self.slot[lane, link[k]], k) for lane, hand in enumerate(hands) for k in hand
-        ]
-        entry, things = np.array(sorted(rows), int).reshape(-1, 2).T
-        return np.searchsorted(entry, np.arange(len(self.link) + 1)), things
+    Model, numbers = scene_types(dtype).Model, _Numbers(scene, division)
+    model = Model()
+    for name, (_, source) in FIELDS.items():
+        kind, values = Model.vars[name].type, source(numbers)
+        if isinstance(kind, wp.array) and values is not None:
+            values = np.ascontiguousarray(values, np.int32 if kind.dtype is wp.int32 else float)
+            # Warp gives an empty array no address; one unread element keeps the struct uniform.
+            values = values if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)
+            setattr(model, name, wp.array(values, dtype=kind.dtype, device=device))
+        elif values is not None:
+            setattr(model, name, kind(values))
+    return model
 
 
 def padded(rows: list[list[int]], width: int) -> np.ndarray:
