@@ -2,8 +2,9 @@
 
 `python benchmarks/paper.py --same REVISION` compares a revision with this one on this machine; with --update-results
 it adds a link to results/fingerprints.csv. A result counts while each link from its revision to the newest one keeps
-the fingerprints that its training depends on: its learner's, and those of its task. A link keeps a fingerprint if it is
-equal in both revisions, or if it was meant to change (--reason) and all sentinels are within their published range.
+the fingerprints that its training depends on: its learner's, and those of its task. A link keeps a fingerprint that is
+equal in both revisions, or that was meant to change (--reason) if all sentinels that depend on it, cells that were
+trained again, are within the published range.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from tempfile import TemporaryDirectory
 
 import common
 import tables
+from cells import LEARNERS
 from tables import ROOT
 
 from diffsim.training import fail
@@ -63,7 +65,7 @@ state = torch.load(f"{sys.argv[-1]}/checkpoint.pt", map_location="cpu", weights_
 print(hashlib.sha256(b"".join(w.numpy().tobytes() for w in state["policy"]["weights"].values())).hexdigest()[:12])
 """  # in the process of the checkout, which knows what its checkpoint holds
 COLUMNS = ("revision", "parent", "machine", "equal", "differ", "reason", "sentinels")
-KEEPS, BREAKS = "within", "beyond"  # a sentinel is within the published range, or beyond it
+KEEPS, BREAKS = "within:", "beyond:"  # verdicts on a sentinel
 
 
 def depends(command: str) -> set[str]:
@@ -160,8 +162,9 @@ def same_files(revision: str, other: str, script: str = "") -> bool:
 
 def keeps(link: Mapping[str, str], name: str) -> bool:
     """Whether results of a link's parent that depend on a fingerprint are results of its revision, too."""
-    meant = link["reason"] and KEEPS in link["sentinels"] and BREAKS not in link["sentinels"]
-    return name in link["equal"].split() or bool(meant) and name in link["differ"].split()
+    told = [words.split() for words in filter(None, link["sentinels"].split("; "))]
+    verdicts = {verdict for learner, task, verdict, *_ in told if name in depends(f"{LEARNERS[learner]} --env {task}")}
+    return name in link["equal"].split() or bool(link["reason"]) and verdicts == {KEEPS}
 
 
 def counts(revision: str, command: str) -> bool:

@@ -58,7 +58,7 @@ from diffsim.training.evaluation import kept
 
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
-SENTINELS: list[list[str]] = CASES["paper"]["sentinels"]  # learner and task
+SENTINELS = 3  # cells, each with as many seeds
 UNTIMED = ("task", "learner", "return", "in the reference", "target", "steps to target")
 
 
@@ -386,11 +386,22 @@ def check(args: Args) -> str:
     return "\n".join(lines)
 
 
-def measure_sentinels(args: Args, runner: Runner, seeds: int = 3) -> None:
-    """Train SENTINELS at this revision, and say in the newest link whether medians are within the published range."""
+def sentinels(args: Args, differ: set[str]) -> list[tuple[str, str]]:
+    """Learners and tasks of this machine that depend on these: first on most of them, and of several the shortest."""
+    rows, chosen, left = read_csv(common.RESULTS / args.place / "cells.csv"), list[tuple[str, str]](), {*differ}
+    steps = {(row["learner"], row["task"]): float(row["control steps"]) for row in rows}
+    depends = {key: fingerprints.depends(f"{LEARNERS[key[0]]} --env {key[1]}") for key in steps}
+    while len(chosen) < SENTINELS and (others := [key for key in steps if key not in chosen and depends[key] & differ]):
+        chosen.append(max(others, key=lambda key: (len(depends[key] & left), -steps[key])))
+        left -= depends[chosen[-1]]
+    return chosen
+
+
+def measure_sentinels(args: Args, runner: Runner) -> None:
+    """Train sentinels at this revision, and say in the newest link whether medians are within the published range."""
     link, verdicts = fingerprints.links()[-1], list[str]()
-    for learner, task in SENTINELS:
-        cells = [Cell(args.place, learner, task, seed) for seed in range(1, seeds + 1)]
+    for learner, task in sentinels(args, {*link["differ"].split()}):
+        cells = [Cell(args.place, learner, task, seed) for seed in range(1, SENTINELS + 1)]
         cases = [cell.case(args.runs / "sentinels" / link["revision"]) for cell in cells]
         for cell, case in zip(cells, cases, strict=True):
             begin(runner, cell, case)
@@ -400,7 +411,7 @@ def measure_sentinels(args: Args, runner: Runner, seeds: int = 3) -> None:
         known = numbers((row for row in own if row["learner"] == learner), "return")
         found = median(evaluation(case.folder)["return"] for case in cases)
         verdict = fingerprints.KEEPS if min(known) <= found <= max(known) else fingerprints.BREAKS
-        verdicts.append(f"{learner} {task} {found:.0f} {verdict} {min(known):.0f} to {max(known):.0f}")
+        verdicts.append(f"{learner} {task} {verdict} {found:.0f} in {min(known):.0f} to {max(known):.0f}")
         print(verdicts[-1], flush=True)
     if args.update_results:
         link = link | {"sentinels": "; ".join(verdicts)}

@@ -63,9 +63,21 @@ def test_a_result_counts_while_each_link_keeps_what_it_depends_on(
     assert counts("a", "shac --env humanoid")
     made[1] = link("b", "c", differ="ant", reason="a better ant", sentinels="")
     assert not counts("a", "shac --env ant")
-    made[1] = link("b", "c", differ="ant", reason="a better ant", sentinels="shac ant within; sapo ant beyond")
+    made[1] = link(
+        "b",
+        "c",
+        differ="ant",
+        reason="a better ant",
+        sentinels="shac ant within: 5 in 4 to 6; sapo ant beyond: 3 in 4 to 6",
+    )
     assert not counts("a", "shac --env ant")
-    made[1] = link("b", "c", differ="ant", reason="a better ant", sentinels="shac ant within; sapo ant within")
+    made[1] = link(
+        "b",
+        "c",
+        differ="ant",
+        reason="a better ant",
+        sentinels="shac ant within: 5 in 4 to 6; sapo hopper beyond: 3 in 4 to 6",
+    )
     assert counts("a", "shac --env ant")
     made[1] = link("b", "c") | {"equal": "shac"}  # the ant was not compared
     assert not counts("a", "shac --env ant") and counts("a", "shac --env hopper")
@@ -122,9 +134,14 @@ def test_a_link_is_recorded_where_the_chain_ends_and_with_its_reason(
 def test_a_sentinel_beyond_the_published_range_breaks_the_chain(
     chain: Callable[..., list[dict[str, str]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, returns, written = chain(HEAD="d"), {"hopper": 5.0, "ant": 5.0, "humanoid_mtu": 5.0}, list[dict[str, str]]()
-    made[-1] |= {"equal": "shac", "differ": "ant", "reason": "a better ant"}
-    rows = [{"learner": a, "task": b, "seed": "1", "return": r} for a, b in paper.SENTINELS for r in ("4", "6")]
+    made, returns, written = chain(HEAD="d"), {"ant": 5.0, "humanoid": 5.0}, list[dict[str, str]]()
+    made[-1] |= {"equal": "shac", "differ": "ant humanoid", "reason": "a better ant"}
+    steps = {"ant": "9", "humanoid": "8", "hopper": "1"}
+    rows = [
+        {"learner": "shac", "task": task, "return": value, "control steps": steps[task]}
+        for task in steps
+        for value in ("4", "6")
+    ]
     monkeypatch.setattr(paper, "read_csv", lambda path: rows)
     monkeypatch.setattr(paper, "begin", lambda *_: {})
     monkeypatch.setattr(paper, "evaluation", lambda folder: {"return": returns[folder.name.partition("__")[0]]})
@@ -132,11 +149,12 @@ def test_a_sentinel_beyond_the_published_range_breaks_the_chain(
     monkeypatch.setattr("cells.Runner.train", lambda *_: True)
     monkeypatch.setattr("cells.Runner.evaluate", lambda *_: True)
     args = paper.Args(update_results=True, machine="cpu")
+    assert paper.sentinels(args, {"ant", "humanoid"}) == [("shac", "humanoid"), ("shac", "ant")]
     for value, kept in ((5.0, True), (7.0, False), (3.0, False)):
         returns["ant"] = value
         paper.measure_sentinels(args, paper.Runner(args))
         made[-1] = written[-1]
-        assert counts("a", "shac --env ant") == kept
+        assert counts("a", "shac --env ant") == kept and counts("a", "shac --env humanoid")
 
 
 def test_fingerprints_notice_changed_numbers_and_no_changed_words(tmp_path: Path) -> None:
