@@ -98,7 +98,7 @@ def make(
     scene = task.load_robot()
     asked = dict(substeps=substeps, theta=theta, passes=passes, touchdown=touchdown)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
-    if penalty and integration.integrator == "mujoco":
+    if penalty and integration.constrained:
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
     scene = scene.with_penalty(penalty or {})
     scene = scene if terrain is None else scene.with_terrain(terrain)

@@ -187,7 +187,7 @@ class DiffEnv(VectorEnv):
                 "window, step under torch.no_grad(), or make the environment with a larger horizon"
             )
         self._recorded += recorded
-        self.qpos, self.qvel = self.sim.step(self.qpos, self.qvel, action)
+        self.qpos, self.qvel = self.sim.advance(self.qpos, self.qvel, action)
         nonfinite = self.sim.nonfinite.clone()
         if self.task.num_memory:
             noise = self._uniform(self.num_envs, self.task.num_noise)
@@ -293,7 +293,7 @@ class DiffEnv(VectorEnv):
         sums = {name: part.sum() for name, part in parts.items()}
         for part in parts.values():
             part.zero_()
-        if self.sim.integration.integrator == "mujoco":
+        if self.sim.integration.constrained:
             sums["sim/residual"] = self.sim.residual.mean()
         return sums
 

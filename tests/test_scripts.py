@@ -219,7 +219,7 @@ def test_evaluate(script: ModuleType, trained: Path, tmp_path: Path, capsys: pyt
     assert evaluation == json.loads((trained / "evaluation.json").read_text()) | {"finer": finer}
     # Returns of this task are costs, so the share that is kept is the inverse ratio.
     assert finer["substeps"] == 16 and finer["kept"] == pytest.approx(evaluation["return"] / finer["return"])
-    assert f"explicit with 16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} kept" in out
+    assert f"semi_implicit with 16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} kept" in out
     settings = dict(script=script.__name__, iteration=10, env="cartpole", substeps=4, eval_episodes=3)
     assert evaluation["settings"].items() >= settings.items()
     assert evaluation["lengths"] == [240] * 3 and evaluation["speed"] is None

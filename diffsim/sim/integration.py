@@ -31,6 +31,28 @@ class Integration(NamedTuple):
     passes: int = PASSES
     touchdown: bool = True
 
+    @classmethod
+    def explicit(cls, contact: str, substeps: int) -> Integration:
+        """Euler's method on soft or MuJoCo's contact."""
+        return cls("mujoco" if contact == "mujoco" else "semi_implicit", substeps)
+
+    @property
+    def contact(self) -> str:
+        """Whose laws of contact and limits: "soft", springs and dampers, or "mujoco", MuJoCo's constraints."""
+        return "mujoco" if self.constrained else "soft"
+
+    @property
+    def constrained(self) -> bool:
+        return self.integrator == "mujoco"
+
+    @property
+    def implicit(self) -> bool:
+        return self.integrator == "implicit"
+
+    @property
+    def extrapolated(self) -> bool:
+        return self.integrator == "extrapolated"
+
     def replaced(self, integrator: str | None = None, **others: Any) -> Integration:
         """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
         same = integrator is None or integrator == self.integrator
@@ -42,11 +64,11 @@ class Integration(NamedTuple):
         if self.integrator not in INTEGRATORS:
             raise ValueError(f"unknown integrator {self.integrator!r}; choose from {', '.join(INTEGRATORS)}")
         substeps = check_count("substeps", self.substeps)
-        if self.integrator == "extrapolated" and substeps % 2:
+        if self.extrapolated and substeps % 2:
             raise ValueError(f"substeps is {self.substeps}, must be even for the extrapolated integrator")
         if not is_real(self.theta) or not 0 <= self.theta <= 1:
             raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
-        if self.theta and self.integrator != "implicit":
+        if self.theta and not self.implicit:
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
         if not isinstance(self.touchdown, bool):
             raise ValueError(f"touchdown is {self.touchdown!r}, must be True or False")

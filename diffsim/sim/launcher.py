@@ -14,7 +14,7 @@ from diffsim import startup
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import Division, divide
-from diffsim.kernels.model import model_of
+from diffsim.kernels.model import model_of, types
 from diffsim.kernels.spec import kernel_spec
 from diffsim.robot.scene import Scene
 from diffsim.sim.options import BLOCKS, WARP_DTYPE, Options
@@ -41,7 +41,6 @@ class Launcher:
     Attributes:
         spec: what the kernels were generated for.
         num_blocks: how many blocks of spec.block environments there are, the last of which may not be full.
-        nonfinite_gradients: see Simulator.
     """
 
     def __init__(self, scene: Scene, num_envs: int, options: Options) -> None:
@@ -54,27 +53,25 @@ class Launcher:
             raise ValueError(f"threads_per_env is {division.threads_per_env}, must be 1 on a CPU")
         block = options.block or default_block(num_envs, options)
         how = options.integration
-        constrained = how.integrator == "mujoco"
         self.spec = kernel_spec(
             scene,
             division,
             real,
             options.forces,
-            implicit=how.integrator == "implicit",
-            constrained=constrained,
-            touchdown=how.touchdown and constrained,
+            implicit=how.implicit,
+            constrained=how.constrained,
+            touchdown=how.touchdown and how.constrained,
             varied=options.factors,
             env_last=cuda,
             block=block,
         )
         self.num_blocks = -(-num_envs // block)
-        self.nonfinite_gradients = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
         with building:
             self._kernels = {"forward": forward_kernel(self.spec), "backward": backward_kernel(self.spec)}
             self._model = model_of(scene, division, real, str(self.device))
         # Coalescing wants wide blocks, but few environments want to reach many multiprocessors.
         self._block_dim = max(8 if num_envs <= 256 else 32, self.spec.threads_per_env)
-        work = num_envs * options.integration.substeps * scene.nlink
+        work = num_envs * how.substeps * scene.nlink
         least = MIN_WORK_PER_THREAD if block == 1 else IN_BLOCKS
         wanted = 1 if cuda else options.threads or min(available_cores(), max(1, work // least))
         count = min(wanted, self.num_blocks)
@@ -110,6 +107,31 @@ class Launcher:
         command[0].launch()
         for future in pending:
             future.result()
+
+    def checkpoints(self, count: int) -> list[wp.array]:
+        """What backward needs of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix.
+
+        With MuJoCo's constraints also the acceleration where the last pass began, and where damping follows them the
+        factors of both.
+        """
+        spec, n, device = self.spec, self.num_envs, str(self.device)
+        widths = (spec.nq, spec.nv, (1 + spec.constrained) * spec.nv, spec.nfactor)
+        counts = (count, count, count, spec.solves * count)
+        numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
+        check_memory("checkpoints", n, numbers * self.dtype.itemsize, self.device)
+        if spec.block == 1:
+            sizes = [(c, k, n) if spec.env_last else (c, n, k) for c, k in zip(counts, widths, strict=True)]
+            return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
+        values = [torch.zeros(c, self.num_blocks, k, spec.block) for c, k in zip(counts, widths, strict=True)]
+        return [array_of_vectors(value, types(spec).T) for value in values]
+
+
+def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
+    """(..., block) float32 values as an array of vectors, which to Warp are numbers of that dtype (kernels.wide)."""
+    strides = tuple(stride * values.itemsize for stride in values.stride()[:-1])
+    array: Any = wp.array(ptr=values.data_ptr() or None, dtype=dtype, shape=values.shape[:-1], strides=strides)
+    array.tensor = values  # keeps the memory
+    return array
 
 
 def default_division(scene: Scene, num_envs: int) -> Division:

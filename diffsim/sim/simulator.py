@@ -1,4 +1,4 @@
-"""Simulator: a batch of environments of one scene, and what may be asked of it."""
+"""Simulator: a batch of environments of one scene, whose control steps are nodes of torch's graph."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import math
 from typing import Any, NoReturn
 
 import torch
+import torch.nn.functional as F
+import warp as wp
 
 from diffsim.robot.constraint import check_soft, constrained
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory
 from diffsim.sim.options import Options
-from diffsim.sim.stepper import ExtrapolatedStepper, State, Stepper
+
+State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 
 
 class Simulator:
@@ -69,27 +72,46 @@ class Simulator:
         self.integration, self.dtype = self.options.integration, self.options.dtype
         self.device = torch.device(self.options.device)
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
+        n, how = num_envs, self.integration
         width, bodies = len(FACTORS) if self.options.factors else 0, scene.nbody if self.options.forces else 0
-        numbers = (horizon + 1) * (scene.nq + scene.nv + scene.nu + width + 6 * bodies)
-        check_memory("states and actions", num_envs, numbers * self.dtype.itemsize, self.device)
-        if self.integration.integrator == "mujoco":
-            scene = constrained(scene, control_dt / self.integration.substeps)
+        # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
+        # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
+        self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
+        self._end_widths = (scene.nq, scene.nv + int(how.constrained))  # with constraints a column for the residual
+        check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
+        if how.constrained:
+            scene = constrained(scene, control_dt / how.substeps)
         else:
             check_soft(scene)
-        launcher = Launcher(scene, num_envs, self.options)
-        stepper = ExtrapolatedStepper if self.integration.integrator == "extrapolated" else Stepper
-        self._stepper = stepper(launcher, self.integration, control_dt, horizon)
-        self.nonfinite_gradients = launcher.nonfinite_gradients
-        self._factors = torch.ones(num_envs, width, dtype=self.dtype, device=self.device)
-        self._forces = torch.zeros(num_envs, bodies, 6, dtype=self.dtype, device=self.device)
+        self._launcher = Launcher(scene, n, self.options)
+        self._factors, self._forces = self._zeros(n, width) + 1, self._zeros(n, bodies, 6)
+        self._start, self._g_start = self._zeros(slots, n, sum(self._widths)), self._zeros(n, sum(self._widths))
+        self._end, self._g_end = self._zeros(n, sum(self._end_widths)), self._zeros(n, scene.nq + scene.nv)
+        self._nonfinite = self._zeros(slots, n, dtype=torch.bool)
+        self.nonfinite_gradients = self._zeros(n, dtype=torch.int32)
+        self._rows: list[wp.array] | None = None  # what backward needs of each substep, of all slots
+        self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
+        self._slot, self._last = 0, horizon  # of the next differentiable step, of the last step
+        self._versions = [0] * horizon  # each slot serves a new step after each round of the ring
+        self._coarse: Simulator | None = None  # the other one of the two steps that are extrapolated
+        if how.extrapolated:
+            half = Integration("semi_implicit", how.substeps // 2)
+            self._coarse = Simulator(self.scene, n, half, control_dt, horizon, **options)
+            self._coarse.nonfinite_gradients = self.nonfinite_gradients
+            ends = [range(k, k + 4) for k in scene.quaternion_adr]
+            self._quaternions = torch.tensor(ends, dtype=torch.int64, device=self.device)
+
+    def _zeros(self, *size: int, dtype: torch.dtype | None = None) -> torch.Tensor:
+        return torch.zeros(size, dtype=dtype or self.dtype, device=self.device)
 
     @property
     def nonfinite(self) -> torch.Tensor:
-        return self._stepper.nonfinite
+        bad = self._nonfinite[self._last]
+        return bad if self._coarse is None else bad | self._coarse.nonfinite
 
     @property
     def residual(self) -> torch.Tensor:
-        return self._stepper.residual
+        return self._end[:, self.nq + self.nv :].sum(1)
 
     @property
     def factors(self) -> torch.Tensor:
@@ -98,7 +120,7 @@ class Simulator:
     @factors.setter
     def factors(self, value: torch.Tensor) -> None:
         self.check_tensor("factors", value, self._factors.shape[1])
-        self.check_factors(value)
+        self._check_factors(value)
         self._factors = value
 
     @property
@@ -108,7 +130,7 @@ class Simulator:
     @forces.setter
     def forces(self, value: torch.Tensor) -> None:
         self.check_tensor("forces", value, *self._forces.shape[1:])
-        self.check_forces(value)
+        self._check_forces(value)
         self._forces = value
 
     def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
@@ -127,18 +149,79 @@ class Simulator:
             ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors or forces that were changed
                 in place to what is not allowed.
         """
-        for name, value, width in (("qpos", qpos, self.nq), ("qvel", qvel, self.nv), ("ctrl", ctrl, self.nu)):
+        for name, value, width in zip(("qpos", "qvel", "ctrl"), (qpos, qvel, ctrl), self._widths, strict=False):
             self.check_tensor(name, value, width)
+        return self.advance(qpos, qvel, ctrl)
+
+    def advance(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
+        """`step`, of arguments that are known to be of the right shape, dtype and device."""
         if self.device.type == "cpu":  # a GPU's would have to be waited for
             if self._factors.shape[1]:
-                self.check_factors(self._factors)
+                self._check_factors(self._factors)
             if self._forces.shape[1]:
-                self.check_forces(self._forces)
-        return self._stepper.step(qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
+                self._check_forces(self._forces)
+        start = (qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
+        if torch.is_grad_enabled() and any(part.requires_grad for part in start):
+            slot, self._slot = self._slot, (self._slot + 1) % self.horizon
+            self._versions[slot] += 1
+            both = ControlStep.apply(self, slot, *start)
+        else:
+            both = self._forward(self.horizon, *start)
+        end: State = both.split(self._widths[:2], dim=1)
+        return end if self._coarse is None else self._extrapolate(self._coarse, start, end)
+
+    def _forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
+        """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl, factors, forces)."""
+        torch.cat([part.detach() for part in start], dim=1, out=self._start[slot])
+        self._last = slot
+        self._launcher.launch(self._command("forward", slot))
+        return self._end[:, : self.nq + self.nv].clone()
+
+    def _extrapolate(self, coarse: Simulator, start: tuple[torch.Tensor, ...], end: State) -> State:
+        """Richardson's extrapolation 2 end - coarse end, in which an error proportional to the substep cancels."""
+        coarse._factors, coarse._forces = self._factors, self._forces
+        coarse_end = coarse.advance(*start[:3])
+        qpos, qvel = (2.0 * b - a for a, b in zip(coarse_end, end, strict=True))
+        if len(self._quaternions):
+            unit = F.normalize(qpos[:, self._quaternions], dim=2)
+            qpos = qpos.index_copy(1, self._quaternions.flatten(), unit.flatten(1))
+        bad = self.nonfinite.unsqueeze(1)
+        return torch.where(bad, start[0].detach(), qpos), torch.where(bad, start[1].detach(), qvel)
 
     def rewind(self) -> None:
         """Let the next differentiable step use the first checkpoint: the start of a new window."""
-        self._stepper.rewind()
+        self._slot = 0
+        if self._coarse is not None:
+            self._coarse.rewind()
+
+    def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
+        key = (kernel, slot)
+        if key not in self._commands:
+            self._commands[key] = self._launcher.command(kernel, self._inputs(kernel, slot))
+        return self._commands[key]
+
+    def _inputs(self, kernel: str, slot: int) -> list[Any]:
+        record, how = slot < self.horizon, self.integration
+        if record and self._rows is None:
+            self._rows = self._launcher.checkpoints(self.horizon * how.substeps)
+        rows = self._rows if record and self._rows else self._launcher.checkpoints(0)
+        row0 = slot * how.substeps if record else 0
+        start, end, g_start, g_end = (
+            [wp.from_torch(part) for part in buffer.split(widths, dim=1)]
+            for buffer, widths in (
+                (self._start[slot], self._widths),
+                (self._end, self._end_widths),
+                (self._g_start, self._widths),
+                (self._g_end, self._widths[:2]),
+            )
+        )
+        real, nonfinite = self._launcher.spec.dtype, wp.from_torch(self._nonfinite[slot])
+        scalars = [real(self.control_dt / how.substeps), real(how.theta), how.substeps]
+        if kernel == "forward":
+            return [*scalars, how.passes, *start, int(record), row0, *rows, *end, nonfinite]
+        qpos, _, *inputs = start  # ctrl, factors and forces
+        blown_up = wp.from_torch(self.nonfinite_gradients)
+        return [*scalars, row0, *rows, qpos, *inputs, nonfinite, *g_end, *g_start, blown_up]
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
@@ -160,10 +243,10 @@ class Simulator:
         if value.device != self.device:
             raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
 
-    def check_factors(self, factors: torch.Tensor) -> None:
+    def _check_factors(self, factors: torch.Tensor) -> None:
         """Raise ValueError unless all (N, len(FACTORS) or 0) are finite and not negative, and what divides positive."""
         bad = ~((factors >= 0) & (factors < math.inf))
-        if factors.shape[1] and self.integration.integrator == "mujoco":
+        if factors.shape[1] and self.integration.constrained:
             divisors = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]
             bad[:, divisors] |= factors[:, divisors] == 0
         if bool(bad.any()):
@@ -173,7 +256,7 @@ class Simulator:
                 "be finite and not negative, with the integrator mujoco those of k_n, k_d and k_limit positive"
             )
 
-    def check_forces(self, forces: torch.Tensor) -> None:
+    def _check_forces(self, forces: torch.Tensor) -> None:
         """Raise ValueError unless all (N, nbody or 0, 6) are finite."""
         if not bool(torch.isfinite(forces).all()):
             env, body, column = (~torch.isfinite(forces)).nonzero()[0].tolist()
@@ -182,3 +265,28 @@ class Simulator:
                 f"{'force' if column < 3 else 'torque'} {'xyz'[column % 3]} on body {name} is "
                 f"{forces[env, body, column].item()} in environment {env}; forces must be finite"
             )
+
+
+class ControlStep(torch.autograd.Function):
+    """qpos, qvel, ctrl, factors, forces -> qpos and qvel side by side. The simulator's slot keeps them for backward."""
+
+    @staticmethod
+    def forward(ctx: Any, sim: Simulator, slot: int, *start: torch.Tensor) -> torch.Tensor:
+        ctx.sim, ctx.slot, ctx.version = sim, slot, sim._versions[slot]
+        return sim._forward(slot, *start)
+
+    @staticmethod
+    def backward(ctx: Any, g_end: torch.Tensor) -> tuple[Any, ...]:
+        if torch.is_grad_enabled():  # create_graph=True; without this, second derivatives would lack their larger part
+            raise RuntimeError(
+                "a simulated step has a first derivative only, so no create_graph=True: take finite differences of it"
+            )
+        sim = ctx.sim
+        if sim._versions[ctx.slot] != ctx.version:
+            raise RuntimeError(
+                f"backward through a control step whose checkpoint was overwritten: at most {sim.horizon} "
+                "differentiable steps can be alive; build the simulator with a larger horizon"
+            )
+        sim._g_end.copy_(g_end)
+        sim._launcher.launch(sim._command("backward", ctx.slot))
+        return (None, None, *sim._g_start.clone().split(sim._widths, dim=1))

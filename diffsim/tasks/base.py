@@ -133,10 +133,11 @@ class Task:
             raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
         own = hasattr(cls, "substeps") and contact == cls.contact
         substeps = cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt))
-        if contact == "mujoco":
-            return Integration("mujoco", substeps * (4 if accuracy == "accurate" else 1))
+        explicit = Integration.explicit(contact, substeps)
+        if explicit.constrained:
+            return explicit.replaced(substeps=substeps * (4 if accuracy == "accurate" else 1))
         if accuracy == "default":
-            return Integration("semi_implicit", substeps)
+            return explicit
         if not hasattr(cls, accuracy):
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
         return getattr(cls, accuracy)

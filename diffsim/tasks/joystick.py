@@ -108,7 +108,7 @@ class Joystick(Task):
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
         """See Task. Newton's method takes longer with dry friction in every joint."""
         found = super().integration(accuracy, contact)
-        return found._replace(passes=6, touchdown=cls.touchdown) if found.integrator == "mujoco" else found
+        return found._replace(passes=6, touchdown=cls.touchdown) if found.constrained else found
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)

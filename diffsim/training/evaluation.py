@@ -18,6 +18,7 @@ from torch import Tensor, nn
 import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
+from diffsim.sim.integration import Integration
 from diffsim.training import checkpoint, gait
 from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.directory import check_writable
@@ -201,15 +202,13 @@ def evaluate_checkpoint(
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     if args.finer:
         substeps = FINER * args.substeps
-        finer = dataclasses.replace(args, theta=0.0, substeps=substeps)
-        if args.integrator != "mujoco":  # whose laws no other one has
-            finer.integrator = "semi_implicit"
+        explicit = Integration.explicit(Integration(args.integrator).contact, substeps)
+        finer = dataclasses.replace(args, **{k: getattr(explicit, k) for k in ("integrator", "substeps", "theta")})
         value = measure(finer).returns.median().item()
         share = kept(evaluation.returns.median().item(), value)
         found["finer"] = {"substeps": substeps, "return": value, "kept": share}
         warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-        name = "mujoco" if args.integrator == "mujoco" else "explicit"
-        print(f"{name} with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
+        print(f"{finer.integrator} with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
     write_evaluation(args, evaluation, state["iteration"], **found)
 
 
