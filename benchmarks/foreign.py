@@ -9,7 +9,6 @@ The robots fly: contact, limits and dry friction are constraints in MuJoCo, and 
 from __future__ import annotations
 
 import copy
-import dataclasses
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,10 +64,9 @@ def random_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[n
 def difference(scene: Scene, count: int) -> float:
     """Largest error of an acceleration, relative to the largest one of its state."""
     m = copy.copy(scene.mj_model)
-    m.dof_frictionloss[:] = 0
     m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     states = random_states(scene, count, np.random.default_rng(1))
-    scene = dataclasses.replace(scene, mj_model=m).without("contact", "limit")
+    scene = load_scene(m)
     sim = Simulator(scene, count, Integration(substeps=1), control_dt=STEP, dtype=torch.float64)
     qpos, qvel, ctrl = (torch.tensor(x) for x in states)
     with torch.no_grad():

@@ -14,6 +14,7 @@ A machine that does something else meanwhile gives wrong numbers.
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import json
 import os
@@ -171,7 +172,8 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
     if "muscle" in whole.features:
-        scenes = {"muscles": whole, "no muscles": whole.without("muscle")}
+        none = {name: getattr(whole, name)[:0] for name in ("segment_link", "segment_position", "segment_muscle")}
+        scenes = {"muscles": whole, "no muscles": dataclasses.replace(whole, **none)}
     if name == "hopper":
         scenes["rough ground"] = whole.with_terrain(rough(0))
     kernels = [kernel for kernel in args.kernels if args.device == "cpu" or kernel != "scalar"]

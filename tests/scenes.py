@@ -6,6 +6,7 @@ import dataclasses
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import reference
@@ -423,6 +424,22 @@ def raise_ground(scene: Scene, qpos: Array) -> Scene:
     depths = np.sort(np.concatenate([reference.contacts(scene, q, rest)[0] for q in qpos]))
     third = len(depths) // 3
     return dataclasses.replace(scene, ground_height=scene.ground_height + depths[third : third + 2].mean())
+
+
+def without(scene: Scene, *features: str) -> Scene:
+    """A copy that lacks them, hence with smaller kernels."""
+    still, free = np.zeros(scene.nlink), np.full(scene.nlink, np.inf)
+    points = "contact_link", "contact_position", "contact_radius"
+    segments = "segment_link", "segment_position", "segment_muscle"
+    gone: dict[str, dict[str, Any]] = {
+        "contact": {name: getattr(scene, name)[:0] for name in points},
+        "limit": {"lower": -free, "upper": free},
+        "stiffness": {"stiffness": still},
+        "damping": {"damping": still},
+        "muscle": {name: getattr(scene, name)[:0] for name in segments},
+        "drag": {"density": 0.0, "viscosity": 0.0},
+    }
+    return dataclasses.replace(scene, **{name: x for feature in features for name, x in gone[feature].items()})
 
 
 def without_ground(scene: Scene) -> Scene:

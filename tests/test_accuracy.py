@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import BALL, HINGE, OSCILLATOR, SOFT, acting_states, leg_scene, parse, run, task_scene
+from scenes import BALL, HINGE, OSCILLATOR, SOFT, acting_states, leg_scene, parse, run, task_scene, without
 from warp._src.context import ModuleBuilder
 
 import diffsim
@@ -347,7 +347,7 @@ def test_kernels_hold_the_code_of_the_features_and_no_other(name):
 
 
 def test_kernels_without_features_hold_nothing_of_them():
-    text = source(task_scene("hopper").without("contact", "limit", "damping"))
+    text = source(without(task_scene("hopper"), "contact", "limit", "damping"))
     assert not re.search(
         "|".join(CODE[f] for f in ("contact", "limit", "stiffness", "damping", "muscle", "floating")), text
     )
@@ -358,7 +358,7 @@ def test_kernels_without_features_hold_nothing_of_them():
 def test_a_feature_that_is_left_out_changes_nothing_where_it_did_nothing(integrator, rng):
     """A hopper in the air, within its limits, undamped: the smaller kernels give the same values and gradients."""
     full = dataclasses.replace(task_scene("hopper"), damping=1e-300 * task_scene("hopper").damping)
-    bare = full.without("contact", "limit", "damping")
+    bare = without(full, "contact", "limit", "damping")
     qpos, qvel, ctrl = acting_states(full, 4, rng)
     qpos[:, 1], qpos[:, 3:] = 100.0, (full.lower[4:] + full.upper[4:]) / 2
     results = []

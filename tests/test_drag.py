@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import reference
 import torch
-from scenes import acceleration, free_states, parse, run
+from scenes import acceleration, free_states, parse, run, without
 from test_gradient import check_gradients
 
 from diffsim.sim.integration import Integration
@@ -83,4 +83,4 @@ def test_gradient_at_rest_is_the_viscous_one(rng):
 
 def test_no_fluid_no_kernel_code():
     scene = parse(FISH)
-    assert "drag" in scene.features and "drag" not in scene.without("drag").features
+    assert "drag" in scene.features and "drag" not in without(scene, "drag").features

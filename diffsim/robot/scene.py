@@ -260,26 +260,6 @@ class Scene:
             raise TerrainError(f"{self.name} touches no ground, so it has no terrain")
         return dataclasses.replace(self, terrain=_check_terrain(vertices), ground_height=0.0)
 
-    def without(self, *features: str) -> Scene:
-        """A copy without "contact", "limit", "stiffness", "damping", "muscle" or "drag"; else raises ValueError."""
-        n = self.nlink
-        points = "contact_link", "contact_position", "contact_radius"
-        segments = "segment_link", "segment_position", "segment_muscle"
-        gone: dict[str, dict[str, Any]] = {
-            "contact": {name: getattr(self, name)[:0] for name in points},
-            "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
-            "stiffness": {"stiffness": np.zeros(n), "servo_stiffness": np.zeros(n)},
-            "damping": {"damping": np.zeros(n), "servo_damping": np.zeros(n)},
-            "muscle": {name: getattr(self, name)[:0] for name in segments},
-            "drag": {"density": 0.0, "viscosity": 0.0},
-        }
-        changes: dict[str, Any] = {}
-        for feature in features:
-            if feature not in gone:
-                raise ValueError(f"cannot leave out {feature!r}; choose from {', '.join(gone)}")
-            changes |= gone[feature]
-        return dataclasses.replace(self, **changes)
-
 
 def _check_terrain(vertices: ArrayLike) -> Array:
     """(M, K, 2) float64, M = 1 of a single profile; raises ValueError as Scene.with_terrain does."""

@@ -18,6 +18,7 @@ from scenes import (
     task_scene,
     tendon,
     tree_scene,
+    without,
 )
 
 
@@ -243,7 +244,7 @@ def test_muscles():
     np.testing.assert_array_equal(scene.segment_muscle, [0, 1, 3, 4, 1, 3, 4, 4])
     np.testing.assert_allclose(scene.segment_position[3], [[0.05, 0.1, 0.05], [-0.03, 0, -0.05]])
     assert {"muscle", "ball"} < scene.features
-    bare = scene.without("muscle")
+    bare = without(scene, "muscle")
     assert bare.features == scene.features - {"muscle"} and bare.nu == 5
 
 
