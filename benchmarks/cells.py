@@ -1,7 +1,7 @@
 """Trainings by the scripts, each in a folder of its own: what was interrupted goes on, what has finished is kept.
 
-All is read from the files that the scripts write. Learners, scripts with flags, and the returns to compare are in
-cases.json.
+A cell is a machine, a learner (a script with flags), a task and a seed; it becomes a row of cells.csv. Learners,
+groups of cells and the returns to compare are in cases.json.
 """
 
 from __future__ import annotations
@@ -18,13 +18,16 @@ from statistics import mean, pstdev
 from typing import Any, NamedTuple
 
 import common
+import fingerprints
 import numpy as np
+import tables
 from common import Line, Panel, plot
-from tables import ROOT
+from groups import Cells
+from tables import ROOT, read_csv
 
 import diffsim
 from diffsim.sim.launcher import available_cores
-from diffsim.training import checkpoint
+from diffsim.training import checkpoint, fail
 from diffsim.training.evaluation import FINER
 
 COLUMNS = ("iteration", "control_steps", "seconds", "return")  # of progress.csv, which a curve has
@@ -42,6 +45,21 @@ class Returns(NamedTuple):
 CASES = json.loads(Path(__file__).with_name("cases.json").read_text())
 RETURNS = {name: Returns(**case) for name, case in CASES["returns"].items()}
 LEARNERS: dict[str, str] = CASES["learners"]  # script and flags
+
+
+class Group(NamedTuple):
+    machine: str  # the folder of results/ and runs/paper/
+    learners: Sequence[str]
+    tasks: Sequence[str]
+    seeds: int
+    page: str = "experiments.md"
+    timed: bool = True  # or its cells may share their machine, and have no seconds
+    picture: bool = False  # of the curves, under the group's name
+    ratios: bool = False  # the table has these of its two learners' best returns
+    older: bool = False  # its results are in the csv files that the page names, measured before there were cells
+
+
+GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
 
 
 @dataclass
@@ -111,6 +129,68 @@ class Runner:
         return process.returncode == 0
 
 
+class Cell(NamedTuple):
+    machine: str
+    learner: str
+    task: str
+    seed: int
+
+    def case(self, runs: Path) -> Case:
+        folder = runs / self.machine / self.learner / f"{self.task}__{self.seed}"
+        script, *flags = LEARNERS[self.learner].split()
+        return Case(folder, self.task, self.seed, script, (*flags,))
+
+    @property
+    def groups(self) -> list[Group]:
+        return [
+            group
+            for group in GROUPS.values()
+            if self.machine == group.machine
+            and self.learner in group.learners
+            and self.task in group.tasks
+            and self.seed <= group.seeds
+        ]
+
+    @property
+    def timed(self) -> bool:
+        return any(group.timed for group in self.groups)
+
+    @property
+    def command(self) -> str:
+        _, task, seed, script, flags = self.case(Path())
+        device = "cpu" if self.machine == "cpu" else "cuda"
+        return " ".join((f"python {script}.py --env {task} --seed {seed} --device {device}", *flags))
+
+
+def begin(runner: Runner, cell: Cell, case: Case) -> dict[str, object]:
+    """What cell.json says of a training, new or begun. A revision that is not recorded is refused."""
+    path, revision = case.folder / "cell.json", tables.revision()
+    if tables.unknown(f"; ; {revision}"):
+        fail(f"a cell is of a commit, not of {revision}")
+    if unrecorded := fingerprints.open_end():
+        fail(unrecorded)
+    begun = json.loads(path.read_text()) if path.is_file() else {}
+    if begun and not same_numbers(begun["revision"], cell.learner, cell.task):
+        fail(f"{case.folder} was begun at {begun['revision']}: remove it")
+    if not begun:
+        case.folder.mkdir(parents=True, exist_ok=True)
+        trained_on = tables.origin(runner.args.device).removeprefix("# ").partition("; ")[0]
+        path.write_text(json.dumps(begun := {"revision": revision, "trained on": trained_on}))
+    return begun
+
+
+def train(runner: Runner, cell: Cell) -> bool:
+    """To the end; whether it got there."""
+    case = cell.case(runner.args.runs)
+    begun = begin(runner, cell, case)
+    fresh, start = not (case.folder / "progress.csv").is_file(), time.monotonic()
+    if not runner.train(case):
+        return False
+    if fresh and "--eval-every" not in runner.args.arguments:  # trained in one go, with all evaluations
+        (case.folder / "cell.json").write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
+    return True
+
+
 def checked(env: str, how: Mapping[str, Any]) -> tuple[int, int]:
     """Substeps of which the finer evaluations take multiples: a run's own, and the task's on that contact."""
     return how["substeps"], diffsim.TASKS[env].integration("default", how.get("contact", "soft")).substeps
@@ -146,6 +226,55 @@ def timed(runs: Sequence[Curve]) -> list[Curve]:
 
 def spread(values: Sequence[float]) -> str:
     return f"{mean(values):.0f} ± {pstdev(values):.0f}" if len(values) > 1 else f"{values[0]:.0f}"
+
+
+# Results --------------------------------------------------------------------------------------------------------------
+
+
+def same_numbers(revision: str, learner: str, task: str) -> bool:
+    """Whether a training there is one of today."""
+    return fingerprints.counts(revision, f"{LEARNERS[learner]} --env {task}")
+
+
+def counts(row: Cells, timed: bool) -> bool:
+    """Whether a cell's line is one of today, and has its seconds, if it is to be timed."""
+    return same_numbers(row["revision"], row["learner"], row["task"]) and (not timed or bool(row["training (s)"]))
+
+
+class Pace(NamedTuple):
+    """Of a training that has its machine alone."""
+
+    start: float  # s, what the first iterations take longer than the others
+    iteration: float  # s
+
+    def seconds(self, iterations: float) -> float:
+        return self.start + self.iteration * iterations
+
+
+def paces(directory: Path) -> dict[tuple[str, str], Pace]:
+    """By learner and task."""
+    rows = (
+        row for row in read_csv(directory / "pace.csv") if same_numbers(row["revision"], row["learner"], row["task"])
+    )
+    return {(row["learner"], row["task"]): Pace(*(float(row[f"{x} (s)"]) for x in Pace._fields)) for row in rows}
+
+
+def read_cells(directory: Path) -> list[Cells]:
+    """A machine's cells. One that has no seconds gets those of its pace, if that was measured."""
+    rows, known = read_csv(directory / "cells.csv"), paces(directory)
+    for row in rows:
+        if (pace := known.get((row["learner"], row["task"]))) and not row["training (s)"]:
+            row["training (s)"] = str(pace.seconds(float(row["iterations"])))
+            each = float(row["control steps"]) / float(row["iterations"])
+            for name in [name for name in row if name.startswith("control_steps to") and row[name]]:
+                passed = pace.seconds(float(row[name]) / each)
+                row[name.replace("control_steps", "seconds")] = str(passed)
+    return rows
+
+
+def done(rows: Sequence[Cells], cell: Cell) -> bool:
+    own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
+    return any(counts(row, cell.timed) for row in own)
 
 
 def draw(path: Path, learners: Sequence[str], tasks: Sequence[str], of: Callable[[str, str], list[Curve]]) -> None:

@@ -21,7 +21,6 @@ from tempfile import TemporaryDirectory
 
 import common
 import tables
-from cells import LEARNERS
 from tables import ROOT
 
 from diffsim.training import fail
@@ -65,7 +64,7 @@ state = torch.load(f"{sys.argv[-1]}/checkpoint.pt", map_location="cpu", weights_
 print(hashlib.sha256(b"".join(w.numpy().tobytes() for w in state["policy"]["weights"].values())).hexdigest()[:12])
 """  # in the process of the checkout, which knows what its checkpoint holds
 COLUMNS = ("revision", "parent", "machine", "equal", "differ", "reason", "sentinels")
-KEEPS, BREAKS = "within:", "beyond:"  # verdicts on a sentinel
+KEEPS, BREAKS = "within", "beyond"  # verdicts on a sentinel: of the published range
 
 
 def depends(command: str) -> set[str]:
@@ -162,8 +161,8 @@ def same_files(revision: str, other: str, script: str = "") -> bool:
 
 def keeps(link: Mapping[str, str], name: str) -> bool:
     """Whether results of a link's parent that depend on a fingerprint are results of its revision, too."""
-    told = [words.split() for words in filter(None, link["sentinels"].split("; "))]
-    verdicts = {verdict for learner, task, verdict, *_ in told if name in depends(f"{LEARNERS[learner]} --env {task}")}
+    told = (words.partition(":")[0].rpartition(" ") for words in filter(None, link["sentinels"].split("; ")))
+    verdicts = {verdict for command, _, verdict in told if name in depends(command)}
     return name in link["equal"].split() or bool(link["reason"]) and verdicts == {KEEPS}
 
 

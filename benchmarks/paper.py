@@ -19,13 +19,11 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
-from typing import NamedTuple
 
 import common
 import fingerprints
@@ -33,96 +31,39 @@ import numpy as np
 import tables
 import transfer
 from cells import (
-    CASES,
+    GROUPS,
     LEARNERS,
     RETURNS,
-    Case,
+    Cell,
     Curve,
     Runner,
     ScriptFlags,
+    begin,
     checked,
+    counts,
     curve,
+    done,
     draw,
     evaluation,
     finer,
+    paces,
     passing,
+    read_cells,
     spread,
+    train,
 )
 from common import LEARNT, TASKS, Tasks, check_names, load_case, run
 from groups import Cells, grouped, middle, numbers
 from tables import ROOT, Row, markdown, read_csv
 
 import diffsim
-from diffsim.training import Natural, checkpoint, fail
+from diffsim.training import Natural, checkpoint
 from diffsim.training.evaluation import kept
 
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 SENTINELS = 3  # cells, each with as many seeds
 UNTIMED = ("task", "learner", "return", "in the reference", "target", "steps to target")
-
-
-class Group(NamedTuple):
-    machine: str  # the folder of results/ and runs/paper/
-    learners: Sequence[str]
-    tasks: Sequence[str]
-    seeds: int
-    page: str = "experiments.md"
-    timed: bool = True  # or its cells may share their machine, and have no seconds
-    picture: bool = False  # of the curves, under the group's name
-    ratios: bool = False  # the table has these of its two learners' best returns
-    older: bool = False  # its results are in the csv files that the page names, measured before there were cells
-
-
-GROUPS = {name: Group(**case) for name, case in CASES["paper"]["groups"].items()}
-
-
-class Pace(NamedTuple):
-    """Of a training that has its machine alone."""
-
-    start: float  # s, what the first iterations take longer than the others
-    iteration: float  # s
-
-    def seconds(self, iterations: float) -> float:
-        return self.start + self.iteration * iterations
-
-
-class Cell(NamedTuple):
-    machine: str
-    learner: str
-    task: str
-    seed: int
-
-    def case(self, runs: Path) -> Case:
-        folder = runs / self.machine / self.learner / f"{self.task}__{self.seed}"
-        script, *flags = LEARNERS[self.learner].split()
-        return Case(folder, self.task, self.seed, script, (*flags,))
-
-    @property
-    def groups(self) -> list[Group]:
-        return [
-            group
-            for group in GROUPS.values()
-            if self.machine == group.machine
-            and self.learner in group.learners
-            and self.task in group.tasks
-            and self.seed <= group.seeds
-        ]
-
-    @property
-    def timed(self) -> bool:
-        return any(group.timed for group in self.groups)
-
-    @property
-    def command(self) -> str:
-        _, task, seed, script, flags = self.case(Path())
-        device = "cpu" if self.machine == "cpu" else "cuda"
-        return " ".join((f"python {script}.py --env {task} --seed {seed} --device {device}", *flags))
-
-
-def same_numbers(revision: str, learner: str, task: str) -> bool:
-    """Whether a training there is one of today."""
-    return fingerprints.counts(revision, f"{LEARNERS[learner]} --env {task}")
 
 
 @dataclass
@@ -166,66 +107,6 @@ def cells(args: Args) -> Iterator[Cell]:
         if task in args.env and seed in (args.seeds or [seed]) and learner in (args.learners or [learner])
     }
     return (cell for _, cell in sorted(found, key=lambda each: each[0]))
-
-
-def counts(row: Cells, timed: bool) -> bool:
-    """Whether a cell's line is one of today, and has its seconds, if it is to be timed."""
-    return same_numbers(row["revision"], row["learner"], row["task"]) and (not timed or bool(row["training (s)"]))
-
-
-def paces(directory: Path) -> dict[tuple[str, str], Pace]:
-    """By learner and task."""
-    rows = (
-        row for row in read_csv(directory / "pace.csv") if same_numbers(row["revision"], row["learner"], row["task"])
-    )
-    return {(row["learner"], row["task"]): Pace(*(float(row[f"{x} (s)"]) for x in Pace._fields)) for row in rows}
-
-
-def read_cells(directory: Path) -> list[Cells]:
-    """A machine's cells. One that has no seconds gets those of its pace, if that was measured."""
-    rows, known = read_csv(directory / "cells.csv"), paces(directory)
-    for row in rows:
-        if (pace := known.get((row["learner"], row["task"]))) and not row["training (s)"]:
-            row["training (s)"] = str(pace.seconds(float(row["iterations"])))
-            each = float(row["control steps"]) / float(row["iterations"])
-            for name in [name for name in row if name.startswith("control_steps to") and row[name]]:
-                passed = pace.seconds(float(row[name]) / each)
-                row[name.replace("control_steps", "seconds")] = str(passed)
-    return rows
-
-
-def done(rows: Sequence[Cells], cell: Cell) -> bool:
-    own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
-    return any(counts(row, cell.timed) for row in own)
-
-
-def begin(runner: Runner, cell: Cell, case: Case) -> dict[str, object]:
-    """What cell.json says of a training, new or begun. A revision that is not recorded is refused."""
-    path, revision = case.folder / "cell.json", tables.revision()
-    if tables.unknown(f"; ; {revision}"):
-        fail(f"a cell is of a commit, not of {revision}")
-    if unrecorded := fingerprints.open_end():
-        fail(unrecorded)
-    begun = json.loads(path.read_text()) if path.is_file() else {}
-    if begun and not same_numbers(begun["revision"], cell.learner, cell.task):
-        fail(f"{case.folder} was begun at {begun['revision']}: remove it")
-    if not begun:
-        case.folder.mkdir(parents=True, exist_ok=True)
-        trained_on = tables.origin(runner.args.device).removeprefix("# ").partition("; ")[0]
-        path.write_text(json.dumps(begun := {"revision": revision, "trained on": trained_on}))
-    return begun
-
-
-def train(runner: Runner, cell: Cell) -> bool:
-    """To the end; whether it got there."""
-    case = cell.case(runner.args.runs)
-    begun = begin(runner, cell, case)
-    fresh, start = not (case.folder / "progress.csv").is_file(), time.monotonic()
-    if not runner.train(case):
-        return False
-    if fresh and "--eval-every" not in runner.args.arguments:  # trained in one go, with all evaluations
-        (case.folder / "cell.json").write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
-    return True
 
 
 def measure_pace(args: Args, runner: Runner, cell: Cell) -> Row:
@@ -411,7 +292,8 @@ def measure_sentinels(args: Args, runner: Runner) -> None:
         known = numbers((row for row in own if row["learner"] == learner), "return")
         found = median(evaluation(case.folder)["return"] for case in cases)
         verdict = fingerprints.KEEPS if min(known) <= found <= max(known) else fingerprints.BREAKS
-        verdicts.append(f"{learner} {task} {verdict} {found:.0f} in {min(known):.0f} to {max(known):.0f}")
+        told = f"{verdict}: {found:.0f} in {min(known):.0f} to {max(known):.0f}"
+        verdicts.append(f"{LEARNERS[learner]} --env {task} {told}")
         print(verdicts[-1], flush=True)
     if args.update_results:
         link = link | {"sentinels": "; ".join(verdicts)}

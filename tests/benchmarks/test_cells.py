@@ -27,7 +27,7 @@ def test_policies_are_compared_within_the_control_steps_that_all_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At 3,000 steps, where a Gaussian run ends: 30 and 60 of the first learner, 15 and 30 of the second."""
-    group = paper.Group("h200", ("a", "b"), ("ant", "hopper"), 2, timed=False, ratios=True)
+    group = cells.Group("h200", ("a", "b"), ("ant", "hopper"), 2, timed=False, ratios=True)
     monkeypatch.setitem(paper.GROUPS, "both", group)
     rows = [*points("a", 1, 1.0, 50), *points("a", 2, 2.0, 50), *points("b", 1, 0.5, 50), *points("b", 2, 1.0, 31)]
     rows += [*points("a", 1, 9.0, 50, "hopper"), *points("a", 2, 9.0, 50, "hopper"), *points("b", 1, 9.0, 50, "hopper")]

@@ -68,7 +68,7 @@ def test_a_result_counts_while_each_link_keeps_what_it_depends_on(
         "c",
         differ="ant",
         reason="a better ant",
-        sentinels="shac ant within: 5 in 4 to 6; sapo ant beyond: 3 in 4 to 6",
+        sentinels="shac --env ant within: 5 in 4 to 6; sapo --env ant beyond: 3 in 4 to 6",
     )
     assert not counts("a", "shac --env ant")
     made[1] = link(
@@ -76,7 +76,7 @@ def test_a_result_counts_while_each_link_keeps_what_it_depends_on(
         "c",
         differ="ant",
         reason="a better ant",
-        sentinels="shac ant within: 5 in 4 to 6; sapo hopper beyond: 3 in 4 to 6",
+        sentinels="shac --env ant within: 5 in 4 to 6; sapo --env hopper beyond: 3 in 4 to 6",
     )
     assert counts("a", "shac --env ant")
     made[1] = link("b", "c") | {"equal": "shac"}  # the ant was not compared

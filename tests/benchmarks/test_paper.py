@@ -16,7 +16,7 @@ import tables
 from cells import Runner
 from learners import refusal
 
-LINK = {"revision": "HEAD", "parent": "HEAD", "equal": " ".join(fingerprints.CASES), "differ": "", "reason": ""}
+LINK = dict(revision="HEAD", parent="HEAD", equal=" ".join(fingerprints.CASES), differ="", reason="", sentinels="")
 SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100", falls="0", kept="0.99", speed="4")
 
 
@@ -24,9 +24,9 @@ SAPO = dict(learner="sapo", task="hopper", revision="aaaaaaa", iterations="1100"
 def known(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
     """The lines of the H200's cells.csv; the code is that of aaaaaaa."""
     rows = list[dict[str, str]]()
-    monkeypatch.setattr(paper, "read_csv", lambda path: rows if path.parts[-2:] == ("h200", "cells.csv") else [])
+    monkeypatch.setattr("cells.read_csv", lambda path: rows if path.parts[-2:] == ("h200", "cells.csv") else [])
     monkeypatch.setattr(fingerprints, "open_end", str)
-    monkeypatch.setattr(paper, "same_numbers", lambda revision, learner, task: revision == "aaaaaaa")
+    monkeypatch.setattr("cells.same_numbers", lambda revision, learner, task: revision == "aaaaaaa")
     for seed, value in enumerate((5000.0, 5100.0, 4800.0, 5300.0, 5200.0), start=1):
         row = SAPO | {"seed": str(seed), "return": f"{value}", "training (s)": f"{60 + seed}", "falls": f"{seed / 100}"}
         row["trained on"] = "NVIDIA H200"
@@ -75,7 +75,7 @@ def test_a_cell_that_shared_its_gpu_has_the_seconds_of_the_pace(
     known[3] |= shared
     known[4] |= shared | {"control_steps to 3000": "inf"}
     files = {"cells.csv": known, "pace.csv": [pace]}
-    monkeypatch.setattr(paper, "read_csv", lambda path: files[path.name] if path.parts[-2] == "h200" else [])
+    monkeypatch.setattr("cells.read_csv", lambda path: files[path.name] if path.parts[-2] == "h200" else [])
     rows = paper.read_cells(Path("h200"))
     assert [float(row["training (s)"]) for row in rows] == pytest.approx([61, 62, 63, 56.5, 56.5])
     assert [float(row["seconds to 3000"]) for row in rows] == pytest.approx([math.inf, math.inf, 9, 11.5, math.inf])
