@@ -26,7 +26,6 @@ from diffsim.training import ClippedAdam, Ensemble, Run, distributed, evaluate, 
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Positive, Repeats, SomeWidths
-from diffsim.training.regression import Regression
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of ppo_baseline.py, shac.py and sac_baseline.py, so that only the policy differs.
@@ -586,7 +585,6 @@ class SHAC(Learner):
                 nn.init.orthogonal_(layer.weight, math.sqrt(2))
                 nn.init.zeros_(layer.bias)
         self.add_critic(critic)
-        self.regression = Regression(critic, self.critic_optimizer)
         sizes = (env.task.obs_dim,), ()  # normalized s_t; the value's target
         self.samples = [torch.zeros(args.horizon * env.num_envs, *size, device=env.device) for size in sizes]
 
@@ -640,7 +638,9 @@ class SHAC(Learner):
         for _ in range(self.args.epochs):
             rows = []  # of the last pass
             for obs, value in self.minibatches(slice(None)):
-                rows.append({"losses/critic": self.regression.step(obs, value)})
+                loss = F.mse_loss(self.critic(obs).squeeze(-1), value)
+                self.critic_optimizer.step(loss)
+                rows.append({"losses/critic": loss.detach()})
         self.follow()
         return self.end_iteration(rows)
 

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, ObsNormalizer, Regression, Run, evaluate, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
@@ -175,7 +176,6 @@ class SHAC:
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
         self.critic_optimizer = ClippedAdam(self.critic, args.max_grad_norm, args.betas)
-        self.regression = Regression(self.critic, self.critic_optimizer)  # of values on observations
         self.obs = torch.zeros(args.horizon * env.num_envs, obs_dim, device=env.device)  # the critic's samples
         self.value = torch.zeros(args.horizon * env.num_envs, device=env.device)
 
@@ -206,7 +206,9 @@ class SHAC:
             losses = []
             batches = self.obs.chunk(args.critic_minibatches), self.value.chunk(args.critic_minibatches)
             for obs, value in zip(*batches, strict=True):
-                losses.append(self.regression.step(obs, value))
+                loss = F.mse_loss(self.critic(obs).squeeze(-1), value)
+                self.critic_optimizer.step(loss)
+                losses.append(loss.detach())
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
         skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped

@@ -26,6 +26,5 @@ from diffsim.training.ranges import (
     SomeWidths,
     Widths,
 )
-from diffsim.training.regression import Regression
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run

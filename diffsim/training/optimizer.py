@@ -60,11 +60,7 @@ class ClippedAdam:
 
     def step(self, loss: Tensor) -> Tensor:
         """One descent step; returns the gradient's norm () before clipping."""
-        return self.descend(self.flatten(torch.autograd.grad(loss, self.parameters)))
-
-    def descend(self, gradient: Tensor) -> Tensor:
-        """`step` along a gradient of the form of `vector`, which becomes the mean of all ranks'."""
-        gradient = distributed.average(gradient)
+        gradient = distributed.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
         norm = torch.linalg.vector_norm(gradient)
         good = norm < self.skip_norm
         bad = (~good).to(norm.dtype)
