@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium
 import torch
-from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
 from diffsim import startup
@@ -111,10 +110,8 @@ def _make_one(name: str, **arguments: Any) -> NumpyEnv:
     return NumpyEnv(make(name, num_envs=1, horizon=1, **arguments))
 
 
-def _make_numpy(
-    name: str, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, **arguments: Any
-) -> NumpyVectorEnv:
-    return NumpyVectorEnv(make(name, num_envs, horizon=1, **arguments), autoreset_mode)
+def _make_numpy(name: str, num_envs: int, **arguments: Any) -> NumpyVectorEnv:
+    return NumpyVectorEnv(make(name, num_envs, horizon=1, **arguments))
 
 
 # Two ids of each task: gymnasium.make makes the same environment of both, gymnasium.make_vec one on tensors and one in

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterable, Mapping
 from numbers import Integral
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim.robot.scene import Scene
@@ -20,8 +23,12 @@ from diffsim.sim.options import Options
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
 from diffsim.terrain import Elevation
-from diffsim.view.screen import RENDER_MODES, Frames, RenderMode, Screen
 
+RenderMode = Literal["rgb_array", "human"]
+Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
+# What works here, as tools try whatever an environment declares: a window needs a display.
+DISPLAY = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+RENDER_MODES = ["rgb_array", "human"] if DISPLAY else ["rgb_array"]
 STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_statistics
 
 
@@ -66,10 +73,6 @@ class DiffEnv(VectorEnv):
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": RENDER_MODES}
-    qpos: Tensor
-    qvel: Tensor
-    memory: Tensor
-    _obs: Tensor
 
     def __init__(
         self,
@@ -93,13 +96,16 @@ class DiffEnv(VectorEnv):
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory)
         check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
         self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
-        self._parts = ("qpos", "qvel", "_obs", *(("memory",) if task.num_memory else ()))  # of the state
         self.control_dt, self.episode_length = task.control_dt, task.episode_length
         if max_episode_steps is not None:
             self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
         self.sim = Simulator(scene, num_envs, control_dt=task.control_dt, horizon=horizon, **asked._asdict())
         self.metadata = self.metadata | {"render_fps": round(1 / task.control_dt)}
-        self._screen = Screen(scene, render_mode, 1 / task.control_dt) if render_mode else None
+        self.render_mode, self._screen = render_mode, None
+        if render_mode:  # otherwise no picture is loaded
+            from diffsim.view.screen import Screen
+
+            self._screen = Screen(scene, render_mode, 1 / task.control_dt)
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
         self._elevation = None if scene.terrain is None else Elevation(scene, self.device, self.dtype)
         real = np.float32 if self.dtype == torch.float32 else np.float64
@@ -117,9 +123,9 @@ class DiffEnv(VectorEnv):
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
-        self.memory = torch.zeros(num_envs, task.num_memory, dtype=self.dtype, device=self.device)
-        self._restart()
-        self.render_mode = render_mode
+        self.qpos, self.qvel, self._obs, self.memory = (start[0] for start in self._draw(1))
+        self._recorded = 0  # differentiable steps since the window began
+        self._starts, self._time = self._draw(horizon), 0  # of the window: one batch of operations, not one per step
 
     @property
     def np_random_seed(self) -> int:
@@ -136,14 +142,15 @@ class DiffEnv(VectorEnv):
             ValueError: several seeds, as one generator draws all start states; a mask of another shape or dtype;
                 unknown options.
         """
-        rows = self.masked(options)
+        mask = self._mask(options)
         if seed is not None:
             self.generator.manual_seed(check_seed(seed))
-        if options and "reset_mask" in options:
-            self.begin(rows, self._uniform(len(rows), self.task.num_random))
-            self._draw_starts()
-        else:
-            self._restart()
+        if mask is None:
+            self._cut()
+            mask = torch.ones_like(self.episode_step, dtype=torch.bool)
+        self._begin(mask, (start[0] for start in self._draw(1)))
+        self._starts, self._time = self._draw(self.horizon), 0
+        self._show()
         return self._obs, {}
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -164,16 +171,13 @@ class DiffEnv(VectorEnv):
         """
         _, reward, terminated, truncated, info = self.advance(action)
         if self._time == self.horizon:
-            self._draw_starts()
-        row, starts = info["_final_obs"].unsqueeze(1), (start[self._time] for start in self._starts)
-        self._put(torch.where(row, start, end) for start, end in zip(starts, self._state(), strict=True))
+            self._starts, self._time = self._draw(self.horizon), 0
+        self._begin(info["_final_obs"], (start[self._time] for start in self._starts))
         self._time += 1
-        self.episode_step.masked_fill_(info["_final_obs"], 0)
-        self._episode_return.masked_fill_(info["_final_obs"], 0.0)
         return self._obs, reward, terminated, truncated, info
 
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """`step` without the reset: obs is info["final_obs"], and what has ended waits for `begin`."""
+        """`step` without the reset: obs is info["final_obs"], and what has ended waits for `reset`."""
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action.detach()).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
@@ -209,36 +213,24 @@ class DiffEnv(VectorEnv):
         info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
         return obs, reward, terminated, truncated, info
 
-    def begin(self, rows: Tensor, rand: Tensor) -> Tensor:
-        """Start new episodes in some environments; gradients of the others stay as they are.
+    def _begin(self, mask: Tensor, starts: Iterable[Tensor]) -> None:
+        """Start new episodes in the environments of a mask (N,); gradients of the others stay as they are."""
+        row = mask.unsqueeze(1)
+        self._put(torch.where(row, start, now) for start, now in zip(starts, self._state(), strict=True))
+        self.episode_step.masked_fill_(mask, 0)
+        self._episode_return.masked_fill_(mask, 0.0)
 
-        Args:
-            rows: (k,) int64, which ones.
-            rand: (k, num_random) uniform in [0, 1), what Task.reset makes their start states of.
-
-        Returns:
-            obs (N, obs_dim) of all environments.
-        """
-        starts = self._start_states(rand, rows)
-        self._put(whole.index_copy(0, rows, part) for whole, part in zip(self._state(), starts, strict=True))
-        self.episode_step.index_fill_(0, rows, 0)
-        self._episode_return.index_fill_(0, rows, 0.0)
-        self._show()
-        return self._obs
-
-    def masked(self, options: dict[str, Any] | None) -> Tensor:
-        """(k,) int64, the environments that reset's options ask for, or all; raises ValueError for other options."""
-        options = {} if options is None else options
-        if not isinstance(options, Mapping) or options.keys() - {"reset_mask"}:
+    def _mask(self, options: dict[str, Any] | None) -> Tensor | None:
+        """The environments that reset's options name, or None for all; raises ValueError for other options."""
+        if options is None or options == {}:
+            return None
+        if not isinstance(options, Mapping) or options.keys() != {"reset_mask"}:
             raise ValueError(f"options are {options!r}, must be a dictionary of reset_mask alone")
-        everyone = np.ones(self.num_envs, dtype=np.bool_)
-        try:
-            mask = torch.as_tensor(options.get("reset_mask", everyone))
-        except (TypeError, RuntimeError) as error:  # torch's for None and for what is no array
-            raise ValueError(f"reset_mask is {options['reset_mask']!r}, must be bool ({self.num_envs},)") from error
+        mask = options["reset_mask"]
+        mask = torch.as_tensor(mask) if isinstance(mask, np.ndarray | Tensor) else torch.empty(0)
         if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
-            raise ValueError(f"reset_mask is {mask.dtype} {tuple(mask.shape)}, must be bool ({self.num_envs},)")
-        return mask.nonzero().flatten().to(self.device)
+            raise ValueError(f"reset_mask must be an array or a tensor, bool ({self.num_envs},)")
+        return mask.to(self.device)
 
     def render(self) -> Frames | None:
         """A frame (height, width, 3) of each environment in render_mode "rgb_array"; None in "human".
@@ -256,14 +248,17 @@ class DiffEnv(VectorEnv):
 
     def detach(self) -> Tensor:
         """Cut the graph at the current state, start a new window there, and return its observation (N, obs_dim)."""
+        self._cut()
+        self._starts, self._time = self._draw(self.horizon), 0
+        return self._obs
+
+    def _cut(self) -> None:
         self._put(part.detach() for part in self._state())
         self._recorded = 0
         self.sim.rewind()
-        self._draw_starts()
-        return self._obs
 
     def pin(self) -> tuple[Tensor, ...]:
-        """Move the state into memory of its own, where a captured window can start again and again; see graph.py."""
+        """Copy the state into fixed buffers, from which a CUDA graph replays the window; see graph.py."""
         self._put(part.detach().clone() for part in self._state())
         return self._state()
 
@@ -274,12 +269,11 @@ class DiffEnv(VectorEnv):
                 to.copy_(value)
         self._put(start)
 
-    def _state(self) -> tuple[Tensor, ...]:
-        return tuple(getattr(self, name) for name in self._parts)
+    def _state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.qpos, self.qvel, self._obs, self.memory
 
     def _put(self, state: Iterable[Tensor]) -> None:
-        for name, value in zip(self._parts, state, strict=True):
-            setattr(self, name, value)
+        self.qpos, self.qvel, self._obs, self.memory = state
 
     def take_statistics(self) -> dict[str, Tensor]:
         """What happened since the last call, as () tensors; the device is not waited for.
@@ -321,56 +315,37 @@ class DiffEnv(VectorEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
-        names = *self._parts, "episode_step", "_episode_return"
-        tensors = {name.lstrip("_"): getattr(self, name).detach().clone() for name in names}
+        names = ("qpos", "qvel", "obs", "memory", "episode_step", "episode_return")
+        parts = zip(names, (*self._state(), self.episode_step, self._episode_return), strict=True)
+        tensors = {name: part.detach().clone() for name, part in parts}
         return {"task": self.task.name, **tensors, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a state_dict of the same task, size and dtype (else ValueError); call `detach` next."""
         own = self.state_dict()
-        if not isinstance(state, Mapping) or state.keys() != own.keys():
-            has = ", ".join(state) if isinstance(state, Mapping) else type(state).__name__
-            raise ValueError(f"the state has {has or 'nothing'}; that of an environment has {', '.join(own)}")
+        if state.keys() != own.keys():
+            raise ValueError(f"the state has {', '.join(state)}; that of an environment has {', '.join(own)}")
         theirs, ours = (f"{len(x['qpos'])} x {x['task']} in {x['qpos'].dtype}" for x in (state, own))
         if theirs != ours:
             raise ValueError(f"the state is of {theirs}; this environment is {ours}")
-        for name, value in own.items():
-            if isinstance(value, Tensor) and (state[name].shape, state[name].dtype) != (value.shape, value.dtype):
-                raise ValueError(f"{name} of the state is of another shape or type")
-        self._put(state[name.lstrip("_")].to(self.device) for name in self._parts)
+        self._put(state[name].to(self.device) for name in ("qpos", "qvel", "obs", "memory"))
         self.episode_step.copy_(state["episode_step"])
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
         self._time = self.horizon
 
-    def _restart(self) -> None:
-        self.episode_step.zero_()
-        self._episode_return.zero_()
-        self._recorded = 0  # differentiable steps since the window began
-        self.sim.rewind()
-        self._put(start[0] for start in self._draw(1))
-        self._draw_starts()
-        self._show()
-
-    def _draw_starts(self) -> None:
-        # Start states of a whole window at once: one batch of small operations instead of one per step.
-        self._starts, self._time = self._draw(self.horizon), 0
-
+    @torch.no_grad()
     def _draw(self, steps: int) -> tuple[Tensor, ...]:
-        return self._start_states(self._uniform(steps, self.num_envs, self.task.num_random))
+        """Start states (steps, N, each) of all environments, so many each: qpos, qvel, obs and memory."""
+        rand = self._uniform(steps, self.num_envs, self.task.num_random)
+        if not self.stochastic_init:
+            rand.fill_(0.5)
+        (qpos, qvel), memory = self.task.reset(rand), self.task.begin(rand)
+        obs = self.task.observe_with(qpos, qvel, self._no_action.expand(steps, -1, -1), memory)
+        return qpos if self._elevation is None else self._elevation.lift(qpos), qvel, obs, memory
 
     def _uniform(self, *size: int) -> Tensor:
         return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
-
-    @torch.no_grad()
-    def _start_states(self, rand: Tensor, rows: Tensor | None = None) -> tuple[Tensor, ...]:
-        """qpos, qvel, obs and memory, if any (..., each) of rand (..., num_random)."""
-        if not self.stochastic_init:
-            rand = torch.full_like(rand, 0.5)
-        (qpos, qvel), memory = self.task.reset(rand), self.task.begin(rand)
-        obs = self.task.observe_with(qpos, qvel, self._no_action[0].expand(*rand.shape[:-1], -1), memory)
-        kept = (memory,) if self.task.num_memory else ()
-        return qpos if self._elevation is None else self._elevation.lift(qpos, rows), qvel, obs, *kept
 
     def _show(self) -> None:
         if self.render_mode == "human":

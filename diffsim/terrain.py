@@ -80,33 +80,30 @@ class Elevation:
         slope = np.divide(np.diff(z), run, out=np.zeros_like(run), where=run > 0)  # of a wall nobody asks
         self._profiles = tensor(np.stack([x[:, :-1], z[:, :-1], slope]))  # (3, M, K - 1)
 
-    def height(self, qpos: Tensor, rows: Tensor | None = None) -> Tensor:
+    def height(self, qpos: Tensor) -> Tensor:
         """z (...) [m] of the terrain at the root's x, of qpos (..., nq).
 
-        The dimension before the last of qpos is that of the environments, all or those of rows (k,), unless one
-        terrain serves all.
+        The dimension before the last of qpos is that of the environments, unless one terrain serves all.
         """
-        x, (start, level, slope) = self._below(qpos, rows)
+        x, (start, level, slope) = self._below(qpos)
         return (level + slope * (x - start)).squeeze(-1)
 
     def gradient(self, qpos: Tensor) -> Tensor:
         """(..., nq, nq) by which qpos (..., nq) of the root's `lift` changes beside itself; walls do not count."""
-        return self._below(qpos, None)[1][2].unsqueeze(-1) * torch.outer(self._up, self._along)
+        return self._below(qpos)[1][2].unsqueeze(-1) * torch.outer(self._up, self._along)
 
-    def _below(self, qpos: Tensor, rows: Tensor | None) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def _below(self, qpos: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         """The root's x (..., 1), and (..., 1) each: where the segment below begins, its height there, its slope."""
         profiles = self._profiles
         if profiles.shape[1] == 1:
             profiles = profiles[:, 0]
-        elif rows is not None:
-            profiles = profiles[:, rows]
         x = (self._x0 + qpos @ self._along).unsqueeze(-1)
         segment = ((x >= profiles[0]).sum(-1, keepdim=True) - 1).clamp(min=0)
         return x, tuple(p.expand(*x.shape[:-1], -1).gather(-1, segment) for p in profiles)
 
-    def lift(self, qpos: Tensor, rows: Tensor | None = None) -> Tensor:
+    def lift(self, qpos: Tensor) -> Tensor:
         """World qpos (..., nq) of one over the plane."""
-        return qpos + self.height(qpos, rows).unsqueeze(-1) * self._up
+        return qpos + self.height(qpos).unsqueeze(-1) * self._up
 
     def lower(self, qpos: Tensor) -> Tensor:
         """qpos (..., nq) over the plane of one in the world."""

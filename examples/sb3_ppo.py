@@ -30,7 +30,7 @@ class DiffVecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> NDArray[np.floating[Any]]:
-        obs, _ = self.env.reset(seed=self._seeds)
+        obs, _ = self.env.reset(seed=self._seeds[0])  # one for the batch
         self._reset_seeds()
         return obs
 

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import time
 from collections import deque
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffsim.env import Frames, RenderMode
 from diffsim.robot.scene import Scene
 from diffsim.view import render
-
-RenderMode = Literal["rgb_array", "human"]
-Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
-# What works here, as tools try whatever an environment declares: a window needs a display.
-DISPLAY = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-RENDER_MODES = ["rgb_array", "human"] if DISPLAY else ["rgb_array"]
 
 SPEEDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
 PUSH = 1.0  # m/s that a key gives to the whole robot

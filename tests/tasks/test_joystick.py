@@ -188,7 +188,8 @@ def test_memory_goes_with_the_episode() -> None:
         _, again, _, _, told = twin.step(actions[2])
     torch.testing.assert_close(told["final_obs"], info["final_obs"], rtol=0, atol=1e-12)
     torch.testing.assert_close(again, reward, rtol=0, atol=1e-12)
-    begun = env.begin(torch.tensor([2]), torch.full((1, env.task.num_random), 0.5, dtype=REAL))
+    env.stochastic_init = False
+    begun, _ = env.reset(options={"reset_mask": torch.arange(4) == 2})
     assert (begun[2, 45:48] == 0).all() and torch.equal(begun[:2], obs[:2])  # a command of zero
 
 
