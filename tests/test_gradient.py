@@ -290,3 +290,22 @@ def test_gradcheck_through_policy_reward_and_three_control_steps(name, rng):
     assert torch.autograd.gradcheck(total_reward, policy, eps=1e-6, atol=1e-6, rtol=1e-6)
     (gradient,) = torch.autograd.grad(total_reward(policy), policy)
     assert gradient.norm() > 1e-3
+
+
+def test_a_free_joint_is_three_slides_and_a_ball(rng):
+    """State and gradient; the same numbers in qpos and qvel."""
+    body = """<mujoco><worldbody><body> {}
+      <inertial pos="0.1 0 -0.3" mass="2" diaginertia=".1 .2 .15"/>
+      <body pos="0 0 -0.5">
+        <joint name="knee" axis="1 0 1" damping="0.1"/> <inertial pos="0.1 0 -0.1" mass="1" diaginertia=".1 .2 .1"/>
+      </body>
+    </body></worldbody> <actuator> <motor joint="knee" gear="5"/> </actuator></mujoco>"""
+    slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    free, jointed = parse(body.format("<freejoint/>")), parse(body.format(f'{slides} <joint type="ball"/>'))
+    assert free.floating and not jointed.floating and jointed.nball == 1
+    states, how = free_states(free, 4, rng), {"integration": ONE}
+    for value, expected in zip(run(jointed, *states, **how), run(free, *states, **how), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-10)
+    w = weights(free, rng)
+    for value, expected in zip(*(gradients(scene, states, w, **how) for scene in (jointed, free)), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9)

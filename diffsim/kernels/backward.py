@@ -54,6 +54,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     read, write, pick = block.read, block.write, block.pick
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in spec.features
     NFACTORS, NBODY = len(FACTORS), spec.forced
+    SOME_FACTORS = NFACTORS if VARIED else 1  # nobody reads or writes it where none vary
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
 
     @wp.func
@@ -130,10 +131,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             driven = wp.zeros(shape=SLOTS, dtype=T)
             joint.drive(m, law, lane, n, ctrl, e, driven)
             free = wp.zeros(shape=SLOTS, dtype=T)  # see joint.py
-        if wp.static(VARIED):
-            adj_factors = wp.zeros(shape=NFACTORS, dtype=T)
-        else:
-            adj_factors = u  # nobody reads or writes it there
+        adj_factors = wp.zeros(shape=SOME_FACTORS, dtype=T)
         if wp.static(FORCED):
             adj_forces = wp.zeros(shape=NBODY, dtype=vec6)
         for i in range(1, n):
