@@ -44,7 +44,7 @@ class CommonFlags:
     output: Path | None = None  # directory of csv files (default: runs/benchmarks/cpu or, by the GPU, e.g. .../h100)
     figures: Path | None = None  # directory of the pictures (default: that of the csv files)
     update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
-    draw_only: Annotated[bool, tyro.conf.arg(aliases=["--collect-only"])] = False  # measure nothing, read csv files
+    draw_only: bool = False  # measure nothing, read csv files
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 
 Cells = dict[str, str]
@@ -14,6 +14,12 @@ def grouped(rows: Iterable[Cells], *columns: str) -> dict[tuple[str, ...], list[
     for row in rows:
         groups.setdefault(tuple(row[column] for column in columns), []).append(row)
     return groups
+
+
+def pivot(rows: Iterable[Cells], columns: Sequence[str], name: str, value: str) -> list[Mapping[str, object]]:
+    """A line for each group; its columns have the names in the column `name`, and the values beside them."""
+    groups = grouped(rows, *columns).items()
+    return [dict(zip(columns, key, strict=True)) | {row[name]: row[value] for row in own} for key, own in groups]
 
 
 def numbers(rows: Iterable[Cells], column: str) -> list[float]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -25,7 +25,7 @@ import mujoco
 import numpy as np
 import torch
 from common import Line, Panel, Part, TaskName, lines, measured, plot, run
-from groups import grouped, numbers
+from groups import grouped, numbers, pivot
 from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay
 from tables import Row
 from torch import Tensor
@@ -103,10 +103,8 @@ def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
         yield row | {"largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
 
 
-def fewest_substeps(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task, a column for each integrator."""
-    groups = grouped(rows, "task", "default").items()
-    return [{"task": t, "default": n} | {r["integrator"]: r["fewest substeps"] for r in own} for (t, n), own in groups]
+def fewest_substeps(rows: list[dict[str, str]]) -> Sequence[Row]:
+    return pivot(rows, ("task", "default"), "integrator", "fewest substeps")
 
 
 def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple[float, int]:
@@ -213,14 +211,10 @@ def summary(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
-def growth(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task, explicitly integrated: the gradient's norm over some horizons."""
+def growth(rows: list[dict[str, str]]) -> Sequence[Row]:
+    """Explicitly integrated: the gradient's norm over some horizons."""
     explicit = (row for row in rows if row["integrator"] == "semi_implicit" and int(row["horizon"]) in SHOWN)
-    groups = grouped(explicit, "task", "integrator").items()
-    return [
-        {"task": task, "integrator": kind} | {row["horizon"]: row["gradient"] for row in own}
-        for (task, kind), own in groups
-    ]
+    return pivot(explicit, ("task", "integrator"), "horizon", "gradient")
 
 
 def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
@@ -286,15 +280,11 @@ def measure_energy(args: Args, links: int) -> Iterator[Row]:
             yield row | {"chains": args.states, "not finite": bad}
 
 
-def energies(rows: list[dict[str, str]]) -> list[Row]:
-    """A row for each number of links and substeps, a column for each integrator."""
-
-    def cell(row: dict[str, str]) -> str:
+def energies(rows: list[dict[str, str]]) -> Sequence[Row]:
+    for row in rows:
         lost = f" ({row['not finite']} of {row['chains']} not finite)" if int(row["not finite"]) else ""
-        return row["energy drift"] + lost
-
-    groups = grouped(rows, "links", "substeps").items()
-    return [{"links": n, "substeps": m} | {row["integrator"]: cell(row) for row in own} for (n, m), own in groups]
+        row["energy drift"] += lost
+    return pivot(rows, ("links", "substeps"), "integrator", "energy drift")
 
 
 def draw(args: Args, rows: list[dict[str, str]]) -> None:
