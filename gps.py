@@ -133,6 +133,9 @@ class Args(Flags):
     bound: Positive = 2.0
     """feedback: actions before tanh that are taught are within this"""
 
+    def env_options(self) -> dict[str, Any]:
+        return super().env_options() | {"control_dt": self.control_dt}
+
     def task_defaults(self) -> dict[str, Any]:
         own = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
         return own | {"eval_every": 10, "eval_episodes": 50}

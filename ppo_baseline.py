@@ -188,7 +188,7 @@ class PPO:
         self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
 
     @torch.no_grad()
-    def roll_out(self) -> dict[str, Tensor]:
+    def collect(self) -> dict[str, Tensor]:
         """Act for a rollout, and keep its samples with their advantages and value targets."""
         args, policy, normalizer = self.args, self.actor_critic, self.actor_critic.normalizer
         noise = torch.randn(args.horizon, self.env.num_envs, policy.log_std.numel(), device=self.env.device)
@@ -299,9 +299,9 @@ def train(args: Args) -> None:
     run = Run(args)
     env = run.make_env(args.num_envs, args.horizon)
     ppo = run.restore(PPO(args, env))
-    roll_out, update = run.capture(ppo.roll_out, env), run.capture(ppo.update)
+    collect, update = run.capture(ppo.collect, env), run.capture(ppo.update)
     for _ in run:
-        run.log(roll_out() | update())
+        run.log(collect() | update())
         if run.evaluation_due:
             run.log_evaluation(evaluate(run.eval_env, ppo.policy))
 

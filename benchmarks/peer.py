@@ -130,7 +130,7 @@ def train(args: Args, name: Name) -> Iterator[Row]:
     ppo = training.restore(ppo_baseline.PPO(settings, env))
     update = training.capture(ppo.update)
     for iteration in training:
-        training.log(ppo.roll_out() | update() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
+        training.log(ppo.collect() | update() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
         if training.seconds >= args.seconds:
             training.last = settings.iterations = iteration
     last = read_csv(training.directory / "progress.csv")[-1]

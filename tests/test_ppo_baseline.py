@@ -90,7 +90,7 @@ def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
         return rollouts[-1]
 
     monkeypatch.setattr(ppo, "collect", recorded)
-    learner.roll_out()
+    learner.collect()
     (rollout,) = rollouts
     assert rollout.terminated.any()
     with torch.no_grad():
@@ -185,7 +185,7 @@ def test_symmetric_policies_are_paid(capsys: pytest.CaptureFixture[str]) -> None
     mirror, normalizer = learner.env.task.mirror, learner.actor_critic.normalizer
     normalizer.update(torch.randn(50, 37))
     used = copy.deepcopy(normalizer)
-    learner.roll_out()
+    learner.collect()
     obs = used.inverse(learner.batch.obs)
     torch.testing.assert_close(learner.batch.mirrored, used(mirror.obs(obs)), rtol=1e-4, atol=1e-4)
 

@@ -35,7 +35,7 @@ SCALARS = {
         "time/update_actor time/update_critic"
     ),
     "bptt": "losses/actor time/update",
-    "ppo_baseline": "losses/policy losses/value losses/kl charts/learning_rate charts/std time/roll_out time/update",
+    "ppo_baseline": "losses/policy losses/value losses/kl charts/learning_rate charts/std time/collect time/update",
     "pfpn": (
         "losses/policy losses/value losses/kl charts/learning_rate charts/entropy time/interact time/learn "
         "particles/dead_mean particles/dead_max particles/moved particles/active particles/std"
@@ -187,7 +187,7 @@ def test_nothing_captured_waits_for_the_device(
 
     monkeypatch.setattr(graph, "capture", capture)
     run(script, tmp_path, *small, "--stop-after", 3)
-    names = {"bptt": ["update"], "ppo_baseline": ["roll_out", "update"], "pfpn": ["interact", "learn"]}
+    names = {"bptt": ["update"], "ppo_baseline": ["collect", "update"], "pfpn": ["interact", "learn"]}
     assert captured == names.get(script.__name__, ["update_actor", "update_critic"])
     only_on_the_cpu = 'if self.device.type == "cpu" and bool(torch.isnan(action.detach()).any()):'
     assert set(places) == {f"env.py: {only_on_the_cpu}"}  # seen, so the rest would be seen

@@ -23,7 +23,7 @@ from diffsim.training import checkpoint, gait
 from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
-from diffsim.training.flags import Args, Flags, parse_penalty
+from diffsim.training.flags import Args, Flags
 from diffsim.view import render
 
 L = TypeVar("L", bound=Learner)
@@ -152,12 +152,8 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 
 def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **options: Any) -> DiffEnv:
     """The task as the flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
-    names = "integrator substeps theta passes touchdown contact early_termination clip".split()
-    flags = {name: getattr(args, name) for name in names}
-    flags |= dict(penalty=parse_penalty(args.penalty), threads=args.threads or None)
-    flags["control_dt"] = getattr(args, "control_dt", None)  # a flag of gps.py alone
     try:
-        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **flags | options)
+        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **args.env_options() | options)
     except ValueError as error:
         fail(error)
 

@@ -108,6 +108,12 @@ class Flags(RunFlags):
         """Defaults that depend on other flags, such as the task, the device or the preset."""
         return {}
 
+    def env_options(self) -> dict[str, Any]:
+        """What diffsim.make takes of them."""
+        names = ("integrator", "substeps", "theta", "passes", "touchdown", "contact", "early_termination", "clip")
+        options = {name: getattr(self, name) for name in names}
+        return options | dict(penalty=parse_penalty(self.penalty), threads=self.threads or None)
+
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
         if self.clip and not issubclass(find_task(self.env), HumanoidImitation):

@@ -384,7 +384,7 @@ class Run:
             f"{self.seconds:.1f} s of training"
         )
         if "grad/skipped" in self._scalars:
-            states, gradients = self._totals.values()
+            states, gradients = (self._totals[f"sim/{name}"] for name in TOTALS)
             skipped = int(self._scalars["grad/skipped"])
             print(f"skipped {skipped} updates, contained {states} non-finite states and {gradients} gradients")
         if self._evaluation:

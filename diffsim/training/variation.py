@@ -1,10 +1,9 @@
-"""Constants that differ between environments, drawn at random, so that no policy lives on one robot's or ground's."""
+"""Constants that differ between environments, drawn at random: a policy cannot overfit one robot or one ground."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import torch
 
@@ -22,15 +21,8 @@ VARIED = {
 SEEDS = 15_485_863  # between the random numbers of one drawing and the next; ranks are 1_000_003 apart
 
 
-class Range(NamedTuple):
-    """Of factors, drawn so that their logarithm is uniform."""
-
-    least: float
-    most: float
-
-
-def parse_ranges(items: Sequence[str]) -> dict[str, Range]:
-    """Of the flag --randomise friction=0.7:1.3 mass=0.9:1.1, by name; raises ValueError for anything else."""
+def parse_ranges(items: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Of --randomise friction=0.7:1.3 the least and the largest factor by name; raises ValueError for anything else."""
     ranges = {}
     for item in items:
         name, _, text = item.partition("=")
@@ -42,7 +34,7 @@ def parse_ranges(items: Sequence[str]) -> dict[str, Range]:
             raise ValueError(f"unknown {name!r}: choose from {', '.join(VARIED)}")
         if not (is_real(least) and 0 < least <= most < math.inf):
             raise ValueError(f"{item!r}: factors must be positive and finite, the least one first")
-        ranges[name] = Range(least, most)
+        ranges[name] = least, most
     return ranges
 
 
@@ -51,15 +43,15 @@ class Variation:
 
     Args:
         env: made with factors.
-        ranges: of random factors, by their names in VARIED.
+        ranges: least and largest random factor, by their names in VARIED; their logarithm is uniform.
         redraw: iterations between drawings.
     """
 
-    def __init__(self, env: DiffEnv, ranges: Mapping[str, Range], redraw: int, seed: int) -> None:
+    def __init__(self, env: DiffEnv, ranges: Mapping[str, tuple[float, float]], redraw: int, seed: int) -> None:
         self.factors, self.redraw, self.seed = env.sim.factors, redraw, seed
         drawn = {factor: ranges[name] for name, factors in VARIED.items() if name in ranges for factor in factors}
-        least = [math.log(drawn[name].least) if name in drawn else 0.0 for name in FACTORS]
-        most = [math.log(drawn[name].most) if name in drawn else 0.0 for name in FACTORS]
+        least = [math.log(drawn[name][0]) if name in drawn else 0.0 for name in FACTORS]
+        most = [math.log(drawn[name][1]) if name in drawn else 0.0 for name in FACTORS]
         self.least, self.width = torch.tensor(least), torch.tensor(most) - torch.tensor(least)
         self._drawing = -1
 

@@ -14,7 +14,7 @@ import ppo_baseline
 import shac
 from diffsim.robot.scene import FACTORS
 from diffsim.training import parse
-from diffsim.training.variation import Range, Variation, parse_ranges
+from diffsim.training.variation import Variation, parse_ranges
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def column(env: diffsim.DiffEnv, name: str) -> torch.Tensor:
 
 def test_factors_are_drawn_for_each_environment_and_constant(env: diffsim.DiffEnv) -> None:
     """Uniform in the logarithm, and drawn anew when it is time."""
-    ranges = {"friction": Range(0.5, 2.0), "mass": Range(0.9, 1.2), "stiffness": Range(1.0, 4.0)}
+    ranges = {"friction": (0.5, 2.0), "mass": (0.9, 1.2), "stiffness": (1.0, 4.0)}
     variation = Variation(env, ranges, 10, 1)
     variation.set(100)
     drawn = env.sim.factors.log()
