@@ -139,7 +139,7 @@ class Case(NamedTuple):
     def about(self) -> dict[str, object]:
         """The cells of ABOUT."""
         args = self.saved.args
-        learner = " ".join((self.saved.script, *(args[name] for name in ("algorithm", "policy") if name in args)))
+        learner = " ".join((self.saved.script, *(args[name] for name in ("policy",) if name in args)))
         learner += " --symmetric" if args.get("symmetric") else ""
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
         values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration

@@ -79,7 +79,7 @@ def learn(policy: str, entropy: str, seed: int) -> dict[int, Tensor]:
         learner.learn()
         if iteration in CASES[entropy]:
             with torch.no_grad():
-                drawn[iteration] = pfpn.sample(learner.actor(torch.zeros(SAMPLES, 1)))[0].squeeze(1).clamp(-1, 1)
+                drawn[iteration] = learner.actor(torch.zeros(SAMPLES, 1))[0].sample().squeeze(1).clamp(-1, 1)
     return drawn
 
 
@@ -100,7 +100,7 @@ def measure(args: Args) -> None:
 def density(learner: pfpn.PPO) -> Tensor:
     """(20001,) of actions from -2 to 2."""
     with torch.no_grad():
-        mixture = learner.actor(torch.zeros(1, 1))
+        mixture, _ = learner.actor(torch.zeros(1, 1))
         return mixture.log_density(torch.linspace(-2, 2, 20_001).unsqueeze(-1)).exp().squeeze(-1)
 
 
@@ -116,7 +116,7 @@ def disturb(args: Args) -> None:
         for noise in NOISES:
             other = copy.deepcopy(learner)
             other.args.resampling, other.args.resampling_noise = "weighted", noise
-            found = other.end_iteration([{}])
+            found = other.resampling.end_iteration(other.actor.head, other.optimizer)
             change = (density(other) - before).abs().sum().item() * 4 / 20_000 / 2
             row = {"noise": noise, "seed": seed, "moved": int(found["particles/moved"]), "total variation": change}
             args.keep("resampling_noise", row, ("noise", "seed"))

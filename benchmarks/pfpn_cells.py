@@ -29,6 +29,7 @@ class Figure(NamedTuple):
     env: str
     flags: str
     cells: dict[str, str]
+    script: str = "pfpn"
 
 
 CASES = json.loads(Path(__file__).with_name("cases.json").read_text())["pfpn"]
@@ -49,7 +50,7 @@ def cases(args: Args) -> Iterator[Case]:
         for number in args.seeds:
             for cell, flags in figure.cells.items():
                 folder = args.runs / "pfpn" / name / f"{cell}__{number}"
-                yield Case(folder, figure.env, number, "pfpn", (*figure.flags.split(), *flags.split()))
+                yield Case(folder, figure.env, number, figure.script, (*figure.flags.split(), *flags.split()))
 
 
 def measured(args: Args) -> Iterator[Row]:

@@ -28,7 +28,7 @@ from diffsim.view import render
 
 POLICIES = files("diffsim") / "policies"
 PACKAGE = Path(str(files("diffsim")))
-LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo_baseline", "sac_baseline", "mbpo", "pfpn", "gps")
+LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo_baseline", "sac_baseline", "mbpo", "pfpn", "pfpn_sac", "gps")
 DEMO_EPISODES = 8  # the one of median return is filmed
 DEMO_SECONDS = 4.0  # of it
 

@@ -1,4 +1,4 @@
-"""PFPN's policy against closed forms and quadrature, its algorithms against the other scripts and known optima."""
+"""PFPN's policy against closed forms and quadrature, PPO and SAC against the other scripts and known optima."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from torch import Tensor
 from torch.distributions import Categorical, MixtureSameFamily, Normal
 
 import pfpn
+import pfpn_sac
 import ppo_baseline
 import sac_baseline
-import shac
 from diffsim.training import ClippedAdam, Transition, load_policy, parse
 
+each_script = pytest.mark.parametrize("script", [pfpn, pfpn_sac], ids=["ppo", "sac"])
 BATCH, M, N = 7, 3, 5  # states, actions, particles
 
 
@@ -39,38 +40,43 @@ def test_density_and_its_gradient_are_those_of_torchs_mixture() -> None:
     u = torch.randn(BATCH, M, dtype=torch.float64)
     components = Normal(loc.expand(BATCH, M, N), log_std.exp().expand(BATCH, M, N))
     expected = MixtureSameFamily(Categorical(logits=logits), components).log_prob(u)
-    density = pfpn.Mixture(*inputs, False).log_prob(u)
+    density = pfpn.Mixture(*inputs).log_prob(u)
     torch.testing.assert_close(density, expected.sum(-1))
     own, torchs = (torch.autograd.grad(x.sum(), inputs, retain_graph=True) for x in (density, expected))
     torch.testing.assert_close(own, torchs, rtol=1e-10, atol=1e-12)
     slope = torch.log1p(-torch.tanh(u).square())
-    torch.testing.assert_close(pfpn.Mixture(*inputs, True).log_prob(u), (expected - slope).sum(-1))
+    torch.testing.assert_close(pfpn_sac.Mixture(*inputs).log_prob(u), (expected - slope).sum(-1))
 
 
-def test_density_far_from_every_particle_is_finite_as_is_its_gradient() -> None:
+@each_script
+def test_density_far_from_every_particle_is_finite_as_is_its_gradient(script: Any) -> None:
     inputs = [x.detach().float().requires_grad_() for x in parameters()]
-    density = pfpn.Mixture(*inputs, True).log_prob(torch.full((M,), 60.0))
+    density = script.Mixture(*inputs).log_prob(torch.full((M,), 60.0))
     assert density.isfinite() and all(g.isfinite().all() for g in torch.autograd.grad(density, inputs))
 
 
-@pytest.mark.parametrize("estimator", ["implicit", "straight-through", "mixed"])
-def test_draws_follow_the_density(estimator: pfpn.Estimator) -> None:
+@pytest.mark.parametrize(
+    "sample", [pfpn.Mixture.sample, pfpn_sac.Mixture.sample, pfpn_sac.straight_through], ids=["ppo", "sac", "gumbel"]
+)
+def test_draws_follow_the_density(sample: Callable[[Any], Tensor]) -> None:
     """Kolmogorov and Smirnov's distance of 100,000 draws of each action, which do not depend on each other."""
     logits, loc, log_std = parameters()
-    mixture = pfpn.Mixture(logits.expand(100_000, M, N), loc, log_std, False)
-    u = pfpn.sample(mixture, estimator)[0].detach().sort(0).values
-    z = (u.unsqueeze(-1) - loc) / log_std.exp()
-    cumulative = (logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
-    rank = (torch.arange(100_000) / 100_000).unsqueeze(-1)
-    assert (cumulative - rank).abs().max() < 0.006
-    shuffled = pfpn.sample(mixture)[0] - u.mean(0)
-    assert (torch.corrcoef(shuffled.T) - torch.eye(M)).abs().max() < 0.02
+    kind = pfpn.Mixture if sample is pfpn.Mixture.sample else pfpn_sac.Mixture
+    with torch.no_grad():
+        mixture = kind(logits.expand(100_000, M, N), loc, log_std)
+        draws, again = sample(mixture), sample(mixture)
+        u = draws.sort(0).values
+        z = (u.unsqueeze(-1) - loc) / log_std.exp()
+        cumulative = (logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
+        rank = (torch.arange(100_000) / 100_000).unsqueeze(-1)
+        assert (cumulative - rank).abs().max() < 0.006
+        assert (torch.corrcoef(torch.cat((draws, again), 1).T) - torch.eye(2 * M)).abs().max() < 0.02
 
 
 def test_bins_count_as_the_nearest() -> None:
     logits = parameters(BATCH)[0][:, :1]
-    bins = pfpn.Bins(logits, torch.linspace(-1, 1, N).expand(1, N), torch.full((1, N), -math.inf), False)
-    u, _ = pfpn.sample(bins)
+    bins = pfpn.Bins(logits, torch.linspace(-1, 1, N).expand(1, N), torch.full((1, N), -math.inf))
+    u = bins.sample()
     index = ((u + 1) / 2 * (N - 1)).round().long()
     torch.testing.assert_close(u, -1 + 2 * index.double() / (N - 1))
     expected = logits.log_softmax(-1).squeeze(1).gather(1, index).squeeze(1)
@@ -79,12 +85,11 @@ def test_bins_count_as_the_nearest() -> None:
 
 
 @pytest.mark.parametrize("std", ["state", "own"])
-@pytest.mark.parametrize(("algorithm", "first"), [("ppo", 0.0), ("shac", -1.0)])
-def test_the_deviation_of_a_gaussian_depends_on_the_state_or_not(algorithm: str, first: float, std: str) -> None:
-    args = parse(pfpn.Args, f"--device cpu --policy gaussian --algorithm {algorithm} --std {std}".split())
+def test_the_deviation_of_a_gaussian_depends_on_the_state_or_not(std: str) -> None:
+    args = parse(pfpn.Args, f"--device cpu --policy gaussian --std {std}".split())
     own, features = pfpn.Head(args, 4, M), torch.randn(20, 4)
     before = own(features).log_std.detach().clone()
-    assert (before - first).abs().max() < 0.2
+    assert before.abs().max() < 0.2
     mixture = own(features[:1])
     mixture.log_prob(mixture.loc.detach().squeeze(-1) + 10.0).sum().backward()  # in this state it has to widen
     with torch.no_grad():
@@ -96,9 +101,9 @@ def test_the_deviation_of_a_gaussian_depends_on_the_state_or_not(algorithm: str,
 
 def test_entropy_is_of_the_weights_or_of_the_gaussian() -> None:
     logits, loc, log_std = parameters(BATCH)
-    entropy = pfpn.Mixture(logits, loc, log_std, False).entropy()
+    entropy = pfpn.Mixture(logits, loc, log_std).entropy()
     torch.testing.assert_close(entropy, Categorical(logits=logits).entropy().sum(-1))
-    gaussian = pfpn.Mixture(logits[..., :1], loc[:, :1], log_std[:, :1], False)
+    gaussian = pfpn.Mixture(logits[..., :1], loc[:, :1], log_std[:, :1])
     torch.testing.assert_close(gaussian.entropy(), Normal(0, log_std[:, :1].exp()).entropy().sum().expand(1)[0])
 
 
@@ -109,7 +114,8 @@ def test_implicit_gradient_keeps_the_cumulative_probability() -> None:
     """By definition; so it is that of the quantile, and unbiased. dF/du is the density, so the rest is determined."""
     inputs = parameters()
     torch.manual_seed(3)
-    u, _ = pfpn.sample(pfpn.Mixture(*inputs, True), "implicit")
+    mixture = pfpn_sac.Mixture(*inputs)
+    u = pfpn_sac.implicit(mixture, mixture.sample().detach(), 0.0)
     logits, loc, log_std = inputs
     cumulative = (logits.softmax(-1) * torch.special.ndtr((u.unsqueeze(-1) - loc) / log_std.exp())).sum()
     for total, own in zip(torch.autograd.grad(cumulative, inputs, retain_graph=True), inputs, strict=True):
@@ -120,9 +126,8 @@ def test_implicit_gradient_keeps_the_cumulative_probability() -> None:
 def test_straight_through_gradient() -> None:
     """Eq. 25: of locations and scales that of the chosen one; of logits the gaps times the gradient of the choice."""
     inputs = parameters()
-    mixture = pfpn.Mixture(*inputs, True)
     torch.manual_seed(5)
-    u, _ = pfpn.sample(mixture, "straight-through")
+    u = pfpn_sac.straight_through(pfpn_sac.Mixture(*inputs))
     torch.manual_seed(5)
     noise = torch.randn(M, dtype=torch.float64).unsqueeze(-1)
     scores = inputs[0].log_softmax(-1) - torch.empty(M, N, dtype=torch.float64).exponential_().log()
@@ -139,23 +144,19 @@ def test_straight_through_gradient() -> None:
 
 
 def test_straight_through_weights_are_biased() -> None:
-    """Of two particles at -1 and 1 E[a^2] does not depend on the weights; the estimate has mean 4 E[x1 x2 sign(a)]."""
+    """Of actions -1 and 1 E[a^2] does not depend on the weights; the estimate has mean 4 E[x1 x2 sign(a)]."""
     count, p = 100_000, 0.8
     log_odds = math.log(p / (1 - p))
     logits = torch.tensor([0.0, log_odds], dtype=torch.float64).expand(count, 1, 2).clone().requires_grad_()
     loc = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
     torch.manual_seed(0)
-    mixture = pfpn.Mixture(logits, loc, torch.full_like(loc, -20), False)
-    u, _ = pfpn.sample(mixture, "straight-through")
-    (gradient,) = torch.autograd.grad(u.square().sum(), logits)
+    u = pfpn_sac.straight_through(pfpn_sac.Mixture(logits, loc, torch.full_like(loc, -20)))
+    (gradient,) = torch.autograd.grad((torch.tanh(u) / math.tanh(1)).square().sum(), logits)
     y = torch.linspace(-40, 40, 400_001, dtype=torch.float64)
     both = y.sigmoid() * (-y).sigmoid()  # x1 x2 where the logistic noise puts their log odds at y
     expected = 4 * torch.trapezoid(both * y.sign() * (y - log_odds).sigmoid() * (log_odds - y).sigmoid(), y).item()
     mean, error = gradient[:, 0, 1].mean().item(), gradient[:, 0, 1].std().item() / math.sqrt(count)
     assert abs(mean - expected) < 4 * error and expected > 50 * error
-    u, chosen = pfpn.sample(mixture, "mixed")  # which adds the score function
-    (score,) = torch.autograd.grad((u.square().sum(-1).detach() * chosen).sum(), logits)
-    assert abs(score[:, 0, 1].mean().item()) < 4 * score[:, 0, 1].std().item() / math.sqrt(count)
 
 
 def test_the_density_floor_bounds_the_implicit_gradient() -> None:
@@ -163,31 +164,31 @@ def test_the_density_floor_bounds_the_implicit_gradient() -> None:
     logits = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
     u, slopes = torch.zeros(1, dtype=torch.float64), []
     for floor in (0.0, 0.01):
-        mixture = pfpn.Mixture(logits, torch.tensor([[-1.0, 1.0]]), torch.full((1, 2), -2.0), True)
-        slopes += torch.autograd.grad(torch.tanh(pfpn.implicit(mixture, u, floor)), logits)
+        mixture = pfpn_sac.Mixture(logits, torch.tensor([[-1.0, 1.0]]), torch.full((1, 2), -2.0))
+        slopes += torch.autograd.grad(torch.tanh(pfpn_sac.implicit(mixture, u, floor)), logits)
     assert slopes[0].abs().max() > 1e6 and slopes[1].abs().max() == pytest.approx(0.25 / 0.01, rel=1e-3)
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
 
 
-def head(*arguments: str) -> tuple[pfpn.Head, pfpn.Resampling, ClippedAdam, Tensor]:
+def head(*arguments: str, script: Any = pfpn) -> tuple[Any, Any, ClippedAdam, Tensor]:
     """A policy head in float64, its resampling, an optimizer that has moments, and features of states."""
     flags = "--env ant --device cpu --particles 6 --resampling-interval 1 --resampling-noise 0"
-    args = parse(pfpn.Args, [*flags.split(), *arguments])
+    args = parse(script.Args, [*flags.split(), *arguments])
     torch.manual_seed(0)
-    own = pfpn.Head(args, 4, M).double()
+    own = script.Head(args, 4, M).double()
     with torch.no_grad():
         for parameter in own.parameters():
             parameter += 0.3 * torch.randn_like(parameter)
-    resampling, optimizer = pfpn.Resampling(args, own).double(), ClippedAdam(own, 1.0, lr=1e-3)
+    resampling, optimizer = script.Resampling(args, own).double(), ClippedAdam(own, 1.0, lr=1e-3)
     features = torch.randn(50, 4, dtype=torch.float64)
     optimizer.exp_avg.normal_()
     optimizer.exp_avg_sq.uniform_()
     return own, resampling, optimizer, features
 
 
-def kill(own: pfpn.Head, places: list[tuple[int, int]], bias: float = -1e4) -> None:
+def kill(own: Any, places: list[tuple[int, int]], bias: float = -1e4) -> None:
     for k, i in places:
         own.linear.weight.data.view(M, 6, 4)[k, i] = 0
         own.linear.bias.data.view(M, 6)[k, i] = bias
@@ -196,10 +197,11 @@ def kill(own: pfpn.Head, places: list[tuple[int, int]], bias: float = -1e4) -> N
 DEAD = [(0, 1), (0, 2), (0, 3), (0, 4), (2, 0), (2, 5)]
 
 
-@pytest.mark.parametrize(("algorithm", "resampling"), [("ppo", "weighted"), ("sac", "uniform")])
-def test_resampling_leaves_the_policy_as_it_is(algorithm: str, resampling: str) -> None:
+@each_script
+@pytest.mark.parametrize("resampling", ["weighted", "uniform"])
+def test_resampling_leaves_the_policy_as_it_is(resampling: str, script: Any) -> None:
     """The theorem (Eq. 10), with several dead particles on one target; what is not involved stays bitwise."""
-    own, moving, optimizer, features = head("--algorithm", algorithm, "--resampling", resampling)
+    own, moving, optimizer, features = head("--resampling", resampling, script=script)
     kill(own, DEAD)
     u = 2 * torch.randn(50, M, dtype=torch.float64)
     before = own(features)
@@ -249,8 +251,9 @@ def test_weights_below_the_threshold_bound_the_change() -> None:
     assert (variation <= bound + 1e-9).all() and variation.max() > 1e-6
 
 
-def test_targets_are_drawn_by_weight_and_copies_land_around_them() -> None:
-    own, moving, optimizer, features = head("--particles", "400", "--resampling-noise", "0.5")
+@each_script
+def test_targets_are_drawn_by_weight_and_copies_land_around_them(script: Any) -> None:
+    own, moving, optimizer, features = head("--particles", "400", "--resampling-noise", "0.5", script=script)
     weight, bias = own.linear.weight.data.view(M, 400, 4), own.linear.bias.data.view(M, 400)
     weight.zero_()
     bias.fill_(-1e4)
@@ -276,8 +279,9 @@ def test_targets_are_drawn_by_weight_and_copies_land_around_them() -> None:
         ("switched off", "--resampling none", 6),
     ],
 )
-def test_nothing_is_moved(case: str, flags: str, dead: int) -> None:
-    own, moving, optimizer, features = head(*flags.split())
+@each_script
+def test_nothing_is_moved(case: str, flags: str, dead: int, script: Any) -> None:
+    own, moving, optimizer, features = head(*flags.split(), script=script)
     if case != "none dead":
         kill(own, DEAD)
     if case != "nothing recorded":
@@ -332,16 +336,14 @@ class Problem:
         return self.x, reward, terminated, no, {"final_obs": action}
 
 
-def build(flags: str, reward: Callable[[Tensor, Tensor], Tensor], envs: int = 256, steps: int = 1) -> Any:
+def build(kind: Any, flags: str, reward: Callable[[Tensor, Tensor], Tensor], envs: int = 256, steps: int = 1) -> Any:
     shared = f"--env ant --device cpu --horizon {steps} --hidden 1".split()
-    args = parse(pfpn.Args, [*shared, *flags.split()])
-    env: Any = Problem(envs, reward, steps)
-    return pfpn.ALGORITHMS[args.algorithm](args, env)
+    args = parse((pfpn if kind is pfpn.PPO else pfpn_sac).Args, [*shared, *flags.split()])
+    return kind(args, Problem(envs, reward, steps))
 
 
 def solve(learner: Any, iterations: int) -> Any:
-    for iteration in range(1, iterations + 1):
-        learner.schedule(iteration)
+    for _ in range(iterations):
         learner.interact()
         learner.learn()
     return learner
@@ -356,8 +358,7 @@ def distance(action: Tensor) -> Tensor:
 
 def masses(actor: pfpn.Actor) -> tuple[float, float]:
     """The shares of actions within 0.15 of each peak."""
-    mixture = actor(torch.zeros(20_000, 1))
-    action = mixture.action(pfpn.sample(mixture)[0])
+    action = actor(torch.zeros(20_000, 1))[0].sample()
     left, right = (((action - peak).abs() < 0.15).double().mean().item() for peak in PEAKS)
     return left, right
 
@@ -365,7 +366,7 @@ def masses(actor: pfpn.Actor) -> tuple[float, float]:
 def ppo_bandit(flags: str) -> Any:
     torch.manual_seed(1)
     flags = f"--minibatch-size 256 --epochs 4 --lr 3e-3 --lr-bounds 3e-3 3e-3 --entropy-coef 0 --std own {flags}"
-    return build(flags, lambda _, action: 1 / (distance(action) + 0.1))
+    return build(pfpn.PPO, flags, lambda _, action: 1 / (distance(action) + 0.1))
 
 
 def test_ppo_bandit_with_two_peaks() -> None:
@@ -388,62 +389,17 @@ def test_ppo_bandit_stays_on_both_peaks_with_entropy() -> None:
     assert min(masses(learner.actor)) > 0.2 and learner.resampling.moved > 0
 
 
-@pytest.mark.parametrize("estimator", ["implicit", "straight-through", "mixed", "gaussian"])
-def test_shac_bandit_with_two_peaks(estimator: str) -> None:
-    """Through the reward's gradient: with each estimator particles find both peaks."""
-    policy = "--policy gaussian" if estimator == "gaussian" else f"--estimator {estimator}"
-    flags = f"--algorithm shac --epochs 1 --critic-hidden 4 --lr 3e-3 --iterations 400 --entropy-coef 0.01 {policy}"
-    torch.manual_seed(1)
-    found = masses(solve(build(flags, lambda _, action: (-distance(action) / 0.15).exp()), 100).actor)
-    assert min(found) < 0.01 if estimator == "gaussian" else min(found) > 0.25
-
-
-@pytest.mark.parametrize("estimator", ["implicit", "mixed"])
-def test_gradient_of_a_window_is_that_of_the_expectation(estimator: str) -> None:
-    """Of two steps, whose second policy and reward depend on the first action, against quadrature over both actions.
-
-    The value of what follows is zero for both, so with "mixed" the advantage is of the rewards alone.
-    """
-    flags = f"--algorithm shac --hidden 3 --critic-hidden 2 --particles 3 --gamma 0.9 --estimator {estimator}"
-
-    def reward(x: Tensor, action: Tensor) -> Tensor:
-        return torch.sin(3 * action) * (1 + x) - (action - 0.5 * x).square()
-
-    torch.manual_seed(0)
-    learner = build(f"{flags} --density-floor 0", reward, 200_000, steps=2)
-    linear = learner.actor.head.linear
-    with torch.no_grad():
-        for parameter in (linear.weight, linear.bias):
-            parameter += 0.5 * torch.randn_like(parameter)
-        for parameter in learner.target.parameters():
-            parameter.zero_()
-    parameters = dict(learner.actor.named_parameters())
-    window, others = learner.collect()
-    estimate = torch.autograd.grad(learner.loss(window, *others), list(parameters.values()))
-
-    u, du = torch.linspace(-6, 6, 801), 12 / 800
-    action = torch.tanh(u).unsqueeze(-1)
-    first = learner.actor(torch.zeros(1, 1)).log_density(u.unsqueeze(-1)).squeeze(-1).exp() * du
-    mixture = learner.actor(action.unsqueeze(1))  # of the first action, (801, 1, m, n)
-    second = mixture.log_density(u.reshape(1, -1, 1).expand(len(u), -1, 1)).squeeze(-1).exp() * du
-    value = reward(torch.zeros_like(action), action).squeeze(-1)
-    value = value + 0.9 * (second * reward(action.unsqueeze(1), action.unsqueeze(0)).squeeze(-1)).sum(-1)
-    exact = torch.autograd.grad(-(first * value).sum() / 2, list(parameters.values()))
-    assert first.sum().item() == pytest.approx(1, abs=1e-4)
-    for name, mean, expected in zip(parameters, estimate, exact, strict=True):
-        assert (mean - expected).norm() < 0.05 * expected.norm(), (name, mean, expected)
-
-
-def test_sac_bandit_has_its_soft_optimum() -> None:
+@pytest.mark.parametrize("estimator", ["implicit", "straight-through"])
+def test_sac_bandit_has_its_soft_optimum(estimator: str) -> None:
     """The policy proportional to exp(r / alpha), which has two peaks of unequal height."""
-    flags = "--algorithm sac --horizon 8 --num-envs 16 --minibatch-size 128 --critic-hidden 64 --particles 15"
+    flags = f"--estimator {estimator} --horizon 8 --num-envs 16 --minibatch-size 128 --critic-hidden 64 --particles 15"
     flags += " --lr 4e-3 --critic-lr 4e-3 --temperature-lr 1e-9 --target-rate 0.05 --buffer-size 5000"
 
     def reward(_: Tensor, action: Tensor) -> Tensor:
         return 2 * (action + 0.6).square() - 2 * torch.cos(5 * (action + 0.6))
 
     torch.manual_seed(1)
-    actor = solve(build(flags, reward, 16), 110).actor
+    actor = solve(build(pfpn_sac.SAC, flags, reward, 16), 110).actor
     a = torch.linspace(-0.9995, 0.9995, 2000).unsqueeze(-1)
     density = actor(torch.zeros(1, 1)).log_prob(torch.atanh(a)).softmax(0).detach()
     assert (density - reward(a, a).squeeze(-1).softmax(0)).abs().sum() / 2 < 0.12
@@ -452,15 +408,15 @@ def test_sac_bandit_has_its_soft_optimum() -> None:
 def test_sac_target_counts_the_entropy_of_what_follows() -> None:
     """And neither it nor a value after a failure."""
     torch.manual_seed(0)
-    learner = build("--algorithm sac --hidden 8 --critic-hidden 8", lambda _, action: action, 4)
+    learner = build(pfpn_sac.SAC, "--hidden 8 --critic-hidden 8", lambda _, action: action, 4)
     learner.temperature["log"].data.fill_(-1)
     obs, next_obs = torch.randn(2, 32, 1)
     batch = Transition(obs, torch.rand(32, 1), torch.randn(32), next_obs, (torch.rand(32) < 0.3).float())
     state = torch.get_rng_state()
     mixture = learner.actor(next_obs)
-    u, _ = pfpn.sample(mixture)
-    values = torch.stack([learner.target[k](torch.cat((next_obs, torch.tanh(u)), 1)).squeeze(1) for k in range(2)])
-    own = torch.stack([learner.critic[k](torch.cat((obs, batch.action), 1)).squeeze(1) for k in range(2)])
+    u = mixture.sample()
+    values = torch.stack([learner.targets[k](torch.cat((next_obs, torch.tanh(u)), 1)).squeeze(1) for k in range(2)])
+    own = torch.stack([learner.critics[k](torch.cat((obs, batch.action), 1)).squeeze(1) for k in range(2)])
     following = values.amin(0) - math.exp(-1) * mixture.log_prob(u)
     target = batch.reward + 0.99 * (1 - batch.terminated) * following
     torch.set_rng_state(state)
@@ -469,15 +425,15 @@ def test_sac_target_counts_the_entropy_of_what_follows() -> None:
 
 
 def test_skipped_updates_are_those_of_all_optimizers() -> None:
-    flags = "--algorithm sac --num-envs 8 --critic-hidden 4 --minibatch-size 8 --buffer-size 64"
-    learner = build(flags, lambda _, action: action, 8, steps=3)
+    flags = "--num-envs 8 --critic-hidden 4 --minibatch-size 8 --buffer-size 64"
+    learner = build(pfpn_sac.SAC, flags, lambda _, action: action, 8, steps=3)
     learner.temperature_optimizer.skip_norm = 0.0
     learner.interact()
     assert learner.learn()["grad/skipped"] == 3
 
 
 def test_locations_beyond_the_bounds_are_drawn_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pfpn.PPO, "bound_coef", 1e4)
+    monkeypatch.setattr(pfpn, "BOUND_COEF", 1e4)
     learner = ppo_bandit("")
     loc = learner.actor.head.loc.data
     loc.copy_(torch.linspace(-2, 2, 35))
@@ -489,96 +445,85 @@ def test_locations_beyond_the_bounds_are_drawn_back(monkeypatch: pytest.MonkeyPa
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 SMALL = "--env cartpole --device cpu --threads 1 --quiet --num-envs 4 --horizon 8 --minibatch-size 32 --epochs 2"
-SMALL += " --hidden 8 --eval-episodes 1 --resampling-interval 1 --particles 8 --dead 0.999 --lr 0.03 --buffer-size 100"
+SMALL += " --hidden 8 --eval-episodes 1 --resampling-interval 1 --dead 0.999 --lr 0.03"
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "shac --estimator mixed", "sac"])
-def test_a_run_resumes_bitwise_with_its_particles(algorithm: str, tmp_path: Path) -> None:
+@each_script
+def test_a_run_resumes_bitwise_with_its_particles(script: Any, tmp_path: Path) -> None:
     """Of a threshold so high that particles are moved on the way. Its deterministic policy stands alone."""
-    flags = f"{SMALL} --algorithm {algorithm} --iterations 6 --log-particles 0".split()
-    whole = run(pfpn, tmp_path / "whole", *flags)
-    run(pfpn, tmp_path / "part", *flags, "--stop-after", 3)
-    part = run(pfpn, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
-    assert_same(part["modules"], whole["modules"])
-    moved = whole["modules"]["resampling"]["moved"]
+    own = "--log-particles 0" if script is pfpn else "--buffer-size 100"
+    flags = f"{SMALL} {own} --particles 8 --iterations 6".split()
+    whole = run(script, tmp_path / "whole", *flags)
+    run(script, tmp_path / "part", *flags, "--stop-after", 3)
+    again = "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet"
+    assert_same(run(script, tmp_path / "part", *again)["modules"], whole["modules"])
     last = {name: float(value or "nan") for name, value in read_progress(tmp_path / "whole")[-1].items()}
-    assert sum(last[f"particles_weight_0_{i}"] for i in range(8)) == pytest.approx(1, abs=1e-4)
-    assert last["particles_moved"] == moved > 0
+    assert last["particles_moved"] == whole["modules"]["resampling"]["moved"] > 0
+    if script is pfpn:
+        assert sum(last[f"particles_weight_0_{i}"] for i in range(8)) == pytest.approx(1, abs=1e-4)
 
-    actor = pfpn.Actor(parse(pfpn.Args, flags), 5, 1)
-    actor.load_state_dict(whole["modules"]["actor"], strict=False)  # PPO's has a value
+    actor = script.Actor(parse(script.Args, flags), 5, 1)
+    actor.load_state_dict(whole["modules"]["actor"])
     obs = torch.randn(20, 5)
     mixture = actor(actor.normalizer(obs))
-    expected = mixture.action(mixture.loc[0][mixture.log_weight.argmax(-1)])
+    mixture, squash = (mixture[0], torch.clone) if script is pfpn else (mixture, torch.tanh)
+    expected = squash(mixture.loc[0][mixture.log_weight.argmax(-1)])
     torch.testing.assert_close(load_policy(tmp_path / "whole" / "checkpoint.pt").network(obs), expected)
 
 
-@pytest.mark.parametrize(
-    "flags", ["gmm --algorithm ppo", "gmm --algorithm shac", "gaussian --algorithm sac", "discrete --algorithm ppo",
-              "discrete --algorithm shac"]
-)  # fmt: skip
-def test_other_policies_train(flags: str, tmp_path: Path) -> None:
-    checkpoint = run(pfpn, tmp_path, *f"{SMALL} --iterations 2 --policy {flags}".split())
+@pytest.mark.parametrize(("script", "policy"), [(pfpn, "gmm"), (pfpn, "discrete"), (pfpn_sac, "gaussian")])
+def test_other_policies_train(script: ModuleType, policy: str, tmp_path: Path) -> None:
+    checkpoint = run(script, tmp_path, *f"{SMALL} --particles 8 --iterations 2 --policy {policy}".split())
     assert all(float(row["grad_skipped"]) == 0 for row in read_progress(tmp_path))
     action = load_policy(tmp_path / "checkpoint.pt").network(torch.randn(50, 5))
     assert action.shape == (50, 1) and action.isfinite().all()
-    if flags.startswith("discrete"):
+    if policy == "discrete":
         bins = torch.linspace(-1, 1, 8)
         assert (action - bins).abs().amin(1).max() < 1e-6
         torch.testing.assert_close(checkpoint["modules"]["actor"]["head.likeliest.loc"][0], bins)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "shac"])
-def test_a_gaussian_is_trained_as_by_the_other_scripts(algorithm: str, tmp_path: Path) -> None:
+def test_a_gaussian_is_trained_as_by_ppo_baseline(tmp_path: Path) -> None:
     """The same random numbers give the same weights, up to rounding: the order of sums differs."""
-    shared = "--env cartpole --device cpu --quiet --num-envs 16 --horizon 32 --iterations 3 --eval-episodes 1"
-    if algorithm == "ppo":
-        shared += " --minibatch-size 100 --epochs 2 --entropy-coef 0.01 --lr-bounds 3e-4 3e-4"
-        theirs = run(ppo_baseline, tmp_path / "theirs", *shared.split())
-    else:
-        own = "--critic-iterations 2 --critic-minibatches 4"
-        theirs = run(shac, tmp_path / "theirs", *shared.split(), *own.split())
-        shared += " --epochs 2 --minibatch-size 128"
-    ours = run(pfpn, tmp_path / "ours", *f"{shared} --algorithm {algorithm} --policy gaussian --std own".split())
+    flags = "--env cartpole --device cpu --quiet --num-envs 16 --horizon 32 --iterations 3 --eval-episodes 1"
+    flags += " --minibatch-size 100 --epochs 2 --entropy-coef 0.01 --lr-bounds 3e-4 3e-4"
+    theirs = run(ppo_baseline, tmp_path / "theirs", *flags.split())
+    ours = run(pfpn, tmp_path / "ours", *f"{flags} --policy gaussian --std own".split())
     weights = [list(checkpoint["policy"]["weights"].values()) for checkpoint in (ours, theirs)]
     torch.testing.assert_close(*weights, rtol=1e-3, atol=2e-5)
 
 
-SAME = {"actor_hidden": "hidden", "actor_lr": "lr", "gae_lambda": "trace_decay", "td_lambda": "trace_decay"}
-SAME |= {"critic_iterations": "epochs", "updates_per_step": "epochs", "batch_size": "minibatch_size"}
-SAME |= {"steps": "horizon", "tau": "target_rate"}
+SAME = {"gae_lambda": "trace_decay", "actor_lr": "lr", "steps": "horizon", "tau": "target_rate"}
+SAME |= {"updates_per_step": "epochs", "batch_size": "minibatch_size"}
+CONSTANTS = {"target_kl": "TARGET_KL", "clip_coef": "CLIP", "value_coef": "VALUE_COEF", "bound_coef": "BOUND_COEF"}
+CONSTANTS |= {"max_grad_norm": "MAX_GRAD_NORM"}
 
 
 @pytest.mark.parametrize("env", ["cartpole", "humanoid_mtu"])
-@pytest.mark.parametrize(("algorithm", "script"), [("ppo", ppo_baseline), ("shac", shac), ("sac", sac_baseline)])
-def test_settings_are_those_of_the_other_scripts(algorithm: str, script: ModuleType, env: str) -> None:
+@pytest.mark.parametrize(("script", "baseline"), [(pfpn, ppo_baseline), (pfpn_sac, sac_baseline)])
+def test_settings_are_those_of_the_baselines(script: Any, baseline: Any, env: str) -> None:
     flags = ["--env", env, "--device", "cpu"]
-    own = vars(parse(pfpn.Args, [*flags, "--algorithm", algorithm])) | vars(pfpn.ALGORITHMS[algorithm])
-    other = {SAME.get(name, name): value for name, value in vars(parse(script.Args, flags)).items()}
+    own, theirs = (vars(parse(each.Args, flags)) for each in (script, baseline))
+    other = {SAME.get(name, name): value for name, value in theirs.items()}
+    own |= {name: vars(script).get(constant) for name, constant in CONSTANTS.items() if name in other}
     shared = other.keys() & own.keys() - {"run_dir", "eval_every", "save_every"}
     assert len(shared) > 20 and {name: own[name] for name in shared} == {name: other[name] for name in shared}
-    if algorithm == "shac":
-        assert own["target_rate"] == pytest.approx(1 - other["target_alpha"])
-        assert own["minibatch_size"] * other["critic_minibatches"] == other["num_envs"] * other["horizon"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("script", "arguments", "message"),
     [
-        ("--particles 1", "--particles must be from 2 to 1,000 with --policy pfpn, not 1"),
-        ("--particles 100000 --policy gmm", "--particles must be from 2 to 1,000 with --policy gmm, not 100000"),
-        (f"--hidden {2**62}", f"--hidden must be from 1 to 16,384, not {2**62}"),
-        ("--dead 1", "--dead 1: with equal weights all particles would be dead"),
-        ("--policy discrete --algorithm sac", "--policy discrete has no density"),
-        ("--policy discrete --algorithm shac --estimator implicit", "choose --estimator straight-through or mixed"),
-        ("--algorithm sac --estimator mixed", "--estimator mixed needs the rewards of a window"),
-        ("--algorithm sac --buffer-size 10", "--buffer-size 10 holds no window of 4096 steps"),
-        ("--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),
+        (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
+        (pfpn, f"--hidden {2**62}", f"--hidden must be from 1 to 16,384, not {2**62}"),
+        (pfpn, "--dead 1", "--dead must be in [0, 1), not 1"),
+        (pfpn, "--lr-bounds 1e-2 1e-3", "the lowest exceeds the highest"),
+        (pfpn, "--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),
+        (pfpn_sac, "--buffer-size 10", "--buffer-size 10 holds no window of 4096 steps"),
     ],
 )
 def test_wrong_arguments_are_refused(
-    arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    script: ModuleType, arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["--env", "ant", "--device", "cpu", "--run-dir", str(tmp_path / "run"), *arguments.split()]
-    assert message in refusal(lambda: pfpn.main(argv), capsys)
+    assert message in refusal(lambda: script.main(argv), capsys)
     assert not (tmp_path / "run").exists()

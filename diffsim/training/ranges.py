@@ -36,6 +36,7 @@ Count = Annotated[int, _whole(1, 10**9)]
 Natural = Annotated[int, _whole(0, 10**9)]
 Repeats = Annotated[int, _whole(1, 10_000)]  # what takes time one after the other
 Few = Annotated[int, _whole(1, 1_000)]  # networks side by side
+Several = Annotated[int, _whole(2, 1_000)]  # parts of which one alone is none
 Width = Annotated[int, _whole(1, 16_384)]
 Finite = Annotated[float, Range("finite", math.isfinite)]
 Positive = Annotated[float, Range("positive", lambda value: value > 0)]

@@ -12,6 +12,7 @@ from learners import refusal
 from tables import markdown, read_csv
 
 import pfpn
+import pfpn_sac
 from diffsim.training import parse
 
 
@@ -23,8 +24,9 @@ def test_each_cell_is_a_command(figure: str, cell: str, monkeypatch: pytest.Monk
     monkeypatch.chdir(ROOT)
     case = pfpn_cells.FIGURES[figure]
     flags = ["--env", case.env, "--device", "cpu", *case.flags.split()]
-    base, args = parse(pfpn.Args, flags), parse(pfpn.Args, [*flags, *case.cells[cell].split()])
-    for name in ("algorithm", "iterations", "num_envs", "horizon", "epochs", "minibatch_size", "gamma", "hidden"):
+    kind = (pfpn if case.script == "pfpn" else pfpn_sac).Args
+    base, args = parse(kind, flags), parse(kind, [*flags, *case.cells[cell].split()])
+    for name in ("iterations", "num_envs", "horizon", "epochs", "minibatch_size", "gamma", "hidden"):
         assert getattr(args, name) == getattr(base, name)
 
 

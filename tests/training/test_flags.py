@@ -183,7 +183,7 @@ def test_defaults_are_the_tables(script: ModuleType) -> None:
         assert re.fullmatch(rf"runs/{env}__{script.__name__}__1__\d+", str(args.run_dir))
 
 
-@pytest.mark.parametrize("name", "shac sapo bptt ppo_baseline sac_baseline mbpo pods pfpn gps".split())
+@pytest.mark.parametrize("name", "shac sapo bptt ppo_baseline sac_baseline mbpo pods pfpn pfpn_sac gps".split())
 def test_arguments_have_the_types_of_their_flags(name: str) -> None:
     """As they are checked when they come from a checkpoint, which holds no paths."""
     script = importlib.import_module(name)

@@ -1,0 +1,438 @@
+"""PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301), by SAC.
+
+The policy is a mixture of particles: normal distributions, the same in all states, whose weights the network gives.
+Soft Actor-Critic trains it off-policy, as in section 4.4 of the paper; the gradient of the critics goes on through the
+sampled actions. pfpn.py trains it by PPO.
+
+    python pfpn_sac.py --env ant --seed 1                    train; writes runs/ant__pfpn_sac__1__<time>/
+    python pfpn_sac.py --env ant --policy gaussian           the policy to compare
+    python pfpn_sac.py --resume <run>/checkpoint.pt          continue an interrupted run exactly
+    python pfpn_sac.py --evaluate <run>/checkpoint.pt        evaluate its deterministic policy
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from diffsim import DiffEnv
+from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training.ensemble import Ensemble
+from diffsim.training.flags import ParallelFlags
+from diffsim.training.layers import Likeliest, ObsNormalizer
+from diffsim.training.optimizer import ClippedAdam
+from diffsim.training.ranges import Count, Decay, Fraction, Natural, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.replay import ReplayBuffer, Transition
+
+# The settings of sac_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
+# fmt: off
+COLUMNS = ("hidden", "num_envs", "minibatch_size", "temperature_lr", "lr", "iterations")
+PER_TASK = {
+    "cartpole":     ((64, 64),              32, 1024, 5e-3, 5e-4,  4_000),
+    "hopper":       ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 20_000),
+    "half_cheetah": ((256, 128, 64),        64, 2048, 5e-3, 5e-4, 20_000),
+    "ant":          ((256, 128, 64),       128, 4096, 5e-3, 5e-4, 20_000),
+    "humanoid":     ((512, 256),            64, 2048, 2e-4, 3e-4, 20_000),
+    "humanoid_mtu": ((512, 512, 512, 256), 256, 4096, 2e-4, 3e-4, 40_000),
+}
+# fmt: on
+LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation of a component
+MAX_GRAD_NORM = 100.0  # sac_baseline.py's
+
+
+@dataclass
+class Args(ParallelFlags):
+    """The policy, and SAC. Defaults: the humanoid's."""
+
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "critic_lr", "temperature_lr")
+
+    policy: Literal["pfpn", "gaussian"] = "pfpn"
+    """particles, or one Gaussian"""
+    particles: Several = 35
+    """particles of each action"""
+    resampling: Literal["weighted", "uniform", "none"] = "weighted"
+    """where dead particles go: to living ones in proportion to their mean weight, to any of them, or nowhere"""
+    resampling_interval: Count = 20
+    """iterations between resamplings"""
+    resampling_noise: NonNegative = 0.1
+    """a particle lands within this many standard deviations of the one that it copies"""
+    dead: Decay = 0.05
+    """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
+    estimator: Literal["straight-through", "implicit"] = "straight-through"
+    """gradient of a sampled action in the weights; straight-through is biased (docs/pfpn.md)"""
+    density_floor: NonNegative = 0.01
+    """the implicit gradient divides by the action's density, at least by this; 0: no bias, no bound either"""
+
+    iterations: Count = 20_000
+    """learning iterations, a window of all environments and its updates each (per task)"""
+    num_envs: Count = 64
+    """parallel environments N (per task)"""
+    horizon: Count = 32
+    """control steps of a window (1/60 s each)"""
+    hidden: SomeWidths = (512, 256)
+    """units of the policy's hidden layers (per task)"""
+    critic_hidden: SomeWidths = (512, 256)
+    """units of the critics' hidden layers (per task)"""
+    lr: Positive = 3e-4
+    """learning rate of the policy (per task)"""
+    critic_lr: Positive = 3e-4
+    """learning rate of the critics (per task)"""
+    temperature_lr: Positive = 2e-4
+    """learning rate of the logarithm of the entropy's weight (per task)"""
+    gamma: Fraction = 0.99
+    """discount factor"""
+    epochs: Repeats = 1
+    """updates per control step"""
+    minibatch_size: Count = 2048
+    """samples of an update (per task)"""
+    target_rate: Fraction = 0.005
+    """target critics <- (1 - rate) target critics + rate critics, after each update"""
+    buffer_size: Count = 1_000_000
+    """transitions in the replay buffer, over all environments"""
+    eval_every: Natural = 500
+    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
+    save_every: Natural = 500
+    """save the checkpoint, which holds the replay buffer, every this many iterations (0: only at the end)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, PER_TASK["humanoid"]), strict=True))
+        return values | {"critic_hidden": values["hidden"], "critic_lr": values["lr"]}
+
+    def check(self) -> None:
+        super().check()
+        if distributed.size() > 1:
+            fail("one process alone: a replay buffer is not shared among ranks")
+        if self.buffer_size < (steps := self.horizon * self.num_envs):
+            fail(f"--buffer-size {self.buffer_size} holds no window of {steps} steps")
+
+
+# Policies -------------------------------------------------------------------------------------------------------------
+
+
+class Mixture:
+    """Each of m actions is tanh u, where u has the density sum_i w_i N(u; mu_i, xi_i^2) of n components (Eq. 3, 27)."""
+
+    def __init__(self, logits: Tensor, loc: Tensor, log_std: Tensor) -> None:
+        self.logits, self.log_weight = logits, F.log_softmax(logits, -1)  # (..., m, n)
+        self.loc, self.log_std = loc, log_std  # (..., m, n) or (m, n)
+
+    def sample(self) -> Tensor:
+        """u (..., m), Eq. 4 and 5: a component by its weight, and a normal number around its location."""
+        noise = torch.randn_like(self.logits[..., 0])
+        if self.logits.shape[-1] == 1:  # a Gaussian
+            return self.loc.squeeze(-1) + self.log_std.exp().squeeze(-1) * noise
+        total = self.logits.detach().softmax(-1).cumsum(-1)
+        level = (1 - torch.rand_like(noise).unsqueeze(-1)) * total[..., -1:]
+        return self.pick((total < level).sum(-1, keepdim=True), noise)
+
+    def pick(self, index: Tensor, noise: Tensor) -> Tensor:
+        """u (..., m) of the components (..., m, 1), with the gradient of their locations and scales."""
+        pair = self.loc, self.log_std.exp()
+        loc, scale = (x.expand_as(self.logits).gather(-1, index).squeeze(-1) for x in pair)
+        return loc + scale * noise
+
+    def log_density(self, u: Tensor) -> Tensor:
+        """Of each u by itself (..., m)."""
+        rate = (-self.log_std).exp() * math.sqrt(0.5)
+        z = torch.addcmul(-self.loc * rate, u.unsqueeze(-1), rate)
+        return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
+
+    def log_prob(self, u: Tensor) -> Tensor:
+        """log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
+        return (self.log_density(u) - log_slope(u)).sum(-1)
+
+
+def log_slope(u: Tensor) -> Tensor:
+    """log da/du."""
+    return 2 * (math.log(2) - u - F.softplus(-2 * u))
+
+
+def logsumexp(x: Tensor) -> Tensor:
+    """Over the last dimension. torch's own takes several times as long on a CPU where an exponential underflows."""
+    largest = x.detach().argmax(-1, keepdim=True)
+    return (x.gather(-1, largest) - F.log_softmax(x, -1).gather(-1, largest)).squeeze(-1)
+
+
+class Head(nn.Module):
+    """Features of a network (..., inputs) -> the mixture of each of m actions. What of it depends on the state:
+
+    pfpn      the weights (Figure 2)
+    gaussian  location and scale of its only component
+    """
+
+    def __init__(self, args: Args, inputs: int, actions: int) -> None:
+        super().__init__()
+        self.policy, self.shape = args.policy, (actions, args.particles if args.policy == "pfpn" else 1)
+        if self.policy == "gaussian":
+            self.linear, self.scale = nn.Linear(inputs, actions), nn.Linear(inputs, actions)
+        else:
+            loc, log_std = spread(*self.shape)
+            self.linear, self.likeliest = almost_constant(inputs, loc.numel()), Likeliest(*self.shape)
+            self.loc.data.copy_(loc)
+            self.log_std = nn.Parameter(log_std)
+
+    @property
+    def loc(self) -> nn.Parameter:
+        """(m, n) the particles' locations."""
+        return self.likeliest.get_parameter("loc")
+
+    def forward(self, features: Tensor) -> Mixture:
+        out = self.linear(features)
+        if self.policy == "gaussian":
+            log_std = self.scale(features).unsqueeze(-1).clamp(*LOG_STD)
+            return Mixture(torch.zeros_like(log_std), out.unsqueeze(-1), log_std)
+        return Mixture(out.unflatten(-1, self.shape), self.loc, self.log_std)
+
+
+def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
+    """Locations of u that cover each action evenly, and log standard deviations that cover their gaps (m, n)."""
+    loc = torch.atanh(-1 + (2 * torch.arange(n, dtype=torch.float64) + 1) / n)
+    gap = loc.diff()
+    widest = torch.maximum(F.pad(gap, (1, 0)), F.pad(gap, (0, 1)))
+    return loc.float().repeat(actions, 1), widest.log().float().repeat(actions, 1)
+
+
+def almost_constant(inputs: int, outputs: int) -> nn.Linear:
+    """A layer that begins with small weights around zero."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.trunc_normal_(layer.weight, std=0.01, a=-0.02, b=0.02)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def mlp(inputs: int, hidden: SomeWidths, outputs: int | None = None) -> nn.Sequential:
+    """Linear and ReLU per hidden layer, and a linear output, if any."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.ReLU()]
+        inputs = width
+    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
+
+
+class Actor(nn.Module):
+    """pi(a|s), of normalized observations."""
+
+    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.normalizer = ObsNormalizer(obs_dim)
+        self.body = mlp(obs_dim, args.hidden)
+        self.head = Head(args, args.hidden[-1], action_dim)
+
+    def forward(self, obs: Tensor) -> Mixture:
+        mixture: Mixture = self.head(self.body(obs))
+        return mixture
+
+    def deterministic(self) -> nn.Sequential:
+        """The actions of the largest weights, of observations as they come, with the same weights."""
+        likeliest = [self.head.likeliest] if self.head.policy == "pfpn" else []
+        return nn.Sequential(self.normalizer, *self.body, self.head.linear, *likeliest, nn.Tanh())
+
+
+# Estimators: how the gradient of a sampled action reaches the weights -------------------------------------------------
+
+
+def straight_through(mixture: Mixture) -> Tensor:
+    """A sample whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
+    noise = torch.randn_like(mixture.logits[..., 0])
+    scores = mixture.logits - torch.empty_like(mixture.logits).exponential_().log()  # Gumbel noise
+    u = mixture.pick(scores.argmax(-1, keepdim=True), noise)
+    each = (mixture.loc + mixture.log_std.exp() * noise.unsqueeze(-1)).detach()  # what each would have drawn
+    x = scores.softmax(-1)  # Concrete distribution of temperature 1
+    gap = torch.tanh(each) - torch.tanh(u.detach()).unsqueeze(-1)
+    gap = gap / log_slope(u.detach()).exp().clamp(min=1e-3).unsqueeze(-1)  # of u, for the same gap of actions
+    return u + (gap * (x - x.detach())).sum(-1)
+
+
+def implicit(mixture: Mixture, u: Tensor, floor: float) -> Tensor:
+    """u with its implicit gradient: its cumulative probability F(u) stays, so du = -dF / p(u) (Figurnov 2018)."""
+    z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()
+    cumulative = (mixture.logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
+    least = floor * log_slope(u).exp()  # the floor is of the action's density
+    density = torch.maximum(mixture.log_density(u).detach().exp(), least)
+    return u - (cumulative - cumulative.detach()) / density
+
+
+# Resampling -----------------------------------------------------------------------------------------------------------
+
+
+class Resampling(nn.Module):
+    """Keeps the particles' weights, and moves those without weight to others (section 3.3). Works in place."""
+
+    def __init__(self, args: Args, head: Head) -> None:
+        super().__init__()
+        self.args, self.active = args, args.policy == "pfpn"  # a Gaussian has nothing to move
+        self.seen: Tensor = nn.Buffer(torch.zeros(2, *head.shape))  # since the last one: sum and largest of weights
+        self.age: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # iterations
+        self.moved: Tensor = nn.Buffer(torch.zeros(()))  # particles, ever
+
+    def record(self, acting: Mixture) -> None:
+        """Take the weights (..., m, n) with which the policy acts."""
+        if self.active:
+            weight = acting.logits.detach().softmax(-1).flatten(0, -3)
+            self.seen[0] += weight.sum(0)
+            torch.maximum(self.seen[1], weight.amax(0), out=self.seen[1])
+
+    @torch.no_grad()
+    def end_iteration(self, head: Head, optimizer: ClippedAdam) -> dict[str, Tensor]:
+        """Resample if it is time; that is decided on the device, so a captured iteration does the same."""
+        if not self.active:
+            return {}
+        head.log_std.clamp_(*LOG_STD)
+        self.age += 1
+        due = self.age % self.args.resampling_interval == 0
+        weight = self.seen[0] / self.seen[0].sum(-1, keepdim=True)  # where nothing was recorded not a number
+        least, largest = self.args.dead / head.shape[1], torch.maximum(weight, self.seen[1])
+        dead = weight < least
+        if self.args.resampling != "none":
+            chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
+            self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))
+        self.seen *= ~due
+        return {
+            "particles/dead_mean": dead.to(weight.dtype).mean(),
+            "particles/dead_max": (largest < least).to(weight.dtype).mean(),  # as in Eq. 8
+            "particles/moved": self.moved,
+            "particles/active": (-torch.xlogy(weight, weight).sum(-1)).exp().mean(),
+            "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
+        }
+
+    def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
+        """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
+
+        |D| copies share the weight of their target: log(|D| + 1) less in each logit. Adam's moments of them are zeroed.
+        """
+        m, n = head.shape
+        draws = torch.empty(m, n, n, device=dead.device).exponential_()
+        target = torch.where(dead, (chance.unsqueeze(1) / draws).argmax(-1), torch.arange(n, device=dead.device))
+        copies = torch.zeros_like(chance).scatter_add(1, target, dead.to(chance.dtype))
+        head.linear.bias.data.view(m, n).sub_(torch.log1p(copies))
+        for parameter in (head.linear.weight, head.linear.bias, head.loc, head.log_std):
+            rows = parameter.data.view(m, n, -1)
+            rows.copy_(rows.gather(1, target.unsqueeze(-1).expand_as(rows)))
+            for moment in optimizer.moments(parameter):
+                moment.view(m, n, -1).masked_fill_(dead.unsqueeze(-1), 0.0)
+        uniform = 2 * torch.rand_like(head.loc) - 1
+        head.loc.add_(dead * self.args.resampling_noise * uniform * head.log_std.exp())
+        self.moved += dead.sum()
+
+
+# The algorithm --------------------------------------------------------------------------------------------------------
+
+
+class SAC:
+    """All that the next iteration depends on, and its two halves.
+
+    They change tensors in place and never wait for the device, so that on a GPU each becomes one CUDA graph.
+    """
+
+    def __init__(self, args: Args, env: DiffEnv) -> None:
+        self.args, self.env = args, env
+        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.policy = self.actor.deterministic()
+        self.resampling = Resampling(args, self.actor.head).to(env.device)
+        critics = [mlp(obs_dim + action_dim, args.critic_hidden, 1) for _ in range(2)]
+        self.critics = Ensemble(critics).to(env.device)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)  # the entropy's weight
+        self.optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.lr)
+        self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.critic_lr)
+        self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
+        self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
+
+    @torch.no_grad()
+    def interact(self) -> dict[str, Tensor]:
+        """Act for a window, into the buffer."""
+        steps, obs, normalizer = [], self.env.detach(), self.actor.normalizer
+        for _ in range(self.args.horizon):
+            mixture = self.actor(normalizer(obs))
+            self.resampling.record(mixture)
+            action = torch.tanh(mixture.sample())
+            next_obs, reward, terminated, _, info = self.env.step(action)
+            steps.append((obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
+            obs = next_obs
+        window = Transition(*(torch.cat(tensors) for tensors in zip(*steps, strict=True)))
+        self.buffer.add(window)
+        normalizer.update(window.obs)
+        return {}
+
+    def learn(self) -> dict[str, Tensor]:
+        """As many updates as there were control steps, times the epochs; then resample."""
+        normalizer, rows = self.actor.normalizer, []
+        for _ in range(self.args.horizon * self.args.epochs):
+            batch = self.buffer.sample(self.args.minibatch_size)
+            obs, next_obs = normalizer(batch.obs), normalizer(batch.next_obs)
+            rows.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
+        optimizers = self.optimizer, self.critic_optimizer, self.temperature_optimizer
+        return {
+            **{name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]},
+            "grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum(),
+            "charts/temperature": self.temperature["log"].detach().exp(),
+            **self.resampling.end_iteration(self.actor.head, self.optimizer),
+        }
+
+    def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
+        """Descend the soft Bellman residual, and let the target critics follow."""
+        with torch.no_grad():
+            mixture = self.actor(next_obs)
+            u = mixture.sample()
+            soft = values(self.targets, next_obs, torch.tanh(u)).amin(0)
+            soft = soft - self.temperature["log"].exp() * mixture.log_prob(u)
+            target = batch.reward + self.args.gamma * (1 - batch.terminated) * soft
+        value = values(self.critics, obs, batch.action)
+        loss = (value - target).square().mean(1).sum()
+        self.critic_optimizer.step(loss)
+        for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
+            slow.lerp_(fast.detach(), self.args.target_rate)
+        return {"losses/critic": loss.detach() / 2, "charts/value": value.detach().mean()}
+
+    def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
+        """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
+        mixture = self.actor(obs)
+        u = self.differentiable(mixture)
+        density = mixture.log_prob(u)
+        value = values(self.critics, obs, torch.tanh(u)).amin(0)
+        loss = (self.temperature["log"].detach().exp() * density - value).mean()
+        norm = self.optimizer.step(loss)
+        surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
+        self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
+        return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
+
+    def differentiable(self, mixture: Mixture) -> Tensor:
+        """A sample with the estimator's gradient."""
+        if self.args.policy == "gaussian":
+            return mixture.sample()
+        if self.args.estimator == "straight-through":
+            return straight_through(mixture)
+        return implicit(mixture, mixture.sample().detach(), self.args.density_floor)
+
+
+def values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
+    """Each critic's Q(s, a) (2, B)."""
+    inputs = torch.cat((obs, action), -1)
+    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
+
+
+# The run --------------------------------------------------------------------------------------------------------------
+
+
+def train(args: Args) -> None:
+    run = Run(args)
+    env = run.make_env(args.num_envs, args.horizon)
+    sac = run.restore(SAC(args, env))
+    interact, learn = run.capture(sac.interact, env), run.capture(sac.learn)
+    for _ in run:
+        run.log(interact() | learn())
+        if run.evaluation_due:
+            run.log_evaluation(evaluate(run.eval_env, sac.policy))
+
+
+main = script(Args, train)
+
+if __name__ == "__main__":
+    main()
