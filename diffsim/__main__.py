@@ -9,7 +9,6 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
@@ -211,15 +210,9 @@ def _version(package: str) -> str:
 
 def _kernel_cache() -> str:
     try:
-        folder = startup.check_kernel_cache()
+        return str(startup.check_kernel_cache())
     except ValueError:
         return "none"
-    size = 0
-    for directory, _, names in os.walk(folder):
-        for name in names:
-            with suppress(FileNotFoundError):  # another process compiles, and renames what it has written
-                size += os.path.getsize(os.path.join(directory, name))
-    return f"{folder}, {sum(path.is_dir() for path in folder.iterdir())} kernels, {size / 1e6:.0f} MB"
 
 
 def find_troubles() -> list[str]:

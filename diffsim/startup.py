@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import gc
 import importlib
 import os
 import shutil
@@ -14,14 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-# A host that has imported torch has so many objects that collecting garbage would take a third of Warp's import.
-collecting = gc.isenabled()
-gc.disable()
-try:
-    import warp as wp
-finally:
-    if collecting:
-        gc.enable()
+import warp as wp
 
 ROOM = 16 * 2**20  # bytes that a kernel takes in Warp's cache at most; LLVM aborts the process when there are fewer
 # What Warp prints when it starts and nobody needs: pip installs a Warp that supports the Python at hand.

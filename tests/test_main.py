@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -55,31 +54,6 @@ def test_the_report_names_tasks_devices_versions_and_cache(capsys: pytest.Captur
     assert f"torch {version('torch')}" in rows["versions"] and f"warp-lang {wp.__version__}" in rows["versions"]
     assert rows["devices"].split()[1] == "cpu," and str(wp.config.kernel_cache_dir) in rows["kernels"]
     assert max(map(len, lines)) < 160
-
-
-def test_the_report_beside_a_process_that_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files come and go in the cache while the report measures it."""
-    monkeypatch.setattr(startup, "check_kernel_cache", lambda: tmp_path)
-    (kept := tmp_path / "wp_kept" / "kernel.o").parent.mkdir()
-    kept.write_bytes(bytes(2_000_000))
-    done, interval = threading.Event(), sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-
-    def compile() -> None:
-        while not done.is_set():
-            (folder := tmp_path / "wp_new").mkdir()
-            (folder / "kernel.o").write_bytes(b"")
-            shutil.rmtree(folder)
-
-    thread = threading.Thread(target=compile)
-    thread.start()
-    try:
-        sizes = {command._kernel_cache().rpartition(", ")[2] for _ in range(300)}
-    finally:
-        sys.setswitchinterval(interval)
-        done.set()
-        thread.join()
-    assert sizes == {"2 MB"}
 
 
 def test_troubles_come_with_their_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
