@@ -119,20 +119,26 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        if distributed.size() > 1:
-            fail("one process alone: a replay buffer is not shared among ranks")
-        if self.num_envs < 2:
-            fail("--num-envs must be at least 2: one environment is held out")
-        if self.elites > self.models:
-            fail(f"--elites {self.elites} are more than --models {self.models}")
-        if self.rollout_lengths[0] > self.rollout_lengths[1]:
-            fail(f"--rollout-lengths {self.rollout_lengths[0]} {self.rollout_lengths[1]} are the wrong way round")
-        if self.buffer_size < (rows := self.num_envs * (1 + self.sample_enhance)):
-            fail(f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a control step")
-        if self.sample_enhance and find_task(self.env).num_memory:
-            fail(f"--sample-enhance takes Jacobians of states that do not hold the past, on which {self.env} depends")
-        if self.sample_enhance and self.randomise:
-            fail("--sample-enhance takes Jacobians of one robot: leave out --randomise")
+        first, last = self.rollout_lengths
+        rows, past = self.num_envs * (1 + self.sample_enhance), find_task(self.env).num_memory
+        jacobians = "--sample-enhance takes Jacobians of"
+        for wrong, message in (
+            (distributed.size() > 1, "one process alone: a replay buffer is not shared among ranks"),
+            (self.num_envs < 2, "--num-envs must be at least 2: one environment is held out"),
+            (self.elites > self.models, f"--elites {self.elites} are more than --models {self.models}"),
+            (first > last, f"--rollout-lengths {first} {last} are the wrong way round"),
+            (
+                self.buffer_size < rows,
+                f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step",
+            ),
+            (
+                self.sample_enhance and past,
+                f"{jacobians} states that do not hold the past, on which {self.env} depends",
+            ),
+            (self.sample_enhance and self.randomise, f"{jacobians} one robot: leave out --randomise"),
+        ):
+            if wrong:
+                fail(message)
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
