@@ -29,7 +29,8 @@ from diffsim.training import fail
 CASES: dict[str, tuple[str, ...]] = {
     # each learner
     "shac": ("shac --env hopper --num-envs 16",),
-    "sapo": ("sapo --env hopper --population 2 --num-envs 16",),
+    "sapo": ("sapo --env hopper --num-envs 16",),
+    "population": ("sapo --env hopper --population 2 --num-envs 16",),
     "bptt": ("bptt --env hopper --num-envs 16",),
     "pods": ("pods --env cartpole --num-envs 16",),
     "ppo_baseline": ("ppo_baseline --env hopper --minibatch-size 512 --num-envs 16",),
