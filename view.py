@@ -1,14 +1,11 @@
-"""Show the policy of any script's checkpoint: as a video, as a web page, or in a window, where it can be pushed.
+"""Show the policy of any script's checkpoint: as a video, as a web page, or in a window.
 
     python view.py runs/<run>/checkpoint.pt --video ant.mp4     a file for a talk or a web site; .gif as well
     python view.py runs/<run> --web ant.html                    one page for any browser, without network access
     python view.py runs/<run> --viewer                          MuJoCo's window; this simulator moves the robot
     python view.py runs/* --plot curves.png                     return against control steps and seconds
 
-Video and page show the beginning of the median one of several episodes.
-
-In the window, double-click a body, then drag with ctrl and the right mouse button to pull it. Arrow keys push the robot
-by 1 m/s; minus and equals change the speed; space pauses; enter starts a new episode.
+Video and page show the beginning of the median one of several episodes. `diffsim drive` lets a robot be pushed.
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ from diffsim.tasks import find_task
 from diffsim.training import command, evaluate, fail, gait, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED
 from diffsim.view import render, web
-from diffsim.view.screen import Window
+from diffsim.view.screen import Screen
 
 DRAWN = "control_steps", "seconds", "return", "eval_return"  # columns of progress.csv
 
@@ -79,10 +76,8 @@ class Args:
             if self.video:
                 render.check_video(self.video, self.size)
                 render.check_opengl()
-            if self.viewer:
-                render.check_display()
         except (ValueError, RuntimeError) as error:
-            fail(f"--video: {error}" if self.video else f"--viewer: {error}; --web and --video need none")
+            fail(f"--video: {error}")
 
 
 @command
@@ -105,8 +100,8 @@ def show(args: Args) -> None:
     changes: dict[str, Any] = {name: x for name in ("env", "substeps") if (x := getattr(args, name)) is not None}
     task, name = find_task(args.env or saved.args["env"]).name, f"{saved.script}.py, iteration {saved.iteration}"
     if args.viewer:
-        print(f"{task}, {name}", (__doc__ or "").rstrip().rpartition("\n\n")[2], sep="\n")
-        play(make_policy_env(saved, 1, forces=True, **changes), saved.network, args.seed)
+        print(f"{task}, {name}")
+        play(make_policy_env(saved, 1, **changes), saved.network, args.seed)
         return
     env = make_policy_env(saved, args.episodes, **changes)
     evaluation = evaluate(env, saved.network, args.seed)
@@ -123,16 +118,12 @@ def show(args: Args) -> None:
 
 @torch.no_grad()
 def play(env: DiffEnv, policy: torch.nn.Module, seed: int) -> None:
-    """Let the policy act on one environment, made with forces, in a window where it can be pushed, until it closes."""
+    """Let the policy act on one environment in a window, until it is closed."""
     obs, _ = env.reset(seed=seed)
-    with closing(Window(env.scene, env.control_dt)) as window:
-        while window.is_open:
-            if window.restart:
-                window.restart, (obs, _) = False, env.reset()
-            env.sim.forces = torch.as_tensor(window.forces(), dtype=env.dtype)[None]
-            action = policy(obs)
-            obs, *_ = env.step(action)
-            window.show(env.qpos[0], env.qvel[0], action[0])
+    with closing(Screen(env.scene, "human", 1 / env.control_dt)) as screen:
+        while screen.is_open:
+            screen.show(env.qpos.numpy())
+            obs, *_ = env.step(policy(obs))
 
 
 def plot(directories: Sequence[Path], output: Path) -> None:

@@ -61,7 +61,7 @@ def test_substeps_are_those_of_the_training_unless_given(tiny_run: Path) -> None
         ("{run} --episodes 3 --web {run}/progress.csv/a.html", "File exists"),
         ("{new} --plot {new}/a.png", "no such file: {new}/progress.csv; --plot takes directories of runs"),
         ("{run} --plot {new}/a.xyz", "xyz"),
-        ("{run} --viewer", "--viewer: display :77 does not answer; --web and --video need none"),
+        ("{run} --viewer", "there is no display"),
     ],
 )
 def test_mistakes_are_one_line(

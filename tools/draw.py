@@ -59,7 +59,7 @@ def loops(
         wide, high = round(2 * zoom * width), round(2 * zoom * height)
         left, top = wide // 2 - width, round(middle * high) - height
         with Renderer(episodes.scene, wide, high) as renderer:
-            drawn = renderer.draw_all(qpos, action)
+            drawn = map(renderer.draw, qpos, action)
             frames = [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in drawn]
         fps = 1 / (every * episodes.control_dt)
         first, last = 0, round(3.5 * fps)
@@ -99,7 +99,7 @@ def gait(
     qpos, action = (rows[wanted] for rows in episodes.episode(int(lasting.int().argmax())))
     path = FIGURES / f"{load_policy(checkpoint).args['env']}_gait.png"
     with Renderer(episodes.scene, 2 * size, 2 * size) as renderer:
-        Image.fromarray(halve(np.concatenate([*renderer.draw_all(qpos, action)], axis=1))).save(path)
+        Image.fromarray(halve(np.concatenate([*map(renderer.draw, qpos, action)], axis=1))).save(path)
     print(path)
 
 

@@ -6,7 +6,6 @@ user asks for goes back as a POST. Several pages show one robot; their commands 
 
 from __future__ import annotations
 
-import base64
 import functools
 import itertools
 import json
@@ -28,14 +27,13 @@ from diffsim.robot.scene import Array
 from diffsim.tasks.joystick import Joystick
 from diffsim.tasks.locomotion import Locomotion
 from diffsim.view import web
-from diffsim.view.screen import GRAVITY, MAX_PULL
 
 KEYS = {  # of the tasks that can be driven
     Joystick: "arrows or gamepad: walk, turn · Q, E: sideways · shift + drag: pull · enter: start anew",
     Locomotion: "left, right or gamepad: turn · shift + drag: pull · enter: start anew",
 }
 TURN = 0.3  # rad/s by which a key turns the way of a robot that otherwise runs straight on; at 1 rad/s the ant falls
-STIFFNESS = 20.0  # N/kg per m of the mouse's pull, up to MAX_PULL
+STIFFNESS, MAX_PULL = 20.0, 19.62  # N/kg per m of the mouse's pull, and N/kg: twice the weight
 SILENCE = 10.0  # s after which a page that takes no more pictures is given up
 LONGEST = 1000  # bytes of what a page asks for
 
@@ -77,16 +75,16 @@ class Pilot:
 
     @torch.no_grad()
     def step(self, wishes: Sequence[Wish]) -> dict[str, str]:
-        """A control step; what it changes in the picture, see web.frames."""
+        """A control step; what it changes in the picture, see web.encode."""
         env, move = self.env, np.sum([wish.move for wish in wishes], axis=0).clip(-1.0, 1.0)
         env.sim.forces = torch.as_tensor(self._forces(wishes), dtype=env.dtype)[None]
-        self._action = self._policy(self._see(move)).clamp(-1.0, 1.0)
-        _, _, terminated, truncated, _ = env.step(self._action)
-        shown = web.frames(env.scene.mj_model, env.qpos.double().numpy(), self._action.numpy())
-        self._places = np.frombuffer(base64.b64decode(shown["poses"]), "<f4").reshape(-1, 7)[:, :3]
+        action = self._action = self._policy(self._see(move)).clamp(-1.0, 1.0)
+        _, _, terminated, truncated, _ = env.step(action)
+        poses, track = web.poses(env.scene.mj_model, env.qpos.double().numpy())
+        self._places = poses[0, :, :3]
         if bool(terminated | truncated):
             self._heading, self._action = 0.0, torch.zeros_like(self._action)
-        return shown
+        return web.encode(env.scene.mj_model, poses, track, action.numpy())
 
     def _see(self, move: Array) -> Tensor:
         env, task = self.env, self.env.task
@@ -102,7 +100,7 @@ class Pilot:
         forces = np.zeros((len(self._places), 6))
         for body, *point in (wish.pull for wish in wishes if wish.pull):
             way = point - self._places[int(body)]
-            strength = min(STIFFNESS, MAX_PULL * GRAVITY / max(float(np.linalg.norm(way)), 1e-9))
+            strength = min(STIFFNESS, MAX_PULL / max(float(np.linalg.norm(way)), 1e-9))
             forces[int(body), :3] += self._mass * strength * way
         return forces
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 import math
 import os
-import subprocess
 import sys
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from fractions import Fraction
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -28,45 +26,45 @@ AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.
 GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
+SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
 VIDEO_FPS = 30.0  # at most
 VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 LARGEST = 4096  # pixels of a side of a picture
 BLOCK = 16  # pixels; libx264 pads the sides of a picture to multiples of it
-REMEDY = "no OpenGL to draw with: apt install libegl1 libgl1 libgl1-mesa-dri (or your system's EGL and Mesa)"
+# faststart: browsers begin to play before they have loaded all of it
+MP4 = dict(codec="libx264", output_params="-crf 15 -preset veryfast -movflags +faststart".split())
+PALETTE = "split[a][b];[a]palettegen[colours];[b][colours]paletteuse=dither=none"
+GIF = dict(codec="gif", pix_fmt_out="pal8", output_params=["-lavfi", PALETTE, "-loop", "0"])
 
 
-class Renderer:
-    """Draws a scene, one configuration at a time.
+class Renderer(AbstractContextManager["Renderer"]):
+    """Draws a scene, one configuration at a time, as the camera "track" of the MJCF sees it, or one that follows.
 
-    Args:
-        scene: what is drawn.
-        width, height: of a frame in pixels.
-        camera: name of a camera of the MJCF; by default "track", or one that follows the robot if there is none.
-        fast: no antialiasing, coarser shapes, shadows on the floor alone; by default where OpenGL runs on the CPU. An
-            ant takes 15 ms of one core instead of 300.
+    Where OpenGL runs on the CPU, shapes are coarser and shadows lie on the floor alone: an ant takes 9 ms of one core
+    instead of 170. Sides are between 1 and 4096 pixels.
 
     Raises:
-        ValueError: the MJCF has no such camera, or a side is not between 1 and 4096 pixels.
+        ValueError: another size.
         RuntimeError: the machine has no OpenGL, with the remedy.
     """
 
-    def __init__(
-        self, scene: Scene, width: int = 640, height: int = 480, camera: str | None = None, fast: bool | None = None
-    ) -> None:
-        self.model, self._material = drawable(scene)
-        self._terrain = scene.terrain
-        self.width, self.height = check_size(width, height)
-        self._view, size = _camera(self.model, camera), self.model.vis.global_
-        size.offwidth, size.offheight = width, height
-        self._window = _gl_context(width, height)
-        self._fast = _is_software() if fast is None else fast
-        if self._fast:
-            lower_quality(self.model)
-        self._data, self._option, self._perturb = mujoco.MjData(self.model), mujoco.MjvOption(), mujoco.MjvPerturb()
-        self._scene, self._area = mujoco.MjvScene(self.model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] &= not self._fast
-        self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    def __init__(self, scene: Scene, width: int = 640, height: int = 480) -> None:
+        check_size(width, height)
+        self.model, self._material = model, _ = drawable(scene)
+        self._terrain, self._data = scene.terrain, mujoco.MjData(model)
+        self._fast = any(name in check_opengl() for name in SOFTWARE)
+        if self._fast:  # no antialiasing, coarser shapes
+            quality = model.vis.quality
+            quality.offsamples, quality.numslices, quality.numstacks, quality.numquads = 0, 16, 8, 1
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._renderer = mujoco.Renderer(model, height, width)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not self._fast
+        self._camera: Any = "track"
+        if "track" not in (model.camera(i).name for i in range(model.ncam)):
+            self._camera = mujoco.MjvCamera()
+            mujoco.mjv_defaultFreeCamera(model, self._camera)
+            self._camera.type, self._camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
 
     def draw(self, qpos: ArrayLike, ctrl: ArrayLike | None = None, profile: int = 0) -> Frame:
         """The frame (height, width, 3) of one configuration qpos (nq,).
@@ -75,52 +73,26 @@ class Renderer:
             ctrl: (nu,) in [-1, 1]; colours muscles by their activation, blue at rest, red at full force.
             profile: of which environment's terrain, if each has its own.
         """
-        model, data = self.model, self._data
-        data.qpos[:] = _check("qpos", qpos, model.nq)
+        self._data.qpos[:] = qpos
         if ctrl is not None:
-            colour_muscles(model, _check("ctrl", ctrl, model.nu))
+            tendons, force = activations(self.model, ctrl)
+            self.model.tendon_rgba[tendons] = np.outer(force, FULL_FORCE) + np.outer(1 - force, AT_REST)
         # All that a picture depends on, without the contacts and matrices of mj_forward.
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
-            stage(model, data)
-        self._window.make_current()
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(model, data, self._option, self._perturb, self._view, everything, self._scene)
+            stage(self.model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
         if self._terrain is not None:
-            add_terrain(self._scene, self._terrain[profile % len(self._terrain)], self._material)
+            add_terrain(self._renderer.scene, self._terrain[profile % len(self._terrain)], self._material)
         elif self._fast:
-            _add_shadows(model, data, self._scene)
-        mujoco.mjr_render(self._area, self._scene, self._context)
-        frame = np.empty((self.height, self.width, 3), dtype=np.uint8)
-        mujoco.mjr_readPixels(frame, None, self._area, self._context)
-        return np.ascontiguousarray(frame[::-1])  # OpenGL's first row is the lowest
-
-    def draw_all(self, qpos: ArrayLike, ctrl: ArrayLike | None = None) -> Iterator[Frame]:
-        """The frames of configurations qpos (T, nq), with ctrl (T, nu), one after the other."""
-        qpos = _check("qpos", qpos, len(np.atleast_1d(qpos)), self.model.nq)
-        colours = itertools.repeat(None) if ctrl is None else _check("ctrl", ctrl, len(qpos), self.model.nu)
-        return map(self.draw, qpos, colours)
+            _add_shadows(self.model, self._data, self._renderer.scene)
+        return self._renderer.render()
 
     def close(self) -> None:
-        """Free what OpenGL holds; a second call does nothing."""
-        if self._window is not None:
-            self._window.make_current()
-            self._context.free()
-            self._window.free()
-            self._window = None
-
-    def __enter__(self) -> Renderer:
-        return self
+        """Free what OpenGL holds."""
+        self._renderer.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _check(name: str, value: ArrayLike, *shape: int) -> NDArray[np.float64]:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
-    return array
 
 
 def drawable(scene: Scene) -> tuple[mujoco.MjModel, int]:
@@ -157,36 +129,11 @@ def add_terrain(scene: mujoco.MjvScene, profile: Array, material: int) -> None:
         scene.ngeom += 1
 
 
-def lower_quality(model: mujoco.MjModel) -> None:
-    """What draws a model several times as fast where OpenGL runs on the CPU: no antialiasing, coarser shapes."""
-    quality = model.vis.quality
-    quality.shadowsize, quality.offsamples = 1024, 0
-    quality.numslices, quality.numstacks, quality.numquads = 16, 8, 1
-
-
 def activations(model: mujoco.MjModel, ctrl: ArrayLike) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """The tendons (m,) of a model's muscles, and their activation (..., m) in [0, 1] by ctrl (..., nu) in [-1, 1]."""
     muscles = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)
     force = np.asarray(ctrl, dtype=np.float64)[..., muscles].clip(-1, 1)
     return model.actuator_trnid[muscles, 0], (force + 1) / 2
-
-
-def colour_muscles(model: mujoco.MjModel, ctrl: ArrayLike) -> None:
-    """Colour the tendons of a model by the activation of their muscles, ctrl (nu,) in [-1, 1]."""
-    tendons, force = activations(model, ctrl)
-    model.tendon_rgba[tendons] = np.outer(force, FULL_FORCE) + np.outer(1 - force, AT_REST)
-
-
-def _camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera:
-    names, view = [model.camera(i).name for i in range(model.ncam)], mujoco.MjvCamera()
-    if name is not None and name not in names:
-        raise ValueError(f"no camera {name!r} in this scene; it has: {', '.join(names) or 'none'}")
-    if name is None and "track" not in names:
-        mujoco.mjv_defaultFreeCamera(model, view)
-        view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
-    else:
-        view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(name or "track")
-    return view
 
 
 def orbit(model: mujoco.MjModel) -> dict[str, Any]:
@@ -238,9 +185,9 @@ def film(
     """
     check_video(path, size)
     stride = max(1, math.ceil(1 / (VIDEO_FPS * control_dt) - 1e-6))
-    shown = None if ctrl is None else np.asarray(ctrl)[::stride]
+    commands = itertools.repeat(None) if ctrl is None else np.asarray(ctrl)[::stride]
     with Renderer(scene, *size) as renderer:
-        return save_video(path, renderer.draw_all(np.asarray(qpos)[::stride], shown), 1 / (stride * control_dt))
+        return save_video(path, map(renderer.draw, np.asarray(qpos)[::stride], commands), 1 / (stride * control_dt))
 
 
 def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float) -> Path:
@@ -251,13 +198,28 @@ def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float
         OSError: the file cannot be written.
         RuntimeError: there is no encoder.
     """
+    import imageio_ffmpeg
+
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise ValueError("a video needs at least one frame")
-    path = check_video(path, first.shape[1::-1])
+    size, frames, target = first.shape[1::-1], itertools.chain([first], frames), MP4
+    path = check_video(path, size)
+    if path.suffix == ".gif":  # its delays are hundredths of a second, and browsers want at least two of them
+        stride = math.ceil(fps / 50 - 1e-6)
+        frames, fps, target = itertools.islice(frames, 0, None, stride), fps / stride, GIF
     with whole_file(path) as part:
-        _encode(part, itertools.chain([first], frames), fps, "x".join(map(str, first.shape[1::-1])))
+        options: dict[str, Any] = target | dict(quality=None, macro_block_size=1, ffmpeg_log_level="fatal")
+        try:
+            with closing(imageio_ffmpeg.write_frames(part, size, fps=fps, **options)) as encoder:
+                encoder.send(None)
+                count = sum(encoder.send(frame) is None for frame in frames)
+            whole = imageio_ffmpeg.count_frames_and_secs(part)[0] == count  # ffmpeg's own errors are not seen
+        except (OSError, RuntimeError) as error:
+            raise OSError("ffmpeg fails, or the disk is full") from error
+        if not whole:
+            raise OSError("ffmpeg fails, or the disk is full")
     return path
 
 
@@ -275,37 +237,8 @@ def check_video(path: str | os.PathLike[str], size: Sequence[int] = VIDEO_SIZE) 
         raise ValueError(f"a video ends in .mp4 or .gif, not {path.suffix!r}")
     if path.suffix == ".mp4" and (width % BLOCK or height % BLOCK):
         raise ValueError(f"width and height of an .mp4 are multiples of {BLOCK}; {width} x {height} are not")
-    _ffmpeg()
+    import_module("imageio_ffmpeg").get_ffmpeg_exe()
     return path
-
-
-def _ffmpeg() -> str:
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-
-        return get_ffmpeg_exe()
-    except (ImportError, RuntimeError) as error:
-        raise RuntimeError("no ffmpeg to write videos: pip install --force-reinstall imageio-ffmpeg") from error
-
-
-def _encode(path: Path, frames: Iterable[Frame], fps: float, size: str) -> None:
-    """As imageio_ffmpeg.write_frames does, which neither sees that ffmpeg fails nor keeps what it says."""
-    if path.suffix == ".gif":  # its delays are hundredths of a second, and browsers want at least two of them
-        stride = math.ceil(fps / 50 - 1e-6)
-        frames, fps = itertools.islice(frames, 0, None, stride), fps / stride
-        target = "-lavfi split[a][b];[a]palettegen[colours];[b][colours]paletteuse=dither=none -loop 0"
-    else:  # faststart: browsers begin to play before they have loaded all of it
-        target = "-vcodec libx264 -pix_fmt yuv420p -crf 15 -preset veryfast -movflags +faststart"
-    source = f"-f rawvideo -pix_fmt rgb24 -s {size} -r {Fraction(fps).limit_denominator()} -i -"
-    command = [_ffmpeg(), "-y", "-v", "error", *source.split(), *target.split(), os.fspath(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
-        assert ffmpeg.stdin
-        with suppress(BrokenPipeError):  # why, stderr says
-            for frame in frames:
-                ffmpeg.stdin.write(frame.tobytes())
-        said = ffmpeg.communicate()[1].decode(errors="replace").strip().rpartition("\n")[2]
-    if ffmpeg.returncode:
-        raise OSError(f"ffmpeg fails: {said or f'exit status {ffmpeg.returncode}'}")
 
 
 @contextmanager
@@ -330,77 +263,21 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             part.unlink()
 
 
-# OpenGL ---------------------------------------------------------------------------------------------------------------
-
-
+@functools.cache
 def check_opengl() -> str:
-    """What draws pictures here, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"; raises RuntimeError with the remedy."""
-    context = _gl_context(16, 16)
-    try:
-        return _gl_renderer()
-    finally:
-        context.free()
+    """What draws pictures here, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"; raises RuntimeError with the remedy.
 
-
-def check_display() -> bool:
-    """Whether OpenGL runs on the CPU in a window that can be opened here.
-
-    It leaves EGL alone: a process that has used both EGL and a window crashes at its end.
-
-    Raises:
-        RuntimeError: there is no display, or it knows no OpenGL.
+    MUJOCO_GL chooses the OpenGL before MuJoCo is imported. Without it, on Linux, it is EGL, which needs no display.
     """
-    import glfw
-
-    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    with warnings.catch_warnings():  # GLFW warns instead of raising
-        warnings.simplefilter("ignore")
-        if not glfw.init():
-            raise RuntimeError(f"display {display} does not answer" if display else "there is no display")
-        glfw.window_hint(glfw.VISIBLE, 0)
-        window = glfw.create_window(16, 16, "diffsim", None, None)
-        if not window:
-            raise RuntimeError(f"display {display} has no OpenGL")
-        glfw.make_context_current(window)
-        software = _is_software()
-        glfw.destroy_window(window)
-        glfw.default_window_hints()
-    return software
-
-
-def _gl_context(width: int, height: int) -> Any:
-    """A current OpenGL context of MuJoCo's, from MUJOCO_GL or, on Linux, EGL; raises RuntimeError with the remedy."""
-    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
-    platform = os.environ.get("PYOPENGL_PLATFORM", "egl").lower()
-    if wanted in ("disable", "disabled", "off", "false", "0"):
-        raise RuntimeError(f"MUJOCO_GL={wanted} forbids to draw: unset it")
-    if sys.platform != "linux":
-        module, remedy = "mujoco", "no OpenGL to draw with"
-    elif wanted == "osmesa":
-        module = "mujoco.osmesa"
-        remedy = "MUJOCO_GL=osmesa, but OSMesa is not there: unset MUJOCO_GL, or apt install libosmesa6"
-    elif wanted in ("glfw", "glx"):
-        module, remedy = "mujoco.glfw", f"MUJOCO_GL={wanted}, but no display is there: unset MUJOCO_GL"
-    else:
-        module = "mujoco.egl"
-        remedy = REMEDY if platform == "egl" else f"PYOPENGL_PLATFORM={platform} excludes EGL: unset it"
+    wanted = os.environ.get("MUJOCO_GL")
     os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # Mesa prints its search for drivers otherwise
     try:
-        if module == "mujoco.glfw":
-            check_display()
-        context = import_module(module).GLContext(width, height)
-        context.make_current()
-    except Exception as error:  # each of them fails in its own ways, AttributeError among them
-        raise RuntimeError(remedy) from error
-    return context
+        if sys.platform == "linux" and not wanted:
+            sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = import_module("mujoco.egl").GLContext
+        with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16):
+            from OpenGL.GL import GL_RENDERER, glGetString
 
-
-def _gl_renderer() -> str:
-    from OpenGL.GL import GL_RENDERER, glGetString
-
-    return glGetString(GL_RENDERER).decode()
-
-
-def _is_software() -> bool:
-    """Whether the current OpenGL runs on the CPU."""
-    return any(software in _gl_renderer() for software in ("llvmpipe", "softpipe", "swrast"))
+            return glGetString(GL_RENDERER).decode()
+    except Exception as error:  # each OpenGL fails in its own ways, AttributeError among them
+        remedy = f"unset MUJOCO_GL={wanted}" if wanted else "apt install libegl1 libgl1 libgl1-mesa-dri"
+        raise RuntimeError(f"no OpenGL to draw with: {remedy} (or your system's EGL and Mesa)") from error

@@ -94,13 +94,12 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
         "meshes": _meshes([*surfaces.values()]),
         "muscles": [_muscle(model, tendon) for tendon in activations(model, ctrl)[0]],
         "camera": orbit(model),
-        **frames(model, qpos[::stride], ctrl),
+        **encode(model, *poses(model, qpos[::stride]), ctrl),
     }
 
 
-def frames(model: mujoco.MjModel, qpos: NDArray[np.float64], ctrl: Array) -> dict[str, str]:
-    """What moves, of configurations qpos (T, nq) with ctrl (T, nu): numbers in the page's order, as base64."""
-    poses, track = _poses(model, qpos)
+def encode(model: mujoco.MjModel, poses: Array, track: Array, ctrl: Array) -> dict[str, str]:
+    """What moves, with what `poses` found and ctrl (T, nu): numbers in the page's order, as base64."""
     activation = activations(model, ctrl)[1]
     return {
         "poses": _base64(poses.astype("<f4")),
@@ -109,7 +108,7 @@ def frames(model: mujoco.MjModel, qpos: NDArray[np.float64], ctrl: Array) -> dic
     }
 
 
-def _poses(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poses(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(T, nbody, 7) position and quaternion wxyz of each body, and (T, 3) what the camera follows.
 
     That is the centre of mass of the body that carries the camera, at its mean height, so that the picture keeps still.

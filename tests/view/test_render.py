@@ -1,25 +1,37 @@
-"""Pictures and videos: what is drawn follows qpos and stands upright, videos play at true speed, mistakes are named."""
+"""Pictures and videos: what is drawn follows qpos and stands upright, videos play at true speed, mistakes are named.
+
+The window of render_mode "human" and of view.py is tested without a display.
+"""
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import scenes
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 import diffsim.tasks
 import shac
+import view
 from diffsim import Scene, load_scene
 from diffsim.training.evaluation import Evaluation
 from diffsim.view import render
 from diffsim.view.render import Renderer, film, save_video
 
+Array = NDArray[np.float64]
 ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
 HOPPER = load_scene(ASSETS / "hopper.xml")
 
@@ -32,9 +44,9 @@ def opengl() -> None:
         pytest.skip(str(error))
 
 
-def frames_of(scene: Scene, qpos: ArrayLike, *size: int, ctrl: ArrayLike | None = None, **options: Any) -> np.ndarray:
-    with Renderer(scene, *size, **options) as renderer:
-        return np.stack([*renderer.draw_all(qpos, ctrl)])
+def frames_of(scene: Scene, qpos: Array, *size: int, ctrl: Iterable[Array | None] = repeat(None)) -> np.ndarray:
+    with Renderer(scene, *size) as renderer:
+        return np.stack([*map(renderer.draw, qpos, ctrl)])
 
 
 def grey(count: int, size: int = 16) -> Iterator[np.ndarray]:
@@ -77,21 +89,23 @@ def test_a_renderer_draws_again_and_again_beside_another(opengl: None) -> None:
         np.testing.assert_array_equal(other.draw(upright), first)
         assert (one.draw(bent) != first).any()
         np.testing.assert_array_equal(one.draw(upright), first)
-        with pytest.raises(ValueError, match=r"qpos must have shape \(6,\), not \(5,\)"):
+        with pytest.raises(ValueError, match=r"shape \(5,\) into shape \(6,\)"):
             one.draw(np.zeros(5))
-    one.close()
 
 
-def test_quality_changes_no_content(opengl: None) -> None:
-    fast, full = (frames_of(HOPPER, np.zeros((1, 6)), 160, 112, fast=fast)[0].astype(int) for fast in (True, False))
-    assert (abs(fast - full).max(-1) > 60).mean() < 0.03  # edges alone
+def test_quality_changes_no_content(opengl: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    full, fast = np.zeros((2, 112, 160, 3), int)
+    for frame, where in ((full, "a GPU"), (fast, "llvmpipe")):
+        monkeypatch.setattr(render, "check_opengl", lambda where=where: where)
+        frame[:] = frames_of(HOPPER, np.zeros((1, 6)), 160, 112)[0]
+    assert (fast != full).any() and (abs(fast - full).max(-1) > 60).mean() < 0.03  # edges alone
 
 
 def test_a_robot_without_a_camera_is_followed(opengl: None, tmp_path: Path) -> None:
     file = tmp_path / "ball.xml"
     file.write_text(scenes.BALL.replace('size="0.1"', 'size="0.3" rgba="1 0 0 1"'))
     for x in (0.0, 50.0):
-        frame = frames_of(load_scene(file), [[x, 0, 1, 1, 0, 0, 0]], 64, 48)[0].astype(int)
+        frame = frames_of(load_scene(file), np.array([[x, 0, 1, 1, 0, 0, 0]]), 64, 48)[0].astype(int)
         assert (frame[..., 0] - frame[..., 2] > 50).sum() > 50
 
 
@@ -106,56 +120,102 @@ def test_muscles_are_coloured_by_activation(opengl: None) -> None:
     red, blue = (frames[:2, ..., k].astype(int) - frames[:2, ..., 2 - k] for k in (0, 2))
     assert ((red > 60).sum((1, 2)) > 100).tolist() == [False, True]
     assert (blue[0] - blue[1] > 60).sum() > 100
-    with pytest.raises(ValueError, match=r"ctrl must have shape \(3, 152\), not \(3, 2\)"):
-        frames_of(muscles, qpos, ctrl=ctrl[:, :2])
 
 
-def test_mistakes_are_named(opengl: None) -> None:
-    with pytest.raises(ValueError, match=r"shape \(6, 6\), not \(6,\)"):
-        frames_of(HOPPER, np.zeros(6))
-    with pytest.raises(ValueError, match="no camera 'side' in this scene; it has: track"):
-        frames_of(HOPPER, np.zeros((1, 6)), camera="side")
+# OpenGL or a display that is not there --------------------------------------------------------------------------------
 
 
-# OpenGL that is not there ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the ways of Linux")
-@pytest.mark.parametrize(
-    ("variables", "remedy"),
-    [
-        ({}, "apt install libegl1 libgl1 libgl1-mesa-dri"),
-        ({"DISPLAY": ":77"}, "apt install libegl1"),
-        ({"PYOPENGL_PLATFORM": "glx"}, "PYOPENGL_PLATFORM=glx excludes EGL: unset it"),
-        ({"MUJOCO_GL": "osmesa"}, "MUJOCO_GL=osmesa, but OSMesa is not there: unset MUJOCO_GL, or apt install libosm"),
-        ({"MUJOCO_GL": "glfw"}, "MUJOCO_GL=glfw, but no display is there: unset MUJOCO_GL"),
-        ({"MUJOCO_GL": "glx", "DISPLAY": ":77"}, "MUJOCO_GL=glx, but no display is there: unset MUJOCO_GL"),
-        ({"MUJOCO_GL": "off"}, "MUJOCO_GL=off forbids to draw: unset it"),
-    ],
-)
-def test_missing_opengl_is_named_with_its_remedy(
-    variables: dict[str, str], remedy: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    for module in ("mujoco.egl", "mujoco.osmesa"):
-        monkeypatch.setitem(sys.modules, module, None)  # its import fails
-    with pytest.raises(RuntimeError) as error:
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL is Linux's")
+def test_missing_opengl_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    render.check_opengl.cache_clear()
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setitem(sys.modules, "mujoco.egl", None)  # its import fails
+    with pytest.raises(RuntimeError, match="no OpenGL to draw with: apt install libegl1 libgl1 libgl1-mesa-dri"):
         Renderer(HOPPER, 8, 8)
-    assert remedy in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_opengl_that_is_chosen_but_not_there() -> None:
+    program = """
+import os
+import diffsim
+from diffsim.view import render
+try:
+    render.Renderer(diffsim.make("cartpole").scene)
+except RuntimeError as error:
+    print(error)"""
+    ran = subprocess.run([sys.executable, "-c", program], env=os.environ | {"MUJOCO_GL": "off"}, capture_output=True)
+    assert ran.stdout.startswith(b"no OpenGL to draw with: unset MUJOCO_GL=off"), ran.stderr
 
 
 def test_capture_video_fails_before_the_training_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    def none() -> str:
+        raise RuntimeError("no OpenGL")
+
     monkeypatch.setattr(sys, "argv", ["shac.py"])
-    monkeypatch.setenv("MUJOCO_GL", "off")
+    monkeypatch.setattr(render, "check_opengl", none)
     with pytest.raises(SystemExit) as exit:
         shac.main(["--env", "cartpole", "--capture-video", "--run-dir", str(tmp_path / "run")])
-    line = "shac.py: --capture-video: MUJOCO_GL=off forbids to draw: unset it\n"
+    line = "shac.py: --capture-video: no OpenGL\n"
     assert exit.value.code == 2 and capsys.readouterr() == ("", line) and not (tmp_path / "run").exists()
+
+
+def test_human_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("glfw.init", lambda: False)
+    with pytest.raises(RuntimeError, match="there is no display; take 'rgb_array'"):
+        gymnasium.make("diffsim/Hopper-v0", render_mode="human").reset()
+
+
+class Viewer:
+    """What mujoco.viewer.launch_passive returns."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> None:
+        self.data, self.open, self.shown = data, True, list[np.ndarray]()
+        self.cam, self.user_scn = mujoco.MjvCamera(), mujoco.MjvScene(model, 1000)
+
+    def lock(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def sync(self) -> None:
+        self.shown.append(self.data.qpos.copy())
+
+    def is_running(self) -> bool:
+        return self.open and len(self.shown) < 20
+
+    def close(self) -> None:
+        self.open = False
+
+
+@pytest.fixture
+def viewers(monkeypatch: pytest.MonkeyPatch) -> list[Viewer]:
+    """All windows that were opened."""
+    opened = list[Viewer]()
+    monkeypatch.setattr("glfw.init", lambda: True)
+    launch = lambda *arguments, **options: opened.append(Viewer(*arguments, **options)) or opened[-1]  # noqa: E731
+    monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
+    return opened
+
+
+def test_human_follows_the_first_environment(viewers: list[Viewer]) -> None:
+    env = gymnasium.make_vec("diffsim/Hopper-v0", num_envs=2, render_mode="human")
+    assert not viewers
+    env.reset(seed=0)
+    started = time.perf_counter()
+    for _ in range(6):
+        env.step(torch.zeros(2, 3))
+    assert time.perf_counter() - started > 3 / 60  # at true speed
+    (viewer,) = viewers
+    assert len(viewer.shown) == 7 and env.render() is None and viewer.cam.trackbodyid == 1
+    np.testing.assert_allclose(viewer.shown[6], env.qpos[0])
+    env.close()
+    assert not viewer.open
+
+
+def test_the_policy_acts_until_the_window_is_closed(viewers: list[Viewer]) -> None:
+    env = diffsim.make("hopper", 1, early_termination=False)
+    view.play(env, torch.nn.Linear(env.task.obs_dim, 3), seed=1)
+    assert env.episode_step.item() == len(viewers[0].shown) == 20 and not viewers[0].open
 
 
 # Videos ---------------------------------------------------------------------------------------------------------------
@@ -211,11 +271,7 @@ def test_an_mp4_asked_for_is_written_or_refused(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(OSError, match="folder.mp4"):
         save_video(tmp_path / "folder.mp4", grey(1), 30)
-    for program in ("/bin/false", "/nowhere/ffmpeg"):
-        monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda program=program: program)
-        with pytest.raises(OSError, match="cannot write .*b.mp4"):
-            save_video(tmp_path / "b.mp4", grey(1), 30)
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # its import fails
-    with pytest.raises(RuntimeError, match="pip install --force-reinstall imageio-ffmpeg"):
-        save_video(tmp_path / "c.mp4", grey(1), 30)
+    monkeypatch.setattr("imageio_ffmpeg._io.get_ffmpeg_exe", lambda: "/bin/false")
+    with pytest.raises(OSError, match="cannot write .*b.mp4"):
+        save_video(tmp_path / "b.mp4", grey(1), 30)
     assert [path.name for path in tmp_path.iterdir()] == ["folder.mp4"]
