@@ -31,7 +31,6 @@ from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.lbfgs import maximise
 from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import System
-from diffsim.planning.terrains import named_terrains, random_terrain
 from diffsim.tasks import find_task
 from diffsim.training import distributed, evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
@@ -40,7 +39,9 @@ from diffsim.training.layers import ObsNormalizer
 from diffsim.training.ranges import Count, Finite, Natural, NonNegative, Positive, Repeats
 from diffsim.training.run import Run
 
-LESSONS, REACH, BLEND = 20_000, 0.5, 0.1  # feedback: states of a fit; how far a guide teaches; over which guides mix
+# Of feedback: states of a fit; how far a guide teaches, and over which distance guides mix; last steps of a guide that
+# do not teach, as what comes after them costs nothing; the largest action before tanh that is taught
+LESSONS, REACH, BLEND, TAIL, BOUND = 20_000, 0.5, 0.1, 20, 2.0
 # fmt: off
 COLUMNS = ("variant", "horizon", "reward", "action_cost", "target_velocity", "target_height", "height_weight",
            "attitude_weight", "window", "tracking", "spread", "hidden", "noise", "perturb")
@@ -60,7 +61,7 @@ PER_TASK = {
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "imitation", "lbfgs_iterations", "perturb", "practice")
+    MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "imitation", "lbfgs_iterations", "perturb")
 
     variant: Literal["full", "feedback"] = "feedback"
     """full: the paper's algorithm; feedback: its first iterations imitate the guides' feedback (ours; per task)"""
@@ -100,10 +101,6 @@ class Args(Flags):
     """the guides' standard deviation relative to the policy's (0: as of exp(reward), the paper's; per task)"""
     guiding_samples: Repeats = 40
     """trajectories drawn from the guiding distributions"""
-    terrain: tuple[str, ...] = ("level",)
-    """train on each, with its own guides: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
-    practice: tuple[str, ...] = ()
-    """the policy's trajectories each go over a random terrain of these kinds, up to that size, not over --terrain"""
     adaptive: Natural = 0
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
     adaptive_iterations: Repeats = 50
@@ -128,10 +125,6 @@ class Args(Flags):
     """w_r starts at their geometric mean and is changed by factors of ten between them; 0 0: no regularizer"""
     imitation: Natural = 20
     """feedback: the first so many iterations imitate the guides, the others search"""
-    tail: Natural = 20
-    """feedback: the last so many steps of a guide teach nothing, as what comes after them costs nothing"""
-    bound: Positive = 2.0
-    """feedback: actions before tanh that are taught are within this"""
 
     def env_options(self) -> dict[str, Any]:
         return super().env_options() | {"control_dt": self.control_dt}
@@ -148,9 +141,7 @@ class Args(Flags):
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if self.env == "cartpole" and self.reward == "target":
             fail("--reward target needs a robot that walks or swims; cartpole has --reward native")
-        if not self.terrain:
-            fail("--terrain needs at least one name: level, incline:DEGREES, step:CM or rough:DEGREES")
-        most = max(2, self.guides * len(self.terrain))
+        most = max(2, self.guides)
         least = dict(horizon=2, guiding_samples=most, restarts=self.guides, samples=most)
         least |= dict(active=self.guiding_samples + self.samples, stored=self.active)
         for name, bound in least.items():
@@ -160,9 +151,6 @@ class Args(Flags):
             fail(f"--regularizer-bounds must be two numbers in order, not {self.regularizer_bounds}")
         if self.demonstration and self.guides > 1:
             fail("--demonstration is one trajectory: --guides must be 1")
-        if self.adaptive and len(self.terrain) > 1:
-            fail("--adaptive takes one --terrain")
-        named_terrains(*self.terrain, *(random_terrain(kind, torch.Generator()) for kind in self.practice))
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -171,12 +159,13 @@ class Args(Flags):
 class Search:
     """Algorithm 1, line by line, and all that its next iteration depends on."""
 
+    guided = True  # whether S begins with the guides
     NUMBERS = "w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        self.grounds = {name: self.over(name) for name in args.terrain}
-        self.system = self.over(*self.grounds) if len(self.grounds) > 1 else self.grounds[args.terrain[0]]
+        self.system = System(env, args.threads or None)
+        self.grounds = [self.system]  # what guides are planned on, --guides on each
         self.cost = AfterStep(self.system, lambda x, u: -self.reward(x, u))
         self.rng = torch.Generator().manual_seed(args.seed)  # on the CPU: the same numbers for every device
         self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn
@@ -186,30 +175,26 @@ class Search:
         self.floor, self.scale = -math.inf, 1.0  # least reward of a step; standard deviation of rewards
         self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
         self.control_steps = self.plan_steps = self.nonfinite = 0
-        sizes = (args.horizon + 1, self.system.nx), (args.horizon, self.system.nu), (args.horizon,)
-        x, u, finite = (torch.zeros(0, *size, dtype=REAL, device=self.system.device) for size in sizes)
-        self.S = SampleSet(self.system, self.network, self.measure(x, u, finite.bool()))
+        self.S = SampleSet(self.system, self.network)
         self.lessons: tuple[Tensor, ...] = ()  # what feedback fits
         self.student = self.network.theta  # the last of feedback's fits
 
     def prepare(self, say: Callable[[str], None], file: Path) -> dict[str, float]:
-        """Lines 1 to 4. Tells its progress, writes the plans to a file as soon as they exist, returns metrics."""
-        args, policy, plans = self.args, self.network, list[Plan]()
-        for name in self.grounds:
-            plans.append(self.plan(name, say))
-            best = [(plan.x[0], plan.u[0]) for plan in plans]
-            save_demonstration(self.system, best, file, list(self.grounds)[: len(plans)])
+        """Lines 1 to 4. Tells its progress, writes the plan to a file as soon as it exists, returns metrics."""
+        args, policy, plans = self.args, self.network, self.plans(say, file)
         self.plan_return = -sum(plan.cost.min().item() for plan in plans) / len(plans)
         policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
-        for ground, plan in zip(self.grounds.values(), plans, strict=True):  # line 1: guides about DDP solutions
+        for ground, plan in zip(self.grounds, plans, strict=True):  # line 1: guides about DDP solutions
             self.guides += self.guide(ground, plan, say)
-        self.plan_steps = sum(ground.steps for ground in self.grounds.values())
+        self.plan_steps = sum(ground.steps for ground in self.grounds)
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
         policy.standardise(guiding.obs, guiding.u)
         policy.theta = self.student = self.pretrain(guiding)  # line 3: initialise theta*
-        self.build(guiding)  # line 4: build S from the guides and theta*
-        self.S.best = len(self.S.generators)
+        self.S.samples = guiding.pick(slice(0))  # line 4: build S from the guides and theta*
+        if self.guided:
+            self.S.append(guiding, *self.guides)
+        self.S.initial = self.S.best = len(self.S.generators)
         own = self.draw(policy.theta, self.S.best)
         self.S.append(own, policy.theta)
         self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
@@ -247,18 +232,28 @@ class Search:
         S.prune(args.stored)
         return metrics | self.metrics(new)
 
-    def plan(self, terrain: str, say: Callable[[str], None]) -> Plan:
-        """Line 1: trajectory optimisation from random action sequences or a demonstration; the best results."""
-        args, system, T = self.args, self.grounds[terrain], self.args.horizon
+    def plans(self, say: Callable[[str], None], file: Path) -> list[Plan]:
+        """Line 1: a plan for each ground."""
+        plan = self.plan(self.system, say)
+        save_demonstration(self.system, plan.x[0], plan.u[0], file)
+        return [plan]
+
+    def plan(self, system: System, say: Callable[[str], None], row: int = 0, steps: int = 0) -> Plan:
+        """Trajectory optimisation from random action sequences or a demonstration; the best results.
+
+        Args:
+            row, steps: which trajectory of the demonstration, and so many steps of it (0: all) are followed.
+        """
+        args, T = self.args, self.args.horizon
 
         def show(iteration: int, costs: Tensor) -> None:
             if iteration % 10 == 9:
-                say(f"planning {terrain}, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
+                say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
 
         first = min(args.window or T, T)
         try:
             if args.demonstration:
-                x, u = load_demonstration(system, args.demonstration, T, terrain, first)
+                x, u = load_demonstration(system, args.demonstration, steps or T, row)
                 x, u = follow_demonstration(system, x, u, args.tracking)
             else:
                 u = starting_actions(args.restarts, first, system.nu, system.control_dt, self.rng).to(system.device)
@@ -295,11 +290,6 @@ class Search:
         """Line 3: the theta under which the guiding samples are likeliest."""
         return self.network.fit(self.network.initial(self.rng), guiding.obs, guiding.u, self.args.pretraining)
 
-    def build(self, guiding: Samples) -> None:
-        """Line 4: S begins with the guides and their samples."""
-        self.S.append(guiding, *self.guides)
-        self.S.initial = len(self.guides)
-
     def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
         """Line 7, from two starts (Section 5): theta*, and theta* fitted to the sample of the highest reward."""
         policy, iterations, top = self.network, self.args.lbfgs_iterations, S.returns.argmax()
@@ -329,9 +319,9 @@ class Search:
     def learn(self, samples: Samples) -> float:
         """Adds the guides' feedback at the states near them to the lessons; returns the share of these states."""
         x = samples.x[:, :-1].flatten(0, 1)
-        guides = [guide.first(max(len(guide.u) - self.args.tail, 1)) for guide in self.guides]
+        guides = [guide.first(max(len(guide.u) - TAIL, 1)) for guide in self.guides]
         # By the step that looks most like a state, as the policy does not see the time
-        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std, self.args.bound, BLEND)
+        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std, BOUND, BLEND)
         near = distance <= REACH  # far away feedback means nothing
         new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
         self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
@@ -375,10 +365,6 @@ class Search:
 
     # Trajectories -----------------------------------------------------------------------------------------------------
 
-    def over(self, *names: str) -> System:
-        """The robot over terrains: trajectory i over number i % n."""
-        return System(self.env, self.args.threads or None, None if names == ("level",) else named_terrains(*names))
-
     def reward(self, x: Tensor, u: Tensor) -> Tensor:
         """What is optimised (Section 6): reward (...) of u (..., nu), which led to x (..., nx)."""
         args, system = self.args, self.system
@@ -415,12 +401,9 @@ class Search:
 
     def draw(self, theta: Tensor, source: int = -1) -> Samples:
         """Trajectories of a policy, --samples of them; those without a source do not join S."""
-        system, count, kinds = self.system, self.args.samples, self.args.practice
+        count = self.args.samples
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
-        start = self.starts(count, source)
-        if kinds:
-            system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
-        return self.roll_out(system, theta, noise, start, source)
+        return self.roll_out(self.system, theta, noise, self.starts(count, source), source)
 
     def starts(self, count: int, source: int) -> Tensor:
         """(count, nx) near the guides' start. They have no part in the importance weights."""
@@ -431,12 +414,32 @@ class Search:
         return system.retract(x[:1].expand(count, -1), self.args.perturb * system.difference(x, x[:1]).std(0) * away)
 
     def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
-        """So many trajectories of guides in equal shares, each over its terrain, numbered from the first source on."""
+        """So many trajectories of guides in equal shares, numbered from the first source on."""
         self.control_steps += count * self.args.horizon
         shares = [self.noise(len(range(i, count, len(guides)))) for i in range(len(guides))]
-        grounds = [ground for ground in self.grounds.values() for _ in range(self.args.guides)]
+        grounds = [ground for ground in self.grounds for _ in range(self.args.guides)]
         parts = [self.measure(*g.sample(grounds[i], shares[i]), first + i) for i, g in enumerate(guides)]
         return Samples(*map(torch.cat, zip(*parts, strict=True)))
+
+    @torch.no_grad()
+    def evaluate(self) -> Evaluation:
+        """The best policy, with the same noise each time: the task's returns until it falls, and the optimised one."""
+        system, count = self.system, self.args.eval_episodes
+        noise = self.noise(count + 1, torch.Generator().manual_seed(SEED))
+        noise[0] = 0.0
+        rollouts = self.roll_out(system, self.network.theta, noise, self.guides[0].x[:1])
+        (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
+        fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & self.args.early_termination).int()
+        alive = fallen.cumsum(1) - fallen == 0
+        returns, lengths, forward, speed = (S.native * alive).sum(1), alive.sum(1), system.task.forward_column, None
+        if forward is not None:
+            x = S.x[..., forward]
+            distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
+            speed = (distance / (lengths * system.control_dt)).mean().item()
+        qpos, action = S.x[:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
+        others = dict(without_noise=without_noise, plan=self.plan_return, guides=self.guide_return[0])
+        others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
+        return Evaluation(returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
 
     @property
     def policy(self) -> nn.Sequential:
@@ -450,16 +453,12 @@ class Search:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         for name in self.NUMBERS:
-            if type(state[name]) is not type(getattr(self, name)):
-                raise ValueError(f"{name} is {state[name]!r}")
             setattr(self, name, state[name])
         device = self.system.device
         for name in ("guides", "adapted"):
             setattr(self, name, [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[name]])
         self.lessons, self.student = tuple(t.to(device) for t in state["lessons"]), state["student"].to(device)
         self.rng.set_state(state["rng"])
-        if any(guide.x.shape[-1] != self.system.nx or len(guide.u) != self.args.horizon for guide in self.guides):
-            raise ValueError("a guide is of another robot or horizon")
 
 
 # Importance sampling --------------------------------------------------------------------------------------------------
@@ -522,8 +521,10 @@ class Samples(NamedTuple):
 class SampleSet:
     """S: samples, and the distributions that they come from."""
 
-    def __init__(self, system: System, policy: Policy, samples: Samples) -> None:
-        self.system, self.policy, self.samples = system, policy, samples
+    samples: Samples
+
+    def __init__(self, system: System, policy: Policy) -> None:
+        self.system, self.policy = system, policy
         self.generators: list[LinearGaussian | Tensor] = []  # guides, the initial ones first, and policies as theta
         self.best = -1  # theta*'s index among them
         self.initial = 0  # initial guides among them
@@ -641,28 +642,6 @@ class Policy(nn.Module):
 # The run --------------------------------------------------------------------------------------------------------------
 
 
-@torch.no_grad()
-def evaluate(search: Search) -> Evaluation:
-    """The best policy, with the same noise each time: the task's own returns until it falls; also what is optimised."""
-    system, count = search.system, search.args.eval_episodes
-    noise = search.noise(count + 1, torch.Generator().manual_seed(SEED))
-    noise[0] = 0.0
-    rollouts = search.roll_out(system, search.network.theta, noise, search.guides[0].x[:1])
-    (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
-    fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & search.args.early_termination).int()
-    alive = fallen.cumsum(1) - fallen == 0
-    returns, lengths, forward, speed = (S.native * alive).sum(1), alive.sum(1), system.task.forward_column, None
-    if forward is not None:
-        x = S.x[..., forward]
-        distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
-        speed = (distance / (lengths * system.control_dt)).mean().item()
-    qpos, action = system.in_world(rollouts.x)[1:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
-    others = dict(without_noise=without_noise, plan=search.plan_return, guides=search.guide_return[0])
-    others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
-    motion = qpos, action, system.copies(count, 1), system.control_dt
-    return Evaluation(returns, lengths, speed, *motion, others)
-
-
 def train(args: Args, learner: type[Search] = Search) -> None:
     run = Run(args)
     search = run.restore(learner(args, run.eval_env))
@@ -672,10 +651,10 @@ def train(args: Args, learner: type[Search] = Search) -> None:
         before = search.control_steps
         run.log(search.iterate(iteration), search.control_steps - before)
         if run.evaluation_due:
-            run.log_evaluation(evaluate(search))
+            run.log_evaluation(search.evaluate())
 
 
-main = script(Args, train, partial(evaluate_checkpoint, learner=Search, method=evaluate))
+main = script(Args, train, partial(evaluate_checkpoint, learner=Search, method=Search.evaluate))
 
 if __name__ == "__main__":
     main()

@@ -21,17 +21,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
-from typing import Annotated
+from typing import Annotated, Any
 
+import gps_ground
+import gps_variants
 import numpy as np
 import torch
 import tyro
 from cells import Case, Runner, ScriptFlags
 from common import Line, Panel, check_names, checkpoint_of, parse, plot
-from gps_variants import CASES as VARIANTS
-from gps_variants import VariantArgs
 from groups import grouped, middle, numbers
-from tables import ROOT, Row, markdown, origins, read_csv, write_csv
+from tables import ROOT, Row, markdown, read_csv, write_csv
 from torch import Tensor
 
 import diffsim
@@ -46,6 +46,8 @@ CASES: dict[str, str] = GPS["cases"]  # what a run is called, and its flags
 PLANS: dict[str, str] = GPS["plans"]  # runs of gps.py that write a plan of benchmarks/plans/; others: results/README.md
 # What docs/gps.md shows, per task: cases, seeds, flags. Other seeds run as the first of their case.
 SUITE: dict[str, list[tuple[str, list[int], str]]] = GPS["suite"]
+SCRIPTS = {"--case": "gps_variants", "--terrain": "gps_ground", "--practice": "gps_ground"}  # by their own flags
+ARGS = {"gps": gps.Args, "gps_variants": gps_variants.VariantArgs, "gps_ground": gps_ground.GroundArgs}
 RUN = ("env", "variant", "seed")
 KEPT = (  # columns of progress.csv
     "iteration control_steps seconds return gps_objective gps_objective_std gps_accepted gps_regularizer gps_plan "
@@ -53,21 +55,17 @@ KEPT = (  # columns of progress.csv
     "eval_length gps_ess gps_guide_share gps_guide_nats gps_near gps_estimate gps_best_estimate sim_model_steps "
     "gps_start"
 ).split()
-PERTURBED = "full", "feedback", "feedback-short", "feedback-start"  # cases whose generalisation is measured
-TORQUED = "feedback-few", "feedback-short"  # cases whose torques are measured
 SPREADS = (1.0, 3.0, 10.0, 30.0, 0.0)  # the last one is of eta = 1
 COUNT = 20  # trajectories of guides, and perturbed starts and pushes of each size
 WEIGHED = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # control steps at which weights are told
 SHOWN = (1, 10, 50, 500)  # of them in the page
-MEASURED = "generalisation", "weights", "torques"  # csv files of a run
 KINDS = {"start": (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), "push": (0.5, 1.0, 2.0)}  # perturbations and their sizes
-DRAWN: list[str] = [case for case in VARIANTS if case != "one-start"]
-DRAWN += "full paper adaptive feedback feedback-short feedback-long".split()
+DRAWN = "unregularized effective nonguided restart single-example policy-gradient dagger full paper adaptive".split()
+DRAWN += "feedback feedback-short feedback-long".split()
 COLOURS = [*(f"C{i}" for i in range(10)), "k", "m", "y"]
 CONTROLLERS = {"policy": "C0", "ddp": "C3", "tbdp": "C1"}
 Runs = list[dict[str, str]]
 Act = Callable[[int, Tensor], Tensor]
-LISTED = "python benchmarks/gps_experiments.py --list"  # the commands of all runs
 
 
 @dataclass
@@ -113,20 +111,21 @@ def record(path: Path, actor: Path | None, steps: int) -> None:
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 
-def train(runner: Runner, name: str, flags: Sequence[str], count: int = COUNT) -> None:
+def script(flags: Sequence[str]) -> str:
+    """The script that takes these flags, without .py."""
+    return next((f"benchmarks/{name}" for flag, name in SCRIPTS.items() if flag in flags), "gps")
+
+
+def train(runner: Runner, name: str, flags: Sequence[str]) -> None:
     """Train a run, or resume it, or find that it is done, and measure its controllers and weights."""
     directory, (env, case, seed) = runner.args.runs / name, name.split("__")
-    script = "benchmarks/gps_variants" if case in VARIANTS else "gps"
     words = (*CASES[case].split(), "--threads", "1", *flags)
-    if not runner.train(Case(directory, env, int(seed), script, words)):
+    if not runner.train(Case(directory, env, int(seed), script(words), words)):
         return
-    for file, measure, wanted in (
-        ("generalisation.csv", lambda search: generalisation(search, count), case in PERTURBED),
-        ("weights.csv", weights, case.startswith("paper")),
-        ("torques.csv", torques, case in TORQUED),
-    ):
-        if wanted and not (directory / file).is_file():
-            write_csv(directory / file, measure(load_search(directory / "checkpoint.pt")))
+    for kind, (cases, measure) in MEASURES.items():
+        path = directory / f"{kind}.csv"
+        if case in cases and not path.is_file():
+            write_csv(path, list(measure(load_search(directory / "checkpoint.pt"))))
     print(f"{name}: done", flush=True)
 
 
@@ -148,7 +147,8 @@ def commands(args: Args) -> Iterator[str]:
     """One for each plan that the runs start from, then one for each run, of one thread."""
     for name, plan in PLANS.items():
         if name.split("_")[0] in args.env:
-            yield shlex.join(["python", "gps.py", *plan.split(), "--run-dir", f"runs/plans/{name}"])
+            flags = plan.split()
+            yield shlex.join(["python", f"{script(flags)}.py", *flags, "--run-dir", f"runs/plans/{name}"])
     runs = args.runs.relative_to(ROOT) if args.runs.is_relative_to(ROOT) else args.runs
     rest = ["--", *args.arguments] if args.arguments else []
     for name in jobs(args):
@@ -158,11 +158,13 @@ def commands(args: Args) -> Iterator[str]:
 
 
 def load_search(path: Path) -> gps.Search:
-    """The search of a checkpoint of gps.py or of gps_variants.py."""
+    """The search of a checkpoint of gps.py, gps_variants.py or gps_ground.py."""
     state = checkpoint.load(path)
-    settings, case = state["args"] | {"device": "cpu"}, state["args"].get("case")
-    args = VariantArgs(**settings) if case else gps.Args(**settings)
-    search = (VARIANTS[case] if case else gps.Search)(args, make_env(args, 1))
+    args = ARGS[state["script"]](**state["args"] | {"device": "cpu"})
+    kind: Any = gps_ground.Search if isinstance(args, gps_ground.GroundArgs) else gps.Search
+    if isinstance(args, gps_variants.VariantArgs):
+        kind = gps_variants.CASES[args.case]
+    search: gps.Search = kind(args, make_env(args, 1))
     checkpoint.restore(search, state)
     return search
 
@@ -193,30 +195,41 @@ def keeps(returns: Tensor, best: float) -> Tensor:
     return returns >= best - 0.25 * abs(best)
 
 
-def generalisation(search: gps.Search, count: int = COUNT) -> list[Row]:
+def ends(search: gps.Search, x: Tensor, u: Tensor, finite: Tensor) -> dict[str, object]:
+    """Mean return of trajectories, and the share that keeps the guides' mean."""
+    returns = search.measure(x, u, finite).returns
+    return scalars(mean=returns.mean(), kept=keeps(returns, search.guide_return[0]).double().mean())
+
+
+def pushed(search: gps.Search, start: Tensor, act: Act, kick: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Trajectories whose states change by a tangent vector a quarter of the time in."""
+    system, T = search.system, search.args.horizon // 4
+    x, u, finite = system.rollout(start, T, act)
+    later = system.rollout(system.retract(x[:, -1], kick), search.args.horizon - T, lambda t, x: act(T + t, x))
+    x, u = torch.cat((x, later[0][:, 1:]), 1), torch.cat((u, later[1]), 1)
+    return x, u, torch.cat((finite, later[2] & finite[:, -1:]), 1)
+
+
+def generalisation(search: gps.Search) -> Iterator[Row]:
     """Each controller from the same perturbed starts and under the same pushes.
 
     A start differs by a normal vector of `size` times the standard deviation of each coordinate over the plan; a push
-    changes the root's velocity along x by `size` m/s in either direction, a quarter of the time in. Kept are
-    trajectories by the guides' mean return.
+    changes the root's velocity along x by `size` m/s in either direction, a quarter of the time in.
     """
-    system, horizon, rows = search.system, search.args.horizon, list[Row]()
-    path = search.guides[0].x[:-1]
+    system, path = search.system, search.guides[0].x[:-1]
     spread = system.difference(path, path[:1]).std(0)
-    draws = torch.randn(count, system.nd, generator=torch.Generator().manual_seed(gps.SEED), dtype=REAL)
+    draws = torch.randn(COUNT, system.nd, generator=torch.Generator().manual_seed(gps.SEED), dtype=REAL)
     kick = torch.zeros_like(draws)
     kick[:, system.nv] = draws[:, 0].sign()
     for kind, size in ((kind, size) for kind, sizes in KINDS.items() for size in sizes):
-        start, push = path[:1].expand(count, -1), None
-        if kind == "start":
-            start = system.retract(start, size * spread * draws)
-        else:
-            push = horizon // 4, size * kick
+        start = path[:1].expand(COUNT, -1)
+        away = system.retract(start, size * spread * draws)
         for name, act in controllers(search).items():
-            returns = search.measure(*system.rollout(start, horizon, act, push)).returns
-            row = scalars(kind=kind, size=size, controller=name, mean=returns.mean(), std=returns.std(correction=0))
-            rows.append(row | scalars(kept=keeps(returns, search.guide_return[0]).double().mean()))
-    return rows
+            if kind == "push":
+                found = pushed(search, start, act, size * kick)
+            else:
+                found = system.rollout(away, search.args.horizon, act)
+            yield scalars(kind=kind, size=size, controller=name) | ends(search, *found)
 
 
 def noisy(act: Act, noise: Tensor) -> Act:
@@ -224,25 +237,23 @@ def noisy(act: Act, noise: Tensor) -> Act:
     return lambda t, x: act(t, x) + noise[:, t]
 
 
-def torques(search: gps.Search, count: int = COUNT) -> list[Row]:
+def torques(search: gps.Search) -> Iterator[Row]:
     """The motors' torques (N m) under each controller, without noise and with the policy's, and in guiding samples.
 
-    Means over steps and motors of their magnitude and square; `kept` is of the guides' mean return.
+    Means over steps and motors of their magnitude and square.
     """
     system, policy, guide = search.system, search.network, search.guides[0]
     gear = torch.tensor(system.scene.mj_model.actuator_gear[:, 0], dtype=REAL)
-    noise, horizon = search.noise(count, torch.Generator().manual_seed(gps.SEED)), search.args.horizon
-    start = guide.x[:1].expand(count, -1)
+    noise, horizon = search.noise(COUNT, torch.Generator().manual_seed(gps.SEED)), search.args.horizon
+    start = guide.x[:1].expand(COUNT, -1)
     cases = {("guide", "guide"): guide.sample(system, noise)}
     for name, act in controllers(search).items():
         cases[name, "none"] = system.rollout(start, horizon, act)
         cases[name, "policy"] = system.rollout(start, horizon, noisy(act, policy.sigma * noise))
-    rows = list[Row]()
-    for (name, kind), (x, u, finite) in cases.items():
-        torque, returns = gear * u.tanh(), search.measure(x, u, finite).returns
+    for (name, kind), found in cases.items():
+        torque = gear * found[1].tanh()
         row = scalars(controller=name, noise=kind, magnitude=torque.abs().mean(), square=torque.square().mean())
-        rows.append(row | scalars(mean=returns.mean(), kept=keeps(returns, search.guide_return[0]).double().mean()))
-    return rows
+        yield row | ends(search, *found)
 
 
 def width(guide: LinearGaussian, sigma: Tensor) -> Tensor:
@@ -250,14 +261,14 @@ def width(guide: LinearGaussian, sigma: Tensor) -> Tensor:
     return (guide.L.norm(dim=-1) / sigma).square().mean(-1)
 
 
-def weights(search: gps.Search) -> list[Row]:
+def weights(search: gps.Search) -> Iterator[Row]:
     """What importance sampling rests on, at some steps t: how theta* weighs the samples of S.
 
     Mean log weights (nats) of the guides' samples and of its own newest, effective samples, the guides' share of the
     weight; and up to t, per step, on the guides' samples: log pi - log q_guide (nats), the distance of the actions from
     the policy's mean and the guides' deviation, in deviations of the policy's noise.
     """
-    S, policy, rows = search.S.samples, search.network, list[Row]()
+    S, policy = search.S.samples, search.network
     log_pi, guides = policy.log_prob(policy.theta, S.obs, S.u), search.S.initial
     log_w, guided = gps.log_weights(log_pi, S.log_mixture), S.source < guides
     own, weight = (S.source == search.S.best).nonzero().flatten()[-search.args.samples :], log_w.softmax(0)
@@ -268,8 +279,14 @@ def weights(search: gps.Search) -> list[Row]:
         row = scalars(step=t, guides=log_w[guided, t - 1].mean(), own=log_w[own, t - 1].mean())
         row |= scalars(effective=1 / weight[:, t - 1].square().sum(), share=weight[guided, t - 1].sum())
         row |= scalars(gap=gap[guided, t - 1].mean() / t, away=away[guided, :t].mean().sqrt())
-        rows.append(row | scalars(wide=wide[:t].mean().sqrt()))
-    return rows
+        yield row | scalars(wide=wide[:t].mean().sqrt())
+
+
+MEASURES: dict[str, tuple[Sequence[str], Callable[[gps.Search], Iterator[Row]]]] = {  # csv files, and of which cases
+    "generalisation": (("full", "feedback", "feedback-short", "feedback-start"), generalisation),
+    "weights": (("paper", "paper-20"), weights),
+    "torques": (("feedback-few", "feedback-short"), torques),
+}
 
 
 def temperatures(env: str) -> Iterator[Row]:
@@ -281,7 +298,7 @@ def temperatures(env: str) -> Iterator[Row]:
     words = ["--env", env, *CASES["paper"].split(), *flags, "--device", "cpu", "--threads", "1"]
     args = parse_script(gps.Args, words)
     search = gps.Search(args, make_env(args, 1))
-    plan = search.plan("level", lambda _: None)
+    plan = search.plan(search.system, lambda _: None)
     search.network.sigma, best = (args.noise * plan.u[0].std(0)).clamp(min=1e-3), -plan.cost.item()
     for args.spread in SPREADS:
         (guide,) = search.guides = search.guide(search.system, plan, lambda _: None)
@@ -296,34 +313,20 @@ def temperatures(env: str) -> Iterator[Row]:
 
 def collect(args: Args) -> None:
     """From the runs to the csv files; rows of runs that are not here stay as they are there."""
-    found: dict[str, list[Row]] = {f"gps_{name}": [] for name in ("runs", *MEASURED)}
-    older: dict[str, set[str]] = {name: set() for name in found}  # of gps_runs all: progress.csv does not tell its own
-    for directory in (path.parent for path in args.runs.glob("*__*__*/progress.csv")):
+    for directory in sorted(path.parent for path in args.runs.glob("*__*__*/progress.csv")):
         run = dict(zip(RUN, directory.name.split("__"), strict=True))
-        run_of = run | {"horizon": json.loads((directory / "args.json").read_text())["horizon"]}
-        for row in read_csv(directory / "progress.csv"):
-            found["gps_runs"].append(run_of | {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT})
-        for name in MEASURED:
-            path = directory / f"{name}.csv"
-            found[f"gps_{name}"] += [run | row for row in read_csv(path)]
-            lines = {f"{line.rpartition('; ')[0]}; {LISTED}\n" for line in origins(path)}
-            older[f"gps_{name}"] |= lines
-            older["gps_runs"] |= lines
-
-    def run_name(row: Row) -> tuple[object, ...]:
-        return tuple(row[key] for key in RUN)
-
-    for name, rows in found.items():
-        here = {*map(run_name, rows)}
-        rows += [row for row in args.read(name) if run_name(row) not in here]
-        known = older[name] | {line for line in origins(args.csv(name)) if line.endswith(f"; {LISTED}\n")}
-        write_csv(args.csv(name), sorted(rows, key=run_name), older=sorted(known))
+        about = run | {"horizon": json.loads((directory / "args.json").read_text())["horizon"]}
+        rows = read_csv(directory / "progress.csv")
+        kept = [about | {key: f"{float(row[key]):.6g}" if row.get(key) else "" for key in KEPT} for row in rows]
+        args.replace("gps_runs", kept, RUN)
+        for name in MEASURES:
+            args.replace(f"gps_{name}", [run | row for row in read_csv(directory / f"{name}.csv")], RUN)
 
 
 def table(runs: Runs) -> list[Row]:
     """Of each case, the runs that were evaluated: means over seeds, and the best policy's last evaluation in each."""
     result = list[Row]()
-    for (env, case), own in grouped(runs, "env", "variant").items():
+    for (env, case), own in sorted(grouped(runs, "env", "variant").items()):
         seeds = [rows for rows in grouped(own, "seed").values() if any(row["eval_objective"] for row in rows)]
         if not seeds:
             continue

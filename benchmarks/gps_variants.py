@@ -28,8 +28,7 @@ LEAST = 5.0  # effective samples: half of what the policy draws
 class NonGuided(gps.Search):
     """S begins without the guides; they only pretrain the policy."""
 
-    def build(self, guiding: gps.Samples) -> None:
-        pass
+    guided = False
 
 
 class Restart(NonGuided):
@@ -75,8 +74,9 @@ class PolicyGradient(NonGuided):
 class DAgger(NonGuided):
     """Ross et al. 2011: the controller's actions at the states that the policy visits join the data."""
 
-    def build(self, guiding: gps.Samples) -> None:
+    def pretrain(self, guiding: gps.Samples) -> Tensor:
         self.lessons = guiding.obs, guiding.u
+        return super().pretrain(guiding)
 
     def iterate(self, iteration: int) -> dict[str, float]:
         new = self.draw(self.network.theta)
@@ -132,7 +132,7 @@ class VariantArgs(gps.Args):
 def main(argv: Sequence[str] | None = None) -> None:
     args = parse(VariantArgs, argv)
     search = CASES[args.case]
-    evaluate_checkpoint(args, search, gps.evaluate) if args.evaluate else gps.train(args, search)
+    evaluate_checkpoint(args, search, search.evaluate) if args.evaluate else gps.train(args, search)
 
 
 if __name__ == "__main__":

@@ -250,9 +250,9 @@ SCRIPTS = [*ROOT.glob("*.py"), *ROOT.glob("benchmarks/*.py"), *ROOT.glob("tools/
 
 @functools.cache
 def flags(script: Path) -> set[str]:
-    """The flags that a script takes: of the fields of its dataclass Args and of that one's bases."""
+    """The flags that a script takes: of the fields of its dataclass ...Args and of that one's bases."""
     known = SHARED | classes(script)
-    found, todo = {"--help"}, ["Args"]
+    found, todo = {"--help"}, [name for name in classes(script) if name.endswith("Args")]
     while todo:
         node = known.get(todo.pop())
         if node is None:

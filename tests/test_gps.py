@@ -6,7 +6,6 @@ import csv
 import json
 import math
 import sys
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,18 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import assert_refuses, assert_same, read_progress, refusal, run
+from learners import assert_refuses, assert_same, refusal, run
 from torch import Tensor
 
 import diffsim
 import gps
-from diffsim.planning import LinearGaussian, gaussian_log_prob, load_demonstration, save_demonstration
+from diffsim.planning import LinearGaussian, gaussian_log_prob, load_demonstration
 from diffsim.planning.lbfgs import maximise
-from diffsim.planning.terrains import named_terrains
 from diffsim.training import evaluate, load_policy, make_policy_env, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
-from diffsim.view import render
 from gps import log_mixture, log_weights, phi, sparse
 
 SMALL = (
@@ -264,9 +261,9 @@ def test_guides_reproduce_the_plan(search: gps.Search) -> None:
     assert abs(mean - plan) < 0.01 * abs(plan) and 0 < std < 0.01 * abs(plan)
 
 
-def test_lessons_end_where_the_guides_are_far(search: gps.Search) -> None:
+def test_lessons_end_where_the_guides_are_far(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
     """And the policy that they teach errs less, in the units of the guides' covariance."""
-    search.args.tail = 0  # else the states after it are far
+    monkeypatch.setattr(gps, "TAIL", 0)  # else the states after it are far
     samples = search.measure(*search.guides[0].sample(search.system, 0.1 * search.noise(2)))
     assert search.learn(samples) == 1.0 and [len(part) for part in search.lessons] == [60, 60, 60]
     x = samples.x.clone()
@@ -304,10 +301,10 @@ def test_lessons_are_means_of_the_guides_within_the_bound(search: gps.Search, mo
     other = search.guides[0]._replace(u=search.guides[0].u + 1.0)
     monkeypatch.setattr(search, "guides", [search.guides[0], other])
     monkeypatch.setattr(search, "lessons", ())
-    monkeypatch.setattr(search.args, "tail", 0)
+    monkeypatch.setattr(gps, "TAIL", 0)
     S = search.measure(*search.guides[0].sample(search.system, 0 * search.noise(1)))
     bound = 0.5 * other.u.abs().max().item()
-    monkeypatch.setattr(search.args, "bound", bound)
+    monkeypatch.setattr(gps, "BOUND", bound)
     search.learn(S)
     expected = (other.u - 1.0).clamp(-bound, bound) / 2 + other.u.clamp(-bound, bound) / 2
     torch.testing.assert_close(search.lessons[1], expected)
@@ -388,7 +385,7 @@ def test_evaluation(trained: Path, rows: list[dict[str, str]], tmp_path: Path, s
     assert again["settings"]["substeps"] == 4 and again["lengths"] == [30] * 3
     for name in ("return", "objective", "objective_std", "without_noise", "plan", "guides"):
         assert again[name] == pytest.approx(float(rows[-1][f"eval_{name}"]), rel=1e-6)
-    assert gps.evaluate(search).qpos.shape == (30, 3, 2)
+    assert search.evaluate().qpos.shape == (30, 3, 2)
 
 
 def test_the_policy_acts_in_environments_as_it_does_in_the_search(trained: Path, search: gps.Search) -> None:
@@ -408,7 +405,7 @@ def test_an_evaluation_ends_where_the_robot_falls() -> None:
     nothing = [torch.zeros(0).double()] * 3
     search.guides = [LinearGaussian(search.system.start(), *nothing, *nothing[:2])]
     search.network.u_std, search.network.sigma = torch.zeros(3).double(), torch.full((3,), 0.1).double()
-    evaluation = gps.evaluate(search)
+    evaluation = search.evaluate()
     env = diffsim.make("hopper", 2, horizon=1, dtype=torch.float64, stochastic_init=False)
     noise = search.noise(3, torch.Generator().manual_seed(gps.SEED))[1:]
     env.reset()
@@ -476,7 +473,7 @@ def test_control_steps_of_another_length(tmp_path: Path, capsys: pytest.CaptureF
     env, state = make_policy_env(saved, 1), load(path, "gps")
     search = gps.Search(gps.Args(**state["args"]), make_env(gps.Args(**state["args"]), 1))
     restore(search, state)
-    assert env.control_dt == search.system.control_dt == gps.evaluate(search).control_dt == 0.05
+    assert env.control_dt == search.system.control_dt == search.evaluate().control_dt == 0.05
     assert search.guides[0].eta == 1.0 and np.load(path.parent / "plan.npz")["control_dt"] == 0.05
     plan = ["--demonstration", str(path.parent / "plan.npz")]
     assert "has control steps of 0.05 s, not of 0.01667 s" in refusal(lambda: gps.main([*TINY, *plan]), capsys)
@@ -489,110 +486,14 @@ def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
     assert search["guides"][0][0][0].tolist() == [0.3, 3.0, 0.0, 0.0]
 
 
-SLOPES = "level", "incline:15:-1", "incline:-15:-1"  # all but the first begin behind the start
-HOPPING = (
-    "--env hopper --horizon 8 --window 4 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 "
-    "--guiding-samples 6 --samples 6 --active 12 --stored 16 --lbfgs-iterations 2 --iterations 2 --eval-every 0 "
-    "--eval-episodes 2 --perturb 0 --quiet --terrain"
-).split()
-
-
-def test_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A guide on each, which is sampled there; trajectory i of the policy goes over terrain i % 3; a plan of each."""
-    taught, learn = list[list[int]](), gps.Search.learn
-    with monkeypatch.context() as patch:
-        patch.setattr(gps.Search, "learn", lambda s, S: (taught.append(S.source.tolist()), learn(s, S))[1])
-        run(gps, tmp_path, *HOPPING, *SLOPES)
-    assert taught[0] == [0, 1]  # every third of 0, 0, 1, 1, 2, 2
-    state = load(tmp_path / "checkpoint.pt", "gps")
-    search = gps.Search(gps.Args(**state["args"]), environment("hopper", 1))
-    restore(search, state)
-    assert len(search.guides) == search.S.initial == 3 and search.plan_steps == int(
-        float(read_progress(tmp_path)[0]["sim_model_steps"])
-    )
-    monkeypatch.setattr(search, "noise", lambda count, rng=None: torch.zeros(count, 8, 3).double())
-    search.args.perturb, S = 0.0, search.follow(search.guides, 6)
-    own = search.draw(search.network.theta)
-    for i, guide in enumerate(search.guides):
-        assert (S.source == i).sum() == 2
-        torch.testing.assert_close(S.x[S.source == i], guide.x.expand(2, -1, -1))
-        alone = search.roll_out(search.grounds[SLOPES[i]], search.network.theta, search.noise(1), guide.x[:1])
-        torch.testing.assert_close(own.x[i::3], alone.x.expand(2, -1, -1))
-    assert not any(torch.allclose(own.x[0], own.x[i]) for i in (1, 2))
-    plan = np.load(tmp_path / "plan.npz")
-    assert tuple(plan["terrain"]) == SLOPES and plan["action"].shape == (3, 8, 3)
-    for i, name in enumerate(SLOPES):  # each is the start of its own terrain's guide, and is followed to its end
-        again = make_search("hopper", f"--horizon 8 --terrain {name} --demonstration {tmp_path / 'plan.npz'}")
-        again.args.ilqr_iterations = 0
-        torch.testing.assert_close(again.plan(name, print).x[0], search.guides[i].x)
-    evaluation = gps.evaluate(search)  # beside these two one without noise, which is the first
-    world = evaluation.qpos[0, :, 1] - search.guides[0].x[0, 1]
-    torch.testing.assert_close(world, torch.tensor([1.0, -1.0]).double() * math.tan(math.radians(15.0)))
-    films: list[Any] = []
-    monkeypatch.setattr(render, "film", lambda path, scene, *_: films.append(scene.terrain))
-    for returns, name in (((0.0, 1.0), SLOPES[1]), ((1.0, 0.0), SLOPES[2])):  # of two, the worse one is filmed
-        replace(evaluation, returns=torch.tensor(returns)).save_video(tmp_path / "video.mp4")
-        np.testing.assert_allclose(films[-1][0, :3], named_terrains(name)[0])
-
-
-def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each trajectory has its own, drawn anew of the kinds in turn; a resumed run draws the same."""
-    kinds, drawn = ("incline:20", "rough:10:2"), list[str]()
-
-    def random_terrain(kind: str, rng: torch.Generator) -> str:
-        drawn.append(kind)
-        return f"incline:{40 * torch.rand(1, generator=rng).item() - 20}:-1"
-
-    monkeypatch.setattr(gps, "random_terrain", random_terrain)
-    arguments = [*HOPPING, "level", "--practice", *kinds, "--perturb", "0"]
-    whole = run(gps, tmp_path / "whole", *arguments)
-    assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
-    start, S = whole["modules"]["learner"]["guides"][0][0][0], whole["modules"]["S"]
-    own = S["samples"][0][S["samples"][5] > 0]
-    assert len(own) >= 6 and len(own[:, 1].unique(dim=0)) == len(own) and (own[:, 0] == start).all()
-    search = gps.Search(gps.Args(**whole["args"]), environment("hopper", 1))
-    restore(search, load(tmp_path / "whole" / "checkpoint.pt", "gps"))
-    monkeypatch.setattr(search, "noise", lambda count: torch.zeros(count, 8, 3).double())
-    assert len(search.draw(search.network.theta).x[:, 1].unique(dim=0)) == 6
-    run(gps, tmp_path / "parts", *arguments, "--stop-after", 1)
-    gps.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
-    parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
-    assert_same(parts["modules"], whole["modules"])
-
-
-def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None:
-    """Its first window is followed, and the rest is planned."""
-    path, search = tmp_path / "level.npz", make_search("hopper", "--horizon 8")
-    u = 0.1 * torch.ones(1, 8, 3).double()
-    x, _, _ = search.system.rollout(search.system.start(), 8, lambda t, _: u[:, t])
-    save_demonstration(search.system, [(x[0], u[0])], path)
-    flags = f"--horizon 8 --window 4 --terrain level step:-20:0.01 --demonstration {path}"
-    search = make_search("hopper", flags)
-    search.args.ilqr_iterations = 0
-    level, step = (search.plan(name, print) for name in search.grounds)
-    torch.testing.assert_close(level.x, x)
-    assert step.x.shape == x.shape and not torch.allclose(step.u, u)
-    ground = search.grounds["step:-20:0.01"]
-    torch.testing.assert_close(ground.rollout(step.x[:, 0], 8, lambda t, _: step.u[:, t])[0], step.x)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--env hopper --terrain hill", "terrain 'hill' must be level, incline:DEGREES"),
-        ("--env hopper --terrain level step:0", "terrain 'step:0': height is 0.0"),
-        ("--env hopper --terrain", "--terrain needs at least one name: level, incline:DEGREES"),
-        ("--env hopper --terrain rough:10:1:inf", "terrain 'rough:10:1:inf'"),
-        ("--env hopper --practice incline:100", "terrain 'incline:100': degrees is 100.0"),
-        ("--env hopper --practice rough:10 step:nan", "terrain 'step:nan': height is nan"),
         ("--env cartpole --horizon 4611686018427387904", "--horizon must be from 1 to 10,000, not 46"),
         ("--env cartpole --hidden 10001", "--hidden must be from 1 to 10,000, not 10001"),
         ("--env cartpole --restarts 4611686018427387904", "--restarts must be from 1 to 10,000"),
         ("--env cartpole --stored 4611686018427387904", "--stored must be from 1 to 10,000"),
         ("--env cartpole --pretraining 2147483648", "--pretraining must be from 1 to 10,000"),
-        ("--env hopper --practice incline:10:1", "kind of terrain 'incline:10:1' must be incline:DEGREES"),
-        ("--env hopper --terrain level step:1 step:2 --samples 2", "--samples must be at least 3, not 2"),
-        ("--env hopper --terrain level step:1 --adaptive 1", "--adaptive takes one --terrain"),
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant"),
         ("--env cartpole --horizon 1", "--horizon must be at least 2, not 1"),
         ("--env cartpole --guiding-samples 1", "--guiding-samples must be at least 2, not 1"),

@@ -14,8 +14,6 @@ from test_accuracy import source
 from test_gradient import check_gradients
 
 import diffsim
-from diffsim.planning.system import System
-from diffsim.planning.terrains import named_terrains
 from diffsim.robot.scene import Scene, TerrainError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -285,45 +283,6 @@ def test_a_window_is_differentiable_over_terrain():
     offsets = 1e-6 * torch.eye(6).double().view(6, 2, 3)
     expected = torch.stack([(total(start + d) - total(start - d)) / 2e-6 for d in offsets]).view(2, 3)
     torch.testing.assert_close(slope, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
-
-
-def test_planning_sees_the_terrain():
-    """States over the ground, on a slope that begins behind the start: the environment's, and their Jacobians."""
-    env = hoppers(incline(15.0, start=-2.0), 1, stochastic_init=False)
-    system = System(env)
-    start = torch.cat((env.qpos, env.qvel), 1)
-    assert start[0, 1] > 0.4 + system.start()[0, 1]
-    torch.testing.assert_close(system.in_world(system.start()[:, None])[:, 0], start)
-    torch.testing.assert_close(system.observe(system.start()), env.reset()[0])
-    u = torch.full((1, 3), 0.1).double()
-    x, _, _ = system.rollout(system.start(), 40, lambda t, _: u)
-    for t in range(1, 41):
-        obs, reward, *_ = env.step(torch.tanh(u))
-        torch.testing.assert_close(system.in_world(x)[0, t, :6], env.qpos[0])
-        torch.testing.assert_close(system.reward(x[:, t], u), reward)
-        torch.testing.assert_close(system.observe(x[:, t]), obs)
-    assert system.check_jacobians(x[0, 30:40:3], u.expand(4, -1)).max() < 1e-4
-
-
-def test_planning_over_several_terrains():
-    """Trajectory i goes over terrain i % M, and a controller gets its state over that."""
-    profiles = named_terrains("incline:15:-1", "step:30:0.05", "rough:10:1:3:-5")
-    together, seen = System(hoppers(None, 1), 1, profiles), []
-    start = together.start().repeat(5, 1)
-    start[3:, :2] += torch.tensor([0.3, 0.1])
-
-    def act(t, x):
-        seen.append(x)
-        return 0.5 * x[:, 6:9]
-
-    x, u, finite = together.rollout(start, 30, act)
-    assert finite.all() and torch.equal(torch.stack(seen, 1), x[:, :-1])
-    for i in range(5):
-        alone = System(hoppers(None, 1), 1, profiles[i % 3])
-        one = alone.rollout(start[i : i + 1], 30, act)
-        assert torch.equal(one[0][0], x[i]) and torch.equal(one[1][0], u[i])
-    with pytest.raises(ValueError, match="Jacobians need one terrain"):
-        together.jacobians(x[:, 0], u[:, 0], x[:, 1])
 
 
 # Input and pictures ---------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -65,12 +64,9 @@ class Dynamics:
             )
         return self._simulators[num_envs]
 
-    def copies(self, count: int, first: int = 0) -> Scene:
-        """The scene of so many copies from number `first` on; number i has terrain i % M of M."""
-        terrain = self.scene.terrain
-        if terrain is None or len(terrain) == 1:
-            return self.scene
-        return self.scene.with_terrain(terrain[np.arange(first, first + count) % len(terrain)])
+    def copies(self, count: int) -> Scene:
+        """The scene of so many trajectories."""
+        return self.scene
 
     def basis(self, x: Tensor) -> Tensor:
         """(..., nx, nd) derivative of `retract` at zero."""
@@ -110,13 +106,8 @@ class Dynamics:
         return tangent
 
     @torch.no_grad()
-    def rollout(
-        self, x: Tensor, steps: int, act: Callable[[int, Tensor], Tensor], push: tuple[int, Tensor] | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def rollout(self, x: Tensor, steps: int, act: Callable[[int, Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """n trajectories from x (n, nx) under u = act(t, x (n, nx)).
-
-        Args:
-            push: (t, (n, nd)) moves the states by this before step t.
 
         Returns:
             States (n, steps + 1, nx), actions (n, steps, nu) and whether finite (n, steps). A trajectory that leaves
@@ -126,8 +117,6 @@ class Dynamics:
         finite = torch.ones(len(x), dtype=torch.bool, device=self.device)
         states, actions, alive = [x], [], []
         for t in range(steps):
-            if push and push[0] == t:
-                x = self.retract(x, push[1])
             u = act(t, x)
             finite = finite & torch.isfinite(u).all(-1)
             u = torch.where(finite.unsqueeze(-1), u, torch.zeros_like(u))

@@ -32,7 +32,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs")
     path = directory / "cartpole__full__1"
     run(gps, path, *SMALL)
-    rows = experiments.generalisation(experiments.load_search(path / "checkpoint.pt"), 4)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiments, "COUNT", 4)
+        rows = list(experiments.generalisation(experiments.load_search(path / "checkpoint.pt")))
     write_csv(path / "generalisation.csv", rows)
     return directory
 
@@ -70,10 +72,29 @@ def test_nearest_controller_acts_by_the_step_that_looks_most_alike(runs: Path) -
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
 
 
+def test_a_push_moves_the_state_before_its_step(runs: Path) -> None:
+    """A quarter of the time in; a controller keeps its clock, and what left the finite numbers stays."""
+    search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
+    system, start, seen = search.system, search.system.start().expand(2, -1), list[int]()
+    kick = torch.tensor([[0.0, 0.0, 1.5, 0.0], [0.0, 0.0, -1.5, 0.0]]).double()
+
+    def act(t: int, x: torch.Tensor) -> torch.Tensor:
+        seen.append(t)
+        return torch.tensor([[0.3], [math.nan if t == 1 else 0.3]]).double()
+
+    x, u, finite = experiments.pushed(search, start, act, kick)
+    assert seen == list(range(12)) and x.shape == (2, 13, 4) and u.shape == (2, 12, 1)
+    assert finite.tolist() == [[True] * 12, [True] + [False] * 11]
+    plain = system.rollout(start[:1], 12, lambda t, _: u[:1, t])[0]
+    torch.testing.assert_close(x[0, :4], plain[0, :4])
+    after = system.rollout(x[:1, 3] + kick[:1], 9, lambda t, _: u[:1, t])[0]
+    torch.testing.assert_close(x[0, 4:], after[0, 1:])
+
+
 def test_torques(runs: Path) -> None:
     """Of the plan's own controller they are the plan's; a motor's is its gear times tanh(u)."""
     search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
-    rows = {(row["controller"], row["noise"]): row for row in experiments.torques(search, 4)}
+    rows = {(row["controller"], row["noise"]): row for row in experiments.torques(search)}
     assert len(rows) == 7 and rows["policy", "none"] != rows["policy", "policy"]
     force = search.guides[0].u.tanh() * float(search.system.scene.mj_model.actuator_gear[0, 0])
     ddp = rows["ddp", "none"]
@@ -85,7 +106,7 @@ def test_torques(runs: Path) -> None:
 def test_weights_at_some_steps(runs: Path) -> None:
     """By products of densities, which a few steps allow; the guide as a policy would weigh its samples alike."""
     search = experiments.load_search(runs / "cartpole__full__1" / "checkpoint.pt")
-    rows, S, policy = experiments.weights(search), search.S.samples, search.network
+    rows, S, policy = list(experiments.weights(search)), search.S.samples, search.network
     assert [row["step"] for row in rows] == [1, 2, 5, 10]
     mean = policy.mean(policy.theta, S.obs)
     away = (S.u - mean) / policy.sigma
@@ -115,8 +136,13 @@ def test_the_list_holds_a_command_for_each_run(capsys: pytest.CaptureFixture[str
 
 
 def parse(env: str, case: str, *flags: str) -> None:
-    kind = gps_variants.VariantArgs if case in gps_variants.CASES else gps.Args
-    training.parse(kind, ["--env", env, *experiments.CASES[case].split(), *flags])
+    words = [*experiments.CASES[case].split(), *flags]
+    check(words, "--env", env)
+
+
+def check(words: list[str], *others: str) -> None:
+    """Whether their script takes the flags."""
+    training.parse(experiments.ARGS[experiments.script(words).rpartition("/")[2]], [*words, *others])
 
 
 def test_the_list_holds_the_runs_that_the_page_shows() -> None:
@@ -132,13 +158,13 @@ def test_the_list_holds_the_runs_that_the_page_shows() -> None:
     files = {path.stem for path in (experiments.ROOT / "benchmarks" / "plans").glob("*.npz")}
     assert files == {*experiments.PLANS, "swimmer_500", "humanoid_500", "walker_switch_300"}
     for flags in experiments.PLANS.values():
-        training.parse(gps.Args, flags.split())
+        check(flags.split())
     for env, case, *flags in {(*name.split("__")[:2], *flags) for name, flags in jobs.items()}:  # seeds share them
         parse(env, case, *flags)
 
 
 def trained(runs: Path, name: str, flags: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    experiments.train(experiments.Runner(experiments.Args(runs=runs)), name, flags, 4)
+    experiments.train(experiments.Runner(experiments.Args(runs=runs)), name, flags)
     return capsys.readouterr().out.splitlines()[-1]
 
 

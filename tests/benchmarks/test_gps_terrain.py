@@ -1,8 +1,9 @@
-"""benchmarks/gps_terrain.py on a small run."""
+"""benchmarks/gps_terrain.py on a small run: what stands, what falls, and the tables."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import gps_experiments as experiments
@@ -11,38 +12,61 @@ import numpy as np
 import pytest
 import torch
 from common import DOCS, RESULTS, CheckpointFlags
+from gps_ground import named_terrains
 from learners import run
-from tables import markdown, read_csv
+from tables import Row, markdown, read_csv
 
 import gps
-from diffsim.planning.terrains import named_terrains
 
 SMALL = (
-    "--env hopper --horizon 3 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 --samples 2 "
+    "--env hopper --horizon 6 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 --samples 2 "
     "--guiding-samples 4 --active 8 --stored 8 --iterations 1 --lbfgs-iterations 2 --eval-every 0 --eval-episodes 1"
 ).split()
 
 
-def test_level_ground_repeats_the_plan_and_a_steep_slope_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    directory, output = tmp_path / "hopper__feedback__1", tmp_path / "results"
+@pytest.fixture(scope="module")
+def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs") / "hopper__feedback__1"
     run(gps, directory, *SMALL, "--quiet")
+    return directory
+
+
+def test_level_ground_repeats_the_plan_and_a_steep_slope_does_not(
+    hopper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(gps_terrain, "PLACES", [-0.5, 0.5])
     monkeypatch.setattr(gps_terrain, "SIZES", {"incline (degrees)": (0.0, 60.0)})
-    gps_terrain.main(CheckpointFlags(checkpoints=(directory,), output=output))
-    rows = {(row["size"], row["controller"]): row for row in read_csv(output / "gps_terrain.csv")}
-    assert len(rows) == 6
-    level, steep = (next(row for (s, c), row in rows.items() if (float(s), c) == (size, "ddp")) for size in (0.0, 60.0))
-    plan = experiments.load_search(directory / "checkpoint.pt").plan_return
-    assert float(level["median_return"]) == pytest.approx(plan, rel=1e-3)
+    gps_terrain.main(CheckpointFlags(checkpoints=(hopper,), output=tmp_path))
+    rows = {(float(row["size"]), row["controller"]): row for row in read_csv(tmp_path / "gps_terrain.csv")}
+    assert len(rows) == 6 and not read_csv(tmp_path / "gps_humanoid.csv")
+    level, steep = rows[0.0, "ddp"], rows[60.0, "ddp"]
+    plan = experiments.load_search(hopper / "checkpoint.pt").plan_return
+    assert float(level["median_return"]) == pytest.approx(plan, rel=5e-3)
     assert level["kept"] == level["walked"] == level["standing"] == "1"
     assert (
         float(steep["median_return"]) < float(level["median_return"]) and steep["walked"] == "0.5"
     )  # one starts on it
-    before = (output / "gps_terrain.csv").read_bytes()
-    gps_terrain.main(CheckpointFlags(draw_only=True, output=output))
-    assert before == (output / "gps_terrain.csv").read_bytes()
+    before = (tmp_path / "gps_terrain.csv").read_bytes()
+    gps_terrain.main(CheckpointFlags(draw_only=True, output=tmp_path))
+    assert before == (tmp_path / "gps_terrain.csv").read_bytes()
+
+
+def test_until_humanoids_fall(hopper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody falls within a tenth of a second, unless it starts in the ground; perturbed starts differ from none."""
+    sizes = {"policy's noise": (1.0,), "perturbed start": (0.0, 99.0), "rough, 1 m (degrees)": (3.0,)}
+    monkeypatch.setattr(gps_terrain, "HUMANOID", sizes)
+    monkeypatch.setattr(gps_terrain, "COUNT", 4)
+    monkeypatch.setattr(gps_terrain, "is_humanoid", lambda path: True)
+    gps_terrain.main(CheckpointFlags(checkpoints=(hopper,), output=tmp_path))
+    rows = {(row["case"], row["size"], row["controller"]): row for row in read_csv(tmp_path / "gps_humanoid.csv")}
+    assert len(rows) == 12 and not read_csv(tmp_path / "gps_terrain.csv")
+    noisy = [rows["policy's noise", "1", name] for name in ("ddp", "tbdp")]
+    assert all(float(row["seconds"]) == 0.1 for row in noisy)
+    still, far = rows["perturbed start", "0", "ddp"], rows["perturbed start", "99", "ddp"]
+    assert float(still["whole"]) == 1.0 > float(far["whole"]) and still["trajectories"] == "4"
+    assert float(still["speed"]) != float(noisy[0]["speed"])
+    rough = rows["rough, 1 m (degrees)", "3", "ddp"]  # level for the first metre
+    assert rough["speed"] == still["speed"] and rough["trajectories"] == "4"
 
 
 def test_terrains() -> None:
@@ -86,15 +110,36 @@ def test_table_means_over_seeds() -> None:
     assert (last["terrain"], last["11 terrains, random"], last["level"]) == ("all", "75", "20")
 
 
+def test_humanoids_table_means_over_seeds() -> None:
+    """A column a kind of run."""
+    rows = [
+        dict(env="humanoid", variant=variant, seed=str(seed), case="rough", size="3", controller=name)
+        | dict(seconds=str(4 * share + seed))
+        for variant in ("feedback", "other")
+        for name, share in (("policy", 0.25), ("ddp", 0.5), ("tbdp", 0.0))
+        for seed in (0, 2)
+    ]
+    (row,) = gps_terrain.humanoids(rows)
+    assert row == {"": "rough", "size": "3"} | dict.fromkeys(("feedback", "other"), "2.0 / 3.0 / 1.0")
+
+
 def test_until_a_fall() -> None:
-    x = torch.zeros(2, 4, 3)
+    """The way after it is not run, also by one that stands up again."""
+    x, up = torch.zeros(2, 4, 3), torch.tensor([[True] * 3, [True, False, True]])
     x[..., 0] = torch.tensor([0.5, 1.0, 2.0, 4.0])
-    x[1, :, 1] = torch.tensor([0.2, -0.2, -0.3, 0.2])  # sinks by half a metre at the third state
-    standing, distance = gps_terrain.until_fall(x, 1)
-    assert standing.tolist() == [True, False]
-    assert distance.tolist() == [3.5, 0.5]
+    steps, way = gps_terrain.until_fall(x, up)
+    assert steps.tolist() == [3, 1] and way.tolist() == [3.5, 0.5]
 
 
-def test_the_page_has_the_table_of_the_csv_file() -> None:
-    rows = [row for row in read_csv(RESULTS / "cpu" / "gps_terrain.csv") if row["env"] == "walker"]
-    assert markdown(gps_terrain.table(rows)) in (DOCS / "gps_terrain.md").read_text()
+def test_noise_is_of_its_own_step() -> None:
+    noise = torch.arange(6.0).view(1, 3, 2)
+    act = experiments.noisy(lambda t, x: 10 * t + x, noise)
+    assert act(2, torch.ones(1, 2)).tolist() == [[25.0, 26.0]]
+
+
+@pytest.mark.parametrize(
+    ("name", "table"), [("gps_terrain", gps_terrain.table), ("gps_humanoid", gps_terrain.humanoids)]
+)
+def test_the_page_has_the_tables_of_the_csv_files(name: str, table: Callable[..., list[Row]]) -> None:
+    rows = read_csv(RESULTS / "cpu" / f"{name}.csv")
+    assert markdown(table(rows)) in (DOCS / "gps_terrain.md").read_text()

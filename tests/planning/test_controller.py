@@ -7,16 +7,13 @@ import pytest
 import torch
 from systems import Linear, normal, task_system
 
-import diffsim
 from diffsim.planning import (
     LinearGaussian,
-    System,
     gaussian_log_prob,
     ilqr,
     maximum_entropy_controllers,
     nearest_feedback,
 )
-from diffsim.terrain import incline
 
 
 def test_the_maximum_entropy_controller(rng: np.random.Generator) -> None:
@@ -78,23 +75,6 @@ def test_feedback_is_that_of_the_step_that_looks_most_alike(rng: np.random.Gener
     at = torch.stack([guides[j].x[k] for j, k in zip(i, t, strict=True)])
     expected = ((system.observe(x) - system.observe(at)) / 2).square().mean(1).sqrt()
     torch.testing.assert_close(distance, expected)
-
-
-def test_on_a_terrain_the_place_does_not_count(rng: np.random.Generator) -> None:
-    """A guide's own is that of its own terrain; over level ground feedback heeds it."""
-    system = task_system("hopper")
-    over = System(diffsim.make("hopper", 1), 1, incline(10.0))
-    x, u = system.start()[0].expand(3, -1), normal(rng, 2, 3)
-    guide = LinearGaussian(x, u, normal(rng, 2, 3, 12), torch.eye(3).double().expand(2, 3, 3), u.sum(), u.sum())
-    near, scale = x[:1] + 0.01 * normal(rng, 1, 12), torch.ones(len(system.observed)).double()
-    far = near.clone()
-    far[0, 0] += 2.0
-    one, other = (nearest_feedback(over, [guide], state, scale)[0] for state in (near, far))
-    assert torch.equal(one, other)
-    expected = guide.u[0] + guide.K[0, :, 1:] @ (near - x[:1])[0, 1:]
-    torch.testing.assert_close(one[0], expected)
-    moved = nearest_feedback(system, [guide], far, scale)[0] - nearest_feedback(system, [guide], near, scale)[0]
-    torch.testing.assert_close(moved[0], 2.0 * guide.K[0, :, 0])
 
 
 def test_a_mean_of_the_controllers_that_are_near(rng: np.random.Generator) -> None:

@@ -71,12 +71,3 @@ def test_a_trajectory_that_blows_up_stays_where_it_was() -> None:
     assert finite.tolist() == [[True] * 5, [True, True, False, False, False], [True] * 5]
     assert torch.isfinite(x).all() and torch.isfinite(u).all() and torch.equal(x[1, 2], x[1, 5])
     assert system.steps - before == 15
-
-
-def test_a_push_moves_the_state_before_its_step() -> None:
-    system = task_system("cartpole")
-    start, push = torch.zeros(1, 4).double(), torch.tensor([[0.0, 0.0, 1.5, 0.0]]).double()
-    x, _, _ = system.rollout(start, 2, lambda t, _: torch.zeros(1, 1).double(), (1, push))
-    unpushed = one_step(system, start, torch.zeros(1, 1).double())
-    torch.testing.assert_close(x[:, 1], unpushed)
-    torch.testing.assert_close(x[:, 2], one_step(system, unpushed + push, torch.zeros(1, 1).double()))

@@ -32,9 +32,6 @@ def test_robot_and_integration_are_the_environments() -> None:
     assert system.scene.k_n == 1e5 and system.simulator(1).integration.substeps == 4
 
 
-def test_a_terrain_in_place_of_the_environments() -> None:
-    profile = incline(10.0, start=-1.0)
-    own, env = (System(diffsim.make("hopper", 1, terrain=t), 1, p) for t, p in ((None, profile), (profile, None)))
-    assert torch.equal(own.start(), env.start()) and own.in_world(own.start()[:, None])[0, 0, 1] > 0.1
-    u = torch.ones(1, 3).double()
-    assert torch.equal(own.rollout(own.start(), 3, lambda t, _: u)[0], env.rollout(env.start(), 3, lambda t, _: u)[0])
+def test_a_terrain_is_refused() -> None:
+    with pytest.raises(ValueError, match="plans need level ground"):
+        System(diffsim.make("hopper", 1, terrain=incline(10.0)))
