@@ -82,7 +82,7 @@ def test_the_pages_have_the_tables_of_the_csv_files(capsys: pytest.CaptureFixtur
 
 def test_the_command_counts_episodes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--env", "cartpole", "--parts", "long", "--steps", "15424", "--output", str(tmp_path)]
-    stability.main(parse(stability.Args, None, [*flags, "--runs", str(tmp_path)]))
+    stability.main(parse(stability.Args, None, flags))
     (row,) = read_csv(tmp_path / "stability_long.csv")
     assert row["control steps"] == "15424" and row["contained"] == "0" and row["episodes"] == "64"
     assert f"| cartpole | 15424 | 0 | {row['largest velocity']} | 64 |" in capsys.readouterr().out
