@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import diffsim.tasks
 from diffsim.robot.mjcf import load_scene
-from diffsim.tasks import SHAC_TASKS, TASKS, Task
+from diffsim.tasks import SHAC_TASKS, TASKS
 
 Array = NDArray[np.float64]
 ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
@@ -459,14 +459,3 @@ def test_resets_fill_the_benchmark_s_distribution(name: str) -> None:
     np.testing.assert_allclose(draws.mean(0), 0, atol=0.05)
     np.testing.assert_allclose(draws[:, uniform].var(0), 1 / 3, atol=0.03)
     assert np.abs(np.corrcoef(draws.T) - np.eye(draws.shape[1])).max() < 0.1
-
-
-def test_task_base_leaves_observation_and_reward_to_the_task() -> None:
-    class Empty(Task):
-        start = spread = (0.0, 0.0)
-
-    x = torch.zeros(1)
-    with pytest.raises(NotImplementedError):
-        Empty().observe(x, x, x)
-    with pytest.raises(NotImplementedError):
-        Empty().reward(x, x)
