@@ -317,7 +317,7 @@ class DiffEnv(VectorEnv):
         """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
         names = ("qpos", "qvel", "obs", "memory", "episode_step", "episode_return")
         parts = zip(names, (*self._state(), self.episode_step, self._episode_return), strict=True)
-        tensors = {name: part.detach().clone() for name, part in parts}
+        tensors = {name: part.detach().clone() for name, part in parts if name != "memory" or self.task.num_memory}
         return {"task": self.task.name, **tensors, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -328,6 +328,10 @@ class DiffEnv(VectorEnv):
         theirs, ours = (f"{len(x['qpos'])} x {x['task']} in {x['qpos'].dtype}" for x in (state, own))
         if theirs != ours:
             raise ValueError(f"the state is of {theirs}; this environment is {ours}")
+        for name, value in own.items():
+            if isinstance(value, Tensor) and value.shape != state[name].shape:
+                raise ValueError(f"the state's {name} has shape {tuple(state[name].shape)}, not {tuple(value.shape)}")
+        state = {"memory": self.memory} | state
         self._put(state[name].to(self.device) for name in ("qpos", "qvel", "obs", "memory"))
         self.episode_step.copy_(state["episode_step"])
         self._episode_return.copy_(state["episode_return"])

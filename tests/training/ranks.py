@@ -39,10 +39,8 @@ def sample_noise(actor: shac.Actor, horizon: int, num_envs: int) -> Tensor:
     return std * share(lambda n: torch.randn(horizon, n, len(std), generator=stream(actor)), num_envs)
 
 
-def draw(env: DiffEnv, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    width = env.task.num_random
-    rand = share(lambda n: torch.rand(steps, n, width, generator=stream(env)), env.num_envs)
-    return env._start_states(rand)
+def uniform(env: DiffEnv, steps: int, num_envs: int, width: int) -> Tensor:
+    return share(lambda n: torch.rand(steps, n, width, generator=stream(env)), num_envs)
 
 
 def restore(run: Run, learner: Learner, restore: Callable[[Run, Learner], Learner] = Run.restore) -> Learner:
@@ -55,7 +53,7 @@ def main(directory: str, *setting: str) -> None:
     finalize, distributed.finalize = distributed.finalize, lambda: None  # the ranks stay connected until the last one
     for script in (bptt, pfpn, ppo_baseline, sapo, shac):
         if script is shac:
-            shac.Actor.sample_noise, DiffEnv._draw, distributed.finalize = sample_noise, draw, finalize
+            shac.Actor.sample_noise, DiffEnv._uniform, distributed.finalize = sample_noise, uniform, finalize
         rank, path = distributed.rank(), Path(directory) / script.__name__
         script.main([*setting, "--run-dir", str(path)])
         run, learner = runs[-1]

@@ -153,7 +153,7 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
     feet = {name: gait.Foot(**numbers) for name, numbers in found["gait"].items()}
     assert [*feet] == [f"foot_{k}" for k in (1, 2, 3, 4)] and "\n".join(table) == gait.table(feet)
     assert returns.startswith("ant, 2 episodes")
-    assert finer == f"explicit with 32 substeps: return median {found['finer']['return']:.1f}, " + (
+    assert finer == f"semi_implicit with 32 substeps: return median {found['finer']['return']:.1f}, " + (
         f"{found['finer']['kept']:.1%} kept"
     )
     assert found["finer"]["kept"] == pytest.approx(found["finer"]["return"] / found["return"])
