@@ -41,7 +41,7 @@ def test_two_ranks_of_half_the_environments_are_one_of_all(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shac.Actor, "sample_noise", ranks.sample_noise)
-    monkeypatch.setattr(DiffEnv, "_draw", ranks.draw)
+    monkeypatch.setattr(DiffEnv, "_uniform", ranks.uniform)
     one, two = run(shac, tmp_path, *SETTING), load(directory / "shac" / "checkpoint.pt")
     for part in ("actor", "critic", "target"):  # the normalizer is a part of the actor
         for name, value in one["modules"][part].items():
