@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from diffsim import DiffEnv
 from diffsim.tasks import find_task
 from diffsim.training import command, evaluate, fail, gait, load_policy, make_policy_env
-from diffsim.training.evaluation import SEED
+from diffsim.training.evaluation import SEED, VIDEO_SECONDS
 from diffsim.view import render, web
 from diffsim.view.screen import Screen
 
@@ -45,7 +45,7 @@ class Args:
     """open MuJoCo's window and simulate there in real time"""
     plot: Path | None = None
     """draw the progress.csv of the runs: .png, .svg or .pdf"""
-    seconds: float = render.VIDEO_SECONDS
+    seconds: float = VIDEO_SECONDS
     """how much of an episode video and page show"""
     episodes: int = 8
     """of as many episodes they show the one of median return"""

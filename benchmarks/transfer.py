@@ -38,7 +38,7 @@ import diffsim
 from diffsim import DiffEnv, Integration, Scene, Simulator
 from diffsim.training import Count, Positive, fail, gait
 from diffsim.training.checkpoint import HOME
-from diffsim.training.evaluation import FINER
+from diffsim.training.evaluation import FINER, VIDEO_SECONDS
 from diffsim.view import render
 
 KEY = (*ABOUT[:-1], "condition")
@@ -180,7 +180,7 @@ def film(path: Path, env: DiffEnv, here: Motion, there: Motion) -> None:
     """The episode of median return here (left), and its start there (right), small as a gif; the fallen lie there."""
     episode = int(here.returns.argsort()[(len(here.returns) - 1) // 2])
     stride = max(1, math.ceil(1 / (render.VIDEO_FPS * env.control_dt) - 1e-6))
-    size, seconds = ((288, 208), 4.0) if path.suffix == ".gif" else (render.VIDEO_SIZE, render.VIDEO_SECONDS)
+    size, seconds = ((288, 208), 4.0) if path.suffix == ".gif" else (render.VIDEO_SIZE, VIDEO_SECONDS)
     renderer = partial(render.Renderer, env.scene, *size)
     count = min(max(here.lengths[episode], there.lengths[episode]), round(seconds / env.control_dt))
     with renderer() as left, renderer() as right:

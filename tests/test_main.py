@@ -206,6 +206,7 @@ import signal, sys, threading
 before = sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT)
 import diffsim, diffsim.training
 assert before == (sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT))
+assert "diffsim.view" not in sys.modules  # no training needs it
 """
     subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | PATH)
 

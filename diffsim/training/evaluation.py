@@ -24,10 +24,10 @@ from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.directory import check_writable
 from diffsim.training.errors import fail
 from diffsim.training.flags import Args, Flags
-from diffsim.view import render
 
 L = TypeVar("L", bound=Learner)
 
+VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
 ENOUGH = 0.97  # of the return, kept there
@@ -82,7 +82,7 @@ class Evaluation:
         """The episode of median return."""
         return int(self.returns.argsort()[(len(self.returns) - 1) // 2])
 
-    def median_episode(self, seconds: float = render.VIDEO_SECONDS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def median_episode(self, seconds: float = VIDEO_SECONDS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """qpos (T, nq) and action (T, nu) of the first seconds of the episode of median return."""
         qpos, action = self.episode(self.median)
         steps = max(1, round(min(len(qpos), seconds / self.control_dt)))
@@ -97,12 +97,14 @@ class Evaluation:
         """How each foot moves over the ground."""
         return gait.measure(self.scene, self.control_dt, (self.episode(k)[0] for k in range(len(self.returns))))
 
-    def save_video(self, path: Path, seconds: float = render.VIDEO_SECONDS) -> Path:
+    def save_video(self, path: Path, seconds: float = VIDEO_SECONDS) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
 
         Raises:
             OSError, RuntimeError: what is missing to draw or to write, see render.film.
         """
+        from diffsim.view import render  # a run without a video draws nothing
+
         (qpos, action), scene = self.median_episode(seconds), self.scene
         if scene.terrain is not None:
             scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])

@@ -19,7 +19,6 @@ from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
 from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, fits, flag
 from diffsim.training.variation import parse_ranges
-from diffsim.view import render
 
 ClipFile = Annotated[
     Clip | None,
@@ -182,6 +181,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     check_ranges(args)
     args.check()
     if args.capture_video and distributed.rank() == 0:
+        from diffsim.view import render
+
         try:
             render.check_opengl()
             render.check_video("video.mp4")

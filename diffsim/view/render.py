@@ -29,7 +29,6 @@ SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
 SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
 VIDEO_FPS = 30.0  # at most
-VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 LARGEST = 4096  # pixels of a side of a picture
 BLOCK = 16  # pixels; libx264 pads the sides of a picture to multiples of it
 # faststart: browsers begin to play before they have loaded all of it
