@@ -1,0 +1,44 @@
+"""Record examples/dog_trot.npz: the cycle of the shipped go2 policy's trot that ends closest to where it begins.
+
+python tools/record_trot.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from record import close, cycle
+from torch import Tensor
+
+import diffsim
+from diffsim.tasks.base import ASSETS
+from diffsim.tasks.imitation.clip import Clip
+from diffsim.training import load_policy
+
+COMMAND = (0.8, 0.0, 0.0)  # m/s forward, which the recorded dog follows
+PERIOD = 25  # control steps of go2 in a cycle of its gait
+
+
+@torch.no_grad()
+def record(steps: int = 350, settling: int = 150) -> Clip:
+    """The best cycle of four episodes, after some steps of settling."""
+    policy = load_policy(ASSETS.parent / "policies" / "go2.pt").network
+    env = diffsim.make("go2", num_envs=4, seed=1)
+    env.reset(seed=1)
+    frames, action = list[Tensor](), torch.zeros(4, env.scene.nu)
+    for _ in range(steps):
+        env.memory[:, :3] = torch.tensor(COMMAND)
+        action = policy(env.observe(env.qpos, env.qvel, action))
+        env.step(action)
+        frames.append(env.qpos.double().clone())
+    found = (cycle(motion, PERIOD, PERIOD) for motion in torch.stack(frames[settling:], dim=1))
+    qpos, _ = min(found, key=lambda each: each[1])
+    return Clip("dog_trot", close(qpos), loop=True)
+
+
+if __name__ == "__main__":
+    path = Path(__file__).resolve().parents[1] / "examples" / "dog_trot.npz"
+    np.savez_compressed(path, qpos=record().qpos.numpy().astype(np.float32), fps=50)
+    print(path)
