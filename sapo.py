@@ -229,9 +229,9 @@ class SAPO:
         score = {"reward": torch.zeros(K), "tied": torch.zeros(())}  # running mean reward; whether all members are one
         self.score = nn.ParameterDict(score).requires_grad_(False).to(env.device)
         limits = args.max_grad_norm, args.betas, self.score["tied"]
-        self.actor_optimizer = EnsembleAdam(self.actor, K, *limits)
-        self.critic_optimizer = EnsembleAdam(self.critics, K, *limits)
-        self.temperature_optimizer = EnsembleAdam(self.temperature, K, *limits)
+        self.actor_optimizer = EnsembleAdam(self.actor, 1, K, *limits)
+        self.critic_optimizer = EnsembleAdam(self.critics, args.critics, K, *limits)
+        self.temperature_optimizer = EnsembleAdam(self.temperature, 1, K, *limits)
         self.temperature_optimizer.lr.fill_(args.temperature_lr)
         self.target_entropy = torch.zeros((), device=env.device)
         samples = args.horizon * env.num_envs * (1 + args.symmetric) // K  # a window's of a member, for its critics
@@ -266,7 +266,7 @@ class SAPO:
         for optimizer in self.optimizers:
             optimizer.tie(member)
         for p in self.targets.parameters():
-            members = p.unflatten(0, (self.args.critics, -1))
+            members = p.view(self.args.critics, self.args.population, -1)
             members.copy_(members[:, member, None].clone().expand_as(members))
         self.score["tied"].fill_(1.0)
 

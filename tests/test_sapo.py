@@ -87,7 +87,7 @@ def test_without_its_additions_it_is_shac() -> None:
     def give(ours: nn.Module, layers: list[nn.Module]) -> None:
         with torch.no_grad():
             for p, q in zip(ours.parameters(), nn.Sequential(*layers).parameters(), strict=True):
-                p.copy_(q.T.unsqueeze(0) if q.dim() == 2 else q.view(1, 1, -1))
+                p.copy_(q)
 
     actor = list(reference.actor.mean)
     give(plain.actor.body, actor[:-1])
@@ -180,7 +180,8 @@ def test_members_of_equal_weights_and_samples_learn_as_one() -> None:
 
     def tile(ours: nn.Module, theirs: nn.Module) -> None:
         for p, q in zip(ours.parameters(), theirs.parameters(), strict=True):
-            p.data.copy_(q.repeat_interleave(len(p) // len(q), 0))
+            alone = (q.T if q.dim() == 2 else q.unsqueeze(0)).unsqueeze(0)  # as an ensemble has it
+            p.data.copy_(q.repeat_interleave(2, 0) if q.dim() == 3 else alone.expand_as(p))
 
     for name in ("body", "mean", "spread"):
         tile(getattr(two.actor, name), getattr(one.actor, name))

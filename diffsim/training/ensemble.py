@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -52,7 +53,7 @@ class LayerNorms(nn.Module):
 class Ensemble(nn.Module):
     """E networks of one shape as one: (E, B, inputs) -> (E, B, outputs), each on its own inputs.
 
-    Indexed by e, it gives a copy of the network e.
+    Indexed by e, it gives a copy of the network e. One network alone keeps its own layers, which are faster then.
 
     Args:
         networks: chains of Linear, LayerNorm and layers without parameters, equal but for their weights.
@@ -60,7 +61,8 @@ class Ensemble(nn.Module):
 
     def __init__(self, networks: Sequence[nn.Sequential]) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(_stack(layers) for layers in zip(*networks, strict=True))
+        alone = len(networks) == 1
+        self.layers = nn.ModuleList(networks[0] if alone else map(_stack, zip(*networks, strict=True)))
 
     def forward(self, x: Tensor) -> Tensor:
         norms = None  # whose scale and shift the next layer is to apply
@@ -95,8 +97,8 @@ class EnsembleAdam(ClippedAdam):
     along the mean of their gradients: together they are one learner with the samples of all.
 
     Args:
-        module: all of whose parameters have E = (networks of a member) * members as their first size, in this order.
-        members: how many.
+        module: of Ensembles of E = networks * members, in this order.
+        networks, members: how many networks a member has in each of them, and how many members there are.
         max_norm, betas, skip_norm: see ClippedAdam.
         tied: () whether the members are tied, 0 or 1; a captured graph reads its present value. None: never.
     """
@@ -104,25 +106,24 @@ class EnsembleAdam(ClippedAdam):
     def __init__(
         self,
         module: nn.Module,
+        networks: int,
         members: int,
         max_norm: float,
         betas: tuple[float, float],
         tied: Tensor | None = None,
         skip_norm: float = 1e6,
     ) -> None:
-        self.members, self.tied = members, tied
+        self.shape, self.tied = (networks, members), tied
         super().__init__(module, max_norm, betas, skip_norm=skip_norm)
 
     def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
         """(networks, members, P)"""
-        return torch.cat([tensor.reshape(-1, self.members, tensor[0].numel()) for tensor in tensors], dim=-1)
+        return torch.cat([tensor.reshape(*self.shape, -1) for tensor in tensors], dim=-1)
 
     def _adopt(self, vector: Tensor) -> None:
-        start = 0
-        for p in self.parameters:
-            end = start + p[0].numel()
-            p.data = vector.flatten(0, 1)[:, start:end].view(p.shape)
-            start = end
+        sizes = [p.numel() // math.prod(self.shape) for p in self.parameters]
+        for p, own in zip(self.parameters, vector.flatten(0, 1).split(sizes, dim=-1), strict=True):
+            p.data = own.view(p.shape)
 
     def step(self, loss: Tensor) -> Tensor:
         """One descent step of each; returns the gradients' largest norm () before clipping."""

@@ -34,11 +34,12 @@ def test_it_is_its_networks_and_gives_them_back() -> None:
         torch.testing.assert_close(ensemble(x)[e], single(x[e]))
         assert all(torch.equal(p, q) for p, q in zip(ensemble[e].parameters(), single.parameters(), strict=True))
     with pytest.raises(TypeError, match="no ensemble of Conv1d: only of Linear, LayerNorm"):
-        Ensemble([nn.Sequential(nn.Conv1d(1, 1, 1))])
+        Ensemble([nn.Sequential(nn.Conv1d(1, 1, 1))] * 2)
     with pytest.raises(TypeError, match="no ensemble of LayerNorm and then ELU: only Linear may follow"):
-        Ensemble([nn.Sequential(nn.LayerNorm(3), nn.ELU())])(torch.ones(1, 2, 3))
+        Ensemble([nn.Sequential(nn.LayerNorm(3), nn.ELU())] * 2)(torch.ones(2, 2, 3))
     trunk = nn.Sequential(*network()[:3])  # ends with a LayerNorm
-    torch.testing.assert_close(Ensemble([trunk])(x[:1])[0], trunk(x[0]))
+    torch.testing.assert_close(Ensemble([trunk] * 2)(x[:2])[1], trunk(x[1]))
+    assert torch.equal(Ensemble([trunk])(x[:1])[0], trunk(x[0]))
 
 
 def test_untied_members_learn_as_if_alone() -> None:
@@ -46,7 +47,7 @@ def test_untied_members_learn_as_if_alone() -> None:
     torch.manual_seed(0)
     networks = [network() for _ in range(6)]
     ensemble = Ensemble(networks)
-    together = EnsembleAdam(ensemble, 3, 0.5, BETAS, tied=torch.zeros(()))
+    together = EnsembleAdam(ensemble, 2, 3, 0.5, BETAS, tied=torch.zeros(()))
     alone = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in networks]
     together.lr.fill_(1e-2)
     for scale in (1.0, 1e-4, 30.0, 1.0):
@@ -68,23 +69,19 @@ def test_tied_members_are_one_learner_with_the_samples_of_all() -> None:
     torch.manual_seed(0)
     networks = [network() for _ in range(6)]  # the first ones of three members, then the second ones
     ensemble, tied = Ensemble(networks), torch.zeros(())
-    together = EnsembleAdam(ensemble, 3, 0.5, BETAS, tied)
+    together = EnsembleAdam(ensemble, 2, 3, 0.5, BETAS, tied)
+    singles = networks[1], networks[4]  # member 1
+    alone = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in singles]
     together.lr.fill_(1e-2)
-    together.step(loss(ensemble(torch.randn(6, 9, 3))))
-    together.tie(1)
-    tied.fill_(1.0)
-    singles = [Ensemble([ensemble[e]]) for e in (1, 4)]
-    optimizers = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in singles]
-    for group, optimizer in enumerate(optimizers):
-        optimizer.exp_avg.copy_(together.exp_avg[group, 1])
-        optimizer.exp_avg_sq.copy_(together.exp_avg_sq[group, 1])
-        optimizer.step_count.copy_(together.step_count)
-    for _ in range(3):
+    for step in range(4):
         x = torch.randn(6, 9, 3)
         together.step(loss(ensemble(x)))
-        for group, (single, optimizer) in enumerate(zip(singles, optimizers, strict=True)):
-            samples = x.unflatten(0, (2, 3))[group].flatten(0, 1)
-            optimizer.step(single(samples.unsqueeze(0)).square().mean())
-            for member in range(3):
-                for p, q in zip(ensemble[3 * group + member].parameters(), single[0].parameters(), strict=True):
-                    torch.testing.assert_close(p, q)
+        own = x.unflatten(0, (2, 3))
+        for single, optimizer, samples in zip(singles, alone, own if step else own[:, 1], strict=True):
+            optimizer.step(single(samples).square().mean())
+        if step == 0:
+            together.tie(1)
+            tied.fill_(1.0)
+        for e in range(6) if step else (1, 4):
+            for p, q in zip(ensemble[e].parameters(), singles[e // 3].parameters(), strict=True):
+                torch.testing.assert_close(p, q)
