@@ -1,11 +1,11 @@
-"""How well policies of the joystick tasks follow commands, here and in MuJoCo on any file of their robot.
+"""How well policies of the joystick tasks follow commands in MuJoCo, on any file of their robot.
 
     python benchmarks/joystick.py runs/go2__shac__1 --file path/to/unitree_go2/scene.xml
     python benchmarks/joystick.py runs/joystick/* --push 0.5
 
 Each command is held for 20 s from the keyframe. The error of an episode is the mean distance of the velocity, averaged
-over a second, from the command, after the first second. In MuJoCo the joints are those of the same names; servos get
-the policy's targets, and a motor the torque that the task's servo would have. Nothing else of the file is changed.
+over a second, from the command, after the first second. The joints are those of the same names; servos get the policy's
+targets, and a motor the torque that the task's servo would have. Nothing else of the file is changed.
 
 Writes joystick.csv, a row for each policy and world, and with --update-results the table of docs/joystick.md.
 """
@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import common
 import numpy as np
@@ -28,11 +29,13 @@ from worlds import Array, OtherFile, State, in_double, rollout
 from diffsim.tasks.joystick import Joystick
 from diffsim.training import NonNegative, Positive, fail
 from diffsim.training.checkpoint import HOME
+from diffsim.training.ranges import Range
 
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
 COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) for v in SIDEWAYS)]
 COMMANDS += [(0.0, 0.0, w) for w in TURNING] + [(v, 0.0, w) for v in (0.5, -0.5) for w in TURNING]
-KEY = (*ABOUT[:-1], "file", "friction", "push")
+PUSHED_EVERY = 4.0  # s
+Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # the first second does not count
 
 
 @dataclass
@@ -40,22 +43,22 @@ class Args(common.CheckpointFlags):
     file: Path | None = None  # MJCF of the robot with a ground, in place of the task's
     friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
     push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
-    seconds: Positive = 20.0  # of an episode
+    seconds: Long = 20.0  # of an episode
 
 
 def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array]:
     """The root's velocities (T, n, 3), vx and vy in its frame and its yaw rate, and falls (n,), of each command."""
-    task, n = in_double(case.env), len(COMMANDS)
-    every, drawn = round(4.0 / task.control_dt), np.random.default_rng(1)
+    task, scene, n = in_double(case.env), case.env.scene, len(COMMANDS)
+    every, drawn = round(PUSHED_EVERY / task.control_dt), np.random.default_rng(1)
 
     def push(step: int, state: State) -> State:
         if not args.push or not step or step % every:
             return state
-        angles = drawn.uniform(0, 2 * np.pi, n)
-        kicks = args.push * np.stack((np.cos(angles), np.sin(angles)), 1)
-        return state._replace(qvel=state.qvel + torch.from_numpy(np.pad(kicks, ((0, 0), (0, case.env.scene.nv - 2)))))
+        angles, kicks = drawn.uniform(0, 2 * np.pi, n), np.zeros((n, scene.nv))
+        kicks[:, :2] = args.push * np.stack((np.cos(angles), np.sin(angles)), 1)
+        return state._replace(qvel=state.qvel + torch.from_numpy(kicks))
 
-    rest, scene = torch.tensor(task.start).double().expand(n, -1), case.env.scene  # the keyframe
+    rest = torch.tensor(task.start).double().expand(n, -1)  # the keyframe
     memory = task.begin(rest.new_full((n, task.num_random), 0.5))
     memory[:, :3] = torch.tensor(COMMANDS)
     start = State(rest[:, : scene.nq], rest.new_zeros(n, scene.nv), rest.new_zeros(n, scene.nu), memory)
@@ -65,11 +68,10 @@ def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array]:
 
 
 def errors(velocities: Array, second: int) -> Array:
-    """(n, 2) mean error of the velocity [m/s] and of the yaw rate [rad/s], averaged over a second, after the first."""
+    """(2, n) mean error of the velocity [m/s] and of the yaw rate [rad/s], averaged over a second, after the first."""
     sums = np.cumsum(velocities, axis=0)
-    means = (sums[2 * second :] - sums[second:-second]) / second
-    off = means - np.array(COMMANDS)
-    return np.stack((np.linalg.norm(off[..., :2], axis=-1).mean(0), np.abs(off[..., 2]).mean(0)), axis=-1)
+    off = (sums[2 * second :] - sums[second:-second]) / second - np.array(COMMANDS)
+    return np.stack((np.linalg.norm(off[..., :2], axis=-1).mean(0), np.abs(off[..., 2]).mean(0)))
 
 
 def training(case: Case) -> dict[str, object]:
@@ -83,44 +85,49 @@ def training(case: Case) -> dict[str, object]:
 def measure(args: Args, path: Path) -> Iterator[Row]:
     """A row for each friction."""
     case = load_case(path, 1, "cpu")
-    about = case.about
+    about, task = case.about, case.env.task
     if case.saved.simulator != HOME:
         about["learner"] = f"{about['learner']} in {case.saved.simulator}"
-    if not isinstance(case.env.task, Joystick):
-        fail(f"{path} was trained on {case.env.task.name}, which follows no command")
+    if not isinstance(task, Joystick):
+        fail(f"{path} was trained on {task.name}, which follows no command")
     for friction in args.friction:
         velocities, fallen = follow(case, OtherFile(case.env, len(COMMANDS), args.file, friction), args)
-        found = errors(velocities, round(1 / case.env.task.control_dt))
+        error, yaw = errors(velocities, round(1 / task.control_dt))
+        print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, error, strict=True)))
         row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
-        row |= {"error": found[:, 0].mean(), "worst error": found[:, 0].max(), "yaw error": found[:, 1].mean()}
-        print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, found[:, 0], strict=True)))
+        row |= {"error": error.mean(), "worst error": error.max(), "yaw error": yaw.mean()}
         yield about | training(case) | row | {"whole": 1 - fallen.mean(), "seconds": args.seconds}
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task, learner and machine, over seeds: medians, and the worst command of the worst seed."""
+    """A line for each task, learner and machine, over seeds: medians, and the worst command of the worst seed.
+
+    Errors are those without pushes on the file's friction, and empty if only others were measured.
+    """
     rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
     rows.sort(key=lambda row: (row["task"], row["checkpoint"]))
     lines = list[Row]()
     for (task, learner, machine, file), group in grouped(rows, "task", "learner", "machine", "file").items():
         calm = [row for row in group if float(row["push"]) == 0]
+        pushed = [row for row in group if float(row["push"]) > 0]
         plain = [row for row in calm if float(row["friction"]) == 1]
-        if not plain:
-            continue
-        pushed = [float(row["whole"]) for row in group if float(row["push"]) > 0]
+
+        def least(found: list[dict[str, str]]) -> str:
+            return f"{min(numbers(found, 'whole')):.0%}" if found else ""
+
         lines.append(
-            {"task": task, "learner": learner, "machine": machine, "seeds": len(plain)}
+            {"task": task, "learner": learner, "machine": machine, "seeds": len({row["checkpoint"] for row in group})}
             | {"return": middle(plain, "return", ",.0f"), "training (s)": middle(plain, "training s", ".0f")}
             | {"judged on": file, "error (m/s)": middle(plain, "error", ".3f")}
-            | {"worst command": f"{max(numbers(plain, 'worst error')):.2f}"}
-            | {"yaw (rad/s)": middle(plain, "yaw error", ".2f"), "whole": f"{min(numbers(calm, 'whole')):.0%}"}
-            | {"whole, pushed": f"{min(pushed):.0%}" if pushed else ""}
+            | {"worst command": f"{max(numbers(plain, 'worst error')):.2f}" if plain else ""}
+            | {"yaw (rad/s)": middle(plain, "yaw error", ".2f"), "whole": least(calm), "whole, pushed": least(pushed)}
         )
     return lines
 
 
 def main(args: Args) -> None:
-    measured(args, Part("joystick", measure, KEY, "joystick", "joystick.md", table))
+    key = (*ABOUT[:-1], "file", "friction", "push")
+    measured(args, Part("joystick", measure, key, "joystick", "joystick.md", table))
 
 
 if __name__ == "__main__":
