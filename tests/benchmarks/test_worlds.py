@@ -50,7 +50,7 @@ def test_episodes_here_are_those_of_an_evaluation() -> None:
     motion = worlds.episodes(worlds.Here(env.sim), worlds.in_double(env), policy, start, steps=40)
     assert motion.returns == pytest.approx(expected.returns.numpy(), rel=1e-4)
     assert motion.lengths.tolist() == [40] * 3 and not motion.fallen.any()
-    assert transfer.speed(motion, DT) == pytest.approx(expected.speed, rel=0.02)  # which leaves the last step out
+    assert transfer.speed(motion, DT, 0) == pytest.approx(expected.speed, rel=0.02)  # which leaves the last step out
 
 
 def test_an_episode_ends_with_a_fall_and_a_world_that_is_lost_stays_as_it_was() -> None:
