@@ -39,8 +39,8 @@ from diffsim.robot.scene import FACTORS
 @cache
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
-    T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
-    Model, law_of, solve_with_factor = t.Model, environment_law(spec), factor_solve(spec)
+    T, vec2, vec3, vec6, quat = t.T, t.vec2, t.vec3, t.vec6, t.quat
+    Model, Link, law_of, solve_with_factor = t.Model, t.Link, environment_law(spec), factor_solve(spec)
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint = muscle_law(spec), constraint_law(spec)
@@ -101,26 +101,19 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     ):
         h = T(seconds)
         theta = T(implicitness)
-        tid = wp.tid()
-        e = first + tid / THREADS_PER_ENV  # the environment, or block of environments
-        lane = tid % THREADS_PER_ENV
+        here = kin.lane_of(m, first, wp.tid())
+        e = here.e
+        lane = here.lane
+        at = here.at
+        n = here.n
         slots = int(SLOTS)
-        n = int(SLOTS)
-        at = lane * SLOTS
-        if wp.static(THREADS_PER_ENV > 1):
-            n = m.count[lane]
-        R = wp.zeros(shape=SLOTS, dtype=mat3)
-        x = wp.zeros(shape=SLOTS, dtype=vec3)
-        S = wp.zeros(shape=SLOTS, dtype=vec6)
-        V = wp.zeros(shape=SLOTS, dtype=vec6)
+        links = wp.zeros(shape=SLOTS, dtype=Link)
         A = wp.zeros(shape=SLOTS, dtype=vec6)
         W = wp.zeros(shape=SLOTS, dtype=vec6)
         adj_a = wp.zeros(shape=SLOTS, dtype=vec6)
         adj_v = wp.zeros(shape=SLOTS, dtype=vec6)
         adj_w = wp.zeros(shape=SLOTS, dtype=vec6)
         adj_p = wp.zeros(shape=SLOTS, dtype=vec6)
-        q = wp.zeros(shape=SLOTS, dtype=T)
-        qd = wp.zeros(shape=SLOTS, dtype=T)
         gq = wp.zeros(shape=SLOTS, dtype=T)
         gqd = wp.zeros(shape=SLOTS, dtype=T)
         gtau = wp.zeros(shape=SLOTS, dtype=T)
@@ -129,7 +122,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         law = law_of(m, h, theta, factors, e)
         if wp.static(CLAMP):
             driven = wp.zeros(shape=SLOTS, dtype=T)
-            joint.drive(m, law, lane, n, ctrl, e, driven)
+            joint.drive(m, law, here, ctrl, driven)
             free = wp.zeros(shape=SLOTS, dtype=T)  # see joint.py
         adj_factors = wp.zeros(shape=SOME_FACTORS, dtype=T)
         if wp.static(FORCED):
@@ -140,7 +133,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
             adj_pull = wp.zeros(shape=NU, dtype=T)
-            muscle.activate(m, law, lane, ctrl, e, pull)
+            muscle.activate(m, law, here, ctrl, pull)
         if wp.static(CONSTRAINED):
             B = wp.zeros(shape=SLOTS, dtype=vec6)  # as in the forward kernel, and its adjoint
             adj_b = wp.zeros(shape=SLOTS, dtype=vec6)
@@ -151,7 +144,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             ga = wp.zeros(shape=SLOTS, dtype=T)
             adj_d = wp.zeros(shape=SLOTS, dtype=vec6)
             adj_w1 = wp.zeros(shape=SLOTS, dtype=vec6)
-        R[0] = wp.identity(3, dtype=T)
+        links[0].R = wp.identity(3, dtype=T)
         end = row0 + substeps - 1
         if wp.static(NBALL > 0):
             turn = wp.zeros(shape=NBALL, dtype=quat)
@@ -177,8 +170,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             place = kin.carrier_place(m, T(0.0), T(0.0))
             A[0] = join(vec3(), -vec3(m.gravity))
             for i in range(1, n):
-                q[i] = load(ck_q, row, qpos_adr(m, at + i), e)
-                qd[i] = load(ck_v, row, VADR + link_of(m, at + i), e)
+                links[i].q = load(ck_q, row, qpos_adr(m, at + i), e)
+                links[i].qd = load(ck_v, row, VADR + link_of(m, at + i), e)
                 gqd[i] = gqd[i] + h * gq[i]
             if wp.static(NBALL > 0):
                 for b in range(m.ball_count[lane]):
@@ -191,7 +184,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     for k in range(3):
                         gqd[i + k] = gqd[i + k] + h * (gb_turn[k] - gb[k])
                         gq[i + k] = gb_start[k]
-                kin.place_balls(m, lane, turn, R, q)
+                kin.place_balls(m, here, turn, links)
             if wp.static(FLOATING):
                 rot = kin.load_quat_row(ck_q, row, 3, e)
                 v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
@@ -203,44 +196,44 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 gw = gw + h * g_turn
                 gr = gr_start
                 place = kin.carrier_place(m, load(ck_q, row, 0, e), load(ck_q, row, 2, e))
-                R[0] = wp.quat_to_matrix(rot)
-                V[0] = join(R[0] * w, v)
+                links[0].R = wp.quat_to_matrix(rot)
+                links[0].V = join(links[0].R * w, v)
                 if wp.static(DAMPED):
-                    D[0] = join(R[0] * wdot, vdot)
+                    D[0] = join(links[0].R * wdot, vdot)
                 if wp.static(CONSTRAINED):
                     vdot = vec3(load(ck_a, row, NV, e), load(ck_a, row, NV + 1, e), load(ck_a, row, NV + 2, e))
                     vdot = vdot - vec3(m.gravity)
                     wdot = vec3(load(ck_a, row, NV + 3, e), load(ck_a, row, NV + 4, e), load(ck_a, row, NV + 5, e))
                 if wp.static(DAMPED):
-                    D[0] = D[0] - join(R[0] * wdot, vdot)
-                A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v))
+                    D[0] = D[0] - join(links[0].R * wdot, vdot)
+                A[0] = join(links[0].R * wdot, vdot - wp.cross(links[0].R * w, v))
                 if wp.static(CONSTRAINED):
-                    B[0] = join(R[0] * wdot, vdot + vec3(m.gravity))
-            place = kin.place_links(m, at, n, q, R, x, S, place)
+                    B[0] = join(links[0].R * wdot, vdot + vec3(m.gravity))
+            place = kin.place_links(m, here, links, place)
             for i in range(1, n):
                 k = at + i
                 p = m.parent[k]
-                V[i] = V[p] + S[i] * qd[i]
+                links[i].V = links[p].V + links[i].S * links[i].qd
                 turning = i
                 if wp.static(NBALL > 0):
                     turning = m.inboard[k]
                 qdd = load(ck_a, row, int(CONSTRAINED) * NV + VADR + link_of(m, k), e)
-                A[i] = A[p] + S[i] * qdd + wp.spatial_cross(V[turning], S[i] * qd[i])
+                A[i] = A[p] + links[i].S * qdd + wp.spatial_cross(links[turning].V, links[i].S * links[i].qd)
                 if wp.static(CONSTRAINED):
                     rate[i] = qdd
-                    B[i] = B[p] + S[i] * qdd
+                    B[i] = B[p] + links[i].S * qdd
                 if wp.static(DAMPED):
-                    D[i] = D[p] + S[i] * (load(ck_a, row, VADR + link_of(m, k), e) - qdd)
+                    D[i] = D[p] + links[i].S * (load(ck_a, row, VADR + link_of(m, k), e) - qdd)
                 if wp.static(CLAMP):
-                    ahead = q[i]
+                    ahead = links[i].q
                     if wp.static(IMPLICIT):
-                        ahead = ahead + theta * h * qd[i]
-                    free[i] = joint.actuation_free(m, k, driven[i], ahead, qd[i])
+                        ahead = ahead + theta * h * links[i].qd
+                    free[i] = joint.actuation_free(m, k, driven[i], ahead, links[i].qd)
             # 2. lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
             # first, and g + h b lambda1 reaches the acceleration before it.
             g_base = vec6()
             if wp.static(FLOATING):
-                g_base = join(R[0] * gw, gv)
+                g_base = join(links[0].R * gw, gv)
             for solve in range(SOLVES):
                 if wp.static(DAMPED):
                     for i in range(n):
@@ -249,9 +242,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if wp.static(CLAMP):
                             within = free[i]
                         ga[i] = gqd[i] + T(solve) * joint.damping(m, at + i, within) * lam[i]
-                    solve_with_factor(m, at, n, ck_f, SOLVES * row + solve, e, S, h, g_base, ga, u, W, lam)
+                    solve_with_factor(m, here, ck_f, SOLVES * row + solve, links, h, g_base, ga, u, W, lam)
                 else:
-                    solve_with_factor(m, at, n, ck_f, row, e, S, h, g_base, gqd, u, W, lam)
+                    solve_with_factor(m, here, ck_f, row, links, h, g_base, gqd, u, W, lam)
             # 3. the partial derivatives of phi, link by link
             for i in range(1, INERT + 1):
                 adj_a[i] = vec6()
@@ -264,10 +257,10 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     adj_d[i] = vec6()
                     adj_w1[i] = vec6()
             for i in range(FIRST, n):
-                la, lv, lw, lp = link.link_adjoint(m, law, at + i, R[i], x[i], V[i], A[i], W[i], place, adj_factors)
+                la, lv, lw, lp = link.link_adjoint(m, law, at + i, links[i], A[i], W[i], place, adj_factors)
                 if wp.static(CONSTRAINED and CONTACT):
                     lv, lw, lp, l_twist = constraint.add_contacts_adjoint(
-                        m, law, at + i, R[i], x[i], V[i], B[i], W[i], place, lv, lw, lp, adj_factors
+                        m, law, at + i, links[i], B[i], W[i], place, lv, lw, lp, adj_factors
                     )
                     adj_b[i] = l_twist
                 adj_a[i] = la
@@ -276,13 +269,13 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 adj_p[i] = lp
                 if wp.static(DAMPED):
                     # phi has W1 . I D besides.
-                    ld, lw1 = link.damping_adjoint(m, law, at + i, R[i], x[i], D[i], W1[i], adj_factors)
+                    ld, lw1 = link.damping_adjoint(m, law, at + i, links[i], D[i], W1[i], adj_factors)
                     adj_d[i] = ld
                     adj_w1[i] = lw1
             if wp.static(FORCED):
-                force.add_forces_adjoint(m, at, n, forces, e, R, x, W, adj_w, adj_p, adj_forces)
+                force.add_forces_adjoint(m, here, forces, links, W, adj_w, adj_p, adj_forces)
             if wp.static(MUSCLE):
-                muscle.add_muscles_adjoint(m, lane, pull, R, x, W, adj_w, adj_p, adj_pull)
+                muscle.add_muscles_adjoint(m, here, pull, links, W, adj_w, adj_p, adj_pull)
             # 4. inward: sum over subtrees, project on the joints
             if wp.static(SHARERS > 1):
                 sums.sharers.add_vectors(adj_a)
@@ -314,23 +307,23 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     if wp.static(NBALL > 0):
                         p = m.inboard[k]
                         turned = m.outboard[k]
-                    qi = q[i]
-                    end_rate = qd[i]
+                    qi = links[i].q
+                    end_rate = links[i].qd
                     if wp.static(IMPLICIT):
-                        qi = qi + theta * h * qd[i]
+                        qi = qi + theta * h * links[i].qd
                         if wp.static(LIMIT):
                             end_rate = end_rate + h * load(ck_a, row, VADR + link_of(m, k), e)
                     within = T(1.0)
                     if wp.static(CLAMP):
                         within = free[i]
-                    gain = joint.gain(m, law, k, qi, qd[i], end_rate, within)
+                    gain = joint.gain(m, law, k, qi, links[i].qd, end_rate, within)
                     if wp.static(VARIED and LIMIT):
                         if m.carried[k] == 1:  # of the lanes that have the joint
-                            by = joint.limit_constants_gain(m, law, k, qi, qd[i], end_rate, theta * h)
+                            by = joint.limit_constants_gain(m, law, k, qi, links[i].qd, end_rate, theta * h)
                             adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - lam[i] * by[0]
                             adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - lam[i] * by[1]
                     if wp.static(CONSTRAINED):
-                        of_held = constraint.joint_gain(m, law, k, q[i], qd[i], rate[i])
+                        of_held = constraint.joint_gain(m, law, k, links[i].q, links[i].qd, rate[i])
                         gain = gain + vec2(of_held[0], of_held[1])
                         if wp.static(VARIED):
                             if m.carried[k] == 1:  # of the lanes that have the joint
@@ -338,21 +331,23 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     kv = gain[1]
                     if wp.static(IMPLICIT):
                         kv = kv + theta * h * gain[0]
-                    xv = adj_v[i] - wp.spatial_cross_dual(V[p], adj_a[i])
+                    xv = adj_v[i] - wp.spatial_cross_dual(links[p].V, adj_a[i])
                     gq[i] = (
                         gq[i]
-                        + wp.dot(adj_p[i], S[i])
-                        - wp.dot(xv, wp.spatial_cross(S[i], V[p]))
-                        - wp.dot(adj_w[i], wp.spatial_cross(S[i], W[p]))
-                        - wp.dot(adj_a[i], wp.spatial_cross(S[i], A[p]))
+                        + wp.dot(adj_p[i], links[i].S)
+                        - wp.dot(xv, wp.spatial_cross(links[i].S, links[p].V))
+                        - wp.dot(adj_w[i], wp.spatial_cross(links[i].S, W[p]))
+                        - wp.dot(adj_a[i], wp.spatial_cross(links[i].S, A[p]))
                         - lam[i] * gain[0]
                     )
                     if wp.static(CONSTRAINED):
-                        gq[i] = gq[i] - wp.dot(adj_b[i], wp.spatial_cross(S[i], B[p]))
+                        gq[i] = gq[i] - wp.dot(adj_b[i], wp.spatial_cross(links[i].S, B[p]))
                     if wp.static(DAMPED):
-                        gq[i] = gq[i] - wp.dot(adj_d[i], wp.spatial_cross(S[i], D[p]))
-                        gq[i] = gq[i] - wp.dot(adj_w1[i], wp.spatial_cross(S[i], W1[p]))
-                    gqd[i] = gqd[i] + wp.dot(xv - wp.spatial_cross_dual(V[turned], adj_a[i]), S[i]) - lam[i] * kv
+                        gq[i] = gq[i] - wp.dot(adj_d[i], wp.spatial_cross(links[i].S, D[p]))
+                        gq[i] = gq[i] - wp.dot(adj_w1[i], wp.spatial_cross(links[i].S, W1[p]))
+                    gqd[i] = (
+                        gqd[i] + wp.dot(xv - wp.spatial_cross_dual(links[turned].V, adj_a[i]), links[i].S) - lam[i] * kv
+                    )
                     gtau[i] = gtau[i] - within * lam[i]
                     if wp.static(NBALL > 0):
                         p = m.parent[k]
@@ -371,7 +366,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 for b in range(m.ball_count[lane]):
                     i = m.ball_slot[lane * NBALL + b]
                     lb = vec3(lam[i], lam[i + 1], lam[i + 2])
-                    lb = T(m.stiffness[at + i]) * (sp.log_adjoint(vec3(q[i], q[i + 1], q[i + 2]), lb) - lb)
+                    lb = T(m.stiffness[at + i]) * (
+                        sp.log_adjoint(vec3(links[i].q, links[i + 1].q, links[i + 2].q), lb) - lb
+                    )
                     for k in range(3):
                         gq[i + k] = gq[i + k] + lb[k]
             if wp.static(FLOATING):
@@ -387,11 +384,11 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(DAMPED):
                     tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(D[0])), adj_d[0])
                     tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(W1[0])), adj_w1[0])
-                tw = xv - wp.spatial_cross_dual(V[0], adj_a[0])
+                tw = xv - wp.spatial_cross_dual(links[0].V, adj_a[0])
                 gp = gp + wp.spatial_bottom(adj_p[0])
-                gr = gr + wp.transpose(R[0]) * wp.spatial_top(tq)
+                gr = gr + wp.transpose(links[0].R) * wp.spatial_top(tq)
                 gv = gv + wp.spatial_bottom(xv)
-                gw = gw + wp.transpose(R[0]) * wp.spatial_top(tw)
+                gw = gw + wp.transpose(links[0].R) * wp.spatial_top(tw)
 
         # A gradient that left the finite numbers, or of a contained step, is zero.
         broken = T(0.0)
@@ -407,7 +404,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             for k in range(NFACTORS):
                 broken = broken + block.broken(adj_factors[k])
         if wp.static(FORCED):
-            broken = broken + force.broken_forces(m, at, adj_forces)
+            broken = broken + force.broken_forces(m, here, adj_forces)
         if wp.static(THREADS_PER_ENV > 1):
             broken = sums.add(broken)
         contained = block.read_flags(nonfinite, e)
@@ -434,7 +431,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if lane == 0:
                     hand_out(g_factors, e, k, drop, total)
         if wp.static(FORCED):
-            force.write_forces_adjoint(m, at, e, drop, adj_forces, g_forces)
+            force.write_forces_adjoint(m, here, drop, adj_forces, g_forces)
         for i in range(1, n):
             hand_out(g_qpos, e, qpos_adr(m, at + i), drop, gq[i])
             hand_out(g_qvel, e, VADR + link_of(m, at + i), drop, gqd[i])

@@ -41,7 +41,18 @@ LEAST_SINKING = 1e-3  # m in a substep: a sphere that grazes the ground has a ju
 @cache
 def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
-    T, U, vec2, vec3, vec4, vec6, mat3, Model, Law = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
+    T, U, vec2, vec3, vec4, vec6, mat3, Model, Law, Link = (
+        t.T,
+        t.U,
+        t.vec2,
+        t.vec3,
+        t.vec4,
+        t.vec6,
+        t.mat3,
+        t.Model,
+        t.Law,
+        t.Link,
+    )
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
     Load = t.Load
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
@@ -109,9 +120,9 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return change * w[2] + (Ds * over - friction * change) * along
 
     @wp.func
-    def place(m: Model, c: int, R: mat3, x: vec3, height: T):
+    def place(m: Model, c: int, link: Link, height: T):
         """Centre of contact sphere c, its distance from the ground, and 1 where that is within its margin, else 0."""
-        centre = x + R * vec3(m.contact_position[c])
+        centre = sp.on_link(link.R, link.x, m.contact_position[c])
         distance = height + centre[2] - T(m.contact_radius[c])
         return centre, distance, pick(distance, T(m.contact_numbers[c][10]), T(1.0), T(0.0))
 
@@ -138,24 +149,12 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return p, jar, vec4(D, state[1], state[2], state[3]), of
 
     @wp.func
-    def add_contacts(
-        m: Model,
-        law: Law,
-        k: int,
-        R: mat3,
-        x: vec3,
-        V: vec6,
-        A: vec6,
-        B: vec6,
-        height: T,
-        stuck: T,
-        load: Load,
-    ):
+    def add_contacts(m: Model, law: Law, k: int, link: Link, A: vec6, B: vec6, height: T, stuck: T, load: Load):
         """The load of link k with its contacts, linear about A; stuck as of cone."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on = place(m, c, R, x, height)
+            centre, distance, on = place(m, c, link, height)
             if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, B)
                 f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, stuck)
                 PH = wp.skew(p) * H
                 load.a = load.a - PH * wp.skew(p)
@@ -165,13 +164,13 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return load
 
     @wp.func
-    def contacts_along(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, B: vec6, height: T, step: vec6, part: T):
+    def contacts_along(m: Model, law: Law, k: int, link: Link, B: vec6, height: T, step: vec6, part: T):
         """Of the contacts of link k after a part of a step of its twist: step . f and step . H step."""
         found = vec2()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on = place(m, c, R, x, height)
+            centre, distance, on = place(m, c, link, height)
             if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, B)
                 by = point_velocity(step, p)
                 f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar + part * by, T(0.0))
                 found = found + vec2(wp.dot(by, f), wp.dot(by, H * by))
@@ -182,9 +181,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         m: Model,
         law: Law,
         k: int,
-        R: mat3,
-        x: vec3,
-        V: vec6,
+        link: Link,
         B: vec6,
         W: vec6,
         height: T,
@@ -196,33 +193,35 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         """The adjoints of link k with its contacts' part of phi added, and the adjoint of B."""
         adj_b = vec6()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on = place(m, c, R, x, height)
+            centre, distance, on = place(m, c, link, height)
             if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, V, B)
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, B)
                 f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
                 w = point_velocity(W, p)
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
                 if wp.static(spec.touchdown):
                     numbers = m.contact_numbers[c]
-                    sinks = wp.max(-law.h * point_velocity(V, p)[2], T(LEAST_SINKING))
+                    sinks = wp.max(-law.h * point_velocity(link.V, p)[2], T(LEAST_SINKING))
                     jump = wp.dot(f, w + T(numbers[4]) * g_jar) / sinks
                     g_r = g_r + pick(T(numbers[10]) - distance, sinks, jump, T(0.0))
                 if wp.static(VARIED):
-                    by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(V, p)) + g_jar[2] * state[2]
+                    by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(link.V, p)) + g_jar[2] * state[2]
                     by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)
                     adj_factors[K_N] = adj_factors[K_N] + by_k / of[0]
                     adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / law.k_d
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_numbers[c][2]) * by_mu
                 G = force_at(p, g_jar)
                 wrench = force_at(p, f)
-                g_p = wp.cross(g_jar, wp.spatial_top(B) + of[1] * wp.spatial_top(V)) - wp.cross(f, wp.spatial_top(W))
+                g_p = wp.cross(g_jar, wp.spatial_top(B) + of[1] * wp.spatial_top(link.V)) - wp.cross(
+                    f, wp.spatial_top(W)
+                )
                 adj_w = adj_w - wrench
                 adj_v = adj_v + of[1] * G
                 adj_b = adj_b + G
                 # The point follows the sphere's centre, at half its speed up and down.
                 adj_p = adj_p + force_at(centre, vec3(g_p[0], g_p[1], T(0.5) * g_p[2] + g_r))
-                adj_p = adj_p + wp.spatial_cross_dual(of[1] * V + B, G) - wp.spatial_cross_dual(W, wrench)
+                adj_p = adj_p + wp.spatial_cross_dual(of[1] * link.V + B, G) - wp.spatial_cross_dual(W, wrench)
         return adj_v, adj_w, adj_p, adj_b
 
     @wp.func

@@ -29,18 +29,18 @@ from diffsim.kernels.wide import blocks
 @cache
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
-    T, vec3, vec4, vec6, mat3, Model, Law = t.T, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law
+    T, vec3, vec4, vec6, mat3, Model, Law, Link = t.T, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law, t.Link
     Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
     sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, VARIED = spec.implicit, spec.varied
 
     @wp.func
-    def sphere_state(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, height: T):
+    def sphere_state(m: Model, law: Law, k: int, link: Link, height: T):
         """Lowest point p, its velocity, and the depth (predicted theta h ahead if implicit) of contact sphere k."""
-        p = x + R * vec3(m.contact_position[k])
+        p = sp.on_link(link.R, link.x, m.contact_position[k])
         depth = height + p[2] - T(m.contact_radius[k])
         p = p - vec3(T(0.0), T(0.0), T(m.contact_radius[k]))
-        v = point_velocity(V, p)
+        v = point_velocity(link.V, p)
         if wp.static(IMPLICIT):
             depth = depth + law.theta * law.h * v[2]
         return p, v, depth
@@ -102,15 +102,13 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(g_kn, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
     @wp.func
-    def add_contacts(
-        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place, Ia: mat3, Ib: mat3, Id: mat3, F: vec6
-    ):
+    def add_contacts(m: Model, law: Law, k: int, link: Link, place: Place, Ia: mat3, Ib: mat3, Id: mat3, F: vec6):
         """Inertia blocks and bias force of link k with its contacts added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, _ = sphere_on_terrain(m, law, c, R, x, V, place)
+                p, v, depth, E, _ = sphere_on_terrain(m, law, c, link, place)
             else:
-                p, v, depth = sphere_state(m, law, c, R, x, V, place)
+                p, v, depth = sphere_state(m, law, c, link, place)
             on = touches(law, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
@@ -138,9 +136,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         m: Model,
         law: Law,
         k: int,
-        R: mat3,
-        x: vec3,
-        V: vec6,
+        link: Link,
         A: vec6,
         W: vec6,
         place: Place,
@@ -153,9 +149,9 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         """The adjoints of link k with its contacts' part of phi added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, curvature = sphere_on_terrain(m, law, c, R, x, V, place)
+                p, v, depth, E, curvature = sphere_on_terrain(m, law, c, link, place)
             else:
-                p, v, depth = sphere_state(m, law, c, R, x, V, place)
+                p, v, depth = sphere_state(m, law, c, link, place)
             on = touches(law, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
@@ -190,7 +186,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 g_p = vec3(T(0.0), T(0.0), g[3])
                 if wp.static(TERRAIN):
                     g_p = E * g_p
-                g_p = g_p + wp.cross(g_v, wp.spatial_top(V)) - wp.cross(f, wp.spatial_top(W))
+                g_p = g_p + wp.cross(g_v, wp.spatial_top(link.V)) - wp.cross(f, wp.spatial_top(W))
                 if wp.static(IMPLICIT):
                     g_a = -wp.cw_mul(B, g_f)
                     if wp.static(TERRAIN):
@@ -199,7 +195,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                     GA = force_at(p, g_a)
                     g_p = g_p + wp.cross(g_a, wp.spatial_top(A))
                     adj_a = adj_a + GA
-                    adj_v = adj_v + wp.spatial_cross_dual(V, GA)
+                    adj_v = adj_v + wp.spatial_cross_dual(link.V, GA)
                     adj_p = adj_p + wp.spatial_cross_dual(A, GA)
                 adj_w = adj_w - wrench
                 adj_v = adj_v + G
@@ -212,7 +208,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 else:
                     centre = p + vec3(T(0.0), T(0.0), T(m.contact_radius[c]))
                 adj_p = adj_p + force_at(centre, g_p)
-                adj_p = adj_p + wp.spatial_cross_dual(V, G) - wp.spatial_cross_dual(W, wrench)
+                adj_p = adj_p + wp.spatial_cross_dual(link.V, G) - wp.spatial_cross_dual(W, wrench)
         return adj_a, adj_v, adj_w, adj_p
 
     return by_name(add_contacts, add_contacts_adjoint)

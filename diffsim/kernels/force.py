@@ -24,9 +24,7 @@ from diffsim.kernels.wide import blocks
 @cache
 def external_force(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
-    T, vec3, vec6, Model, block = t.T, t.vec3, t.vec6, t.Model, blocks(spec)
-    loads_of = wp.array(dtype=t.Load)
-    mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (t.mat3, vec3, vec6))
+    T, vec3, Model, Lane, block = t.T, t.vec3, t.Model, t.Lane, blocks(spec)
     join, force_at, point_velocity, read = sp.join, sp.force_at, sp.point_velocity, block.read
     FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base feels no force
 
@@ -39,52 +37,51 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         return f, force_at(p, f) + join(torque, vec3())
 
     @wp.func
-    def add_forces(m: Model, at: int, n: int, forces: t.array2, e: int, R: mat3s, x: vec3s, loads: loads_of):
+    def add_forces(m: Model, here: Lane, forces: t.array2, links: t.links, loads: t.loads):
         """Adds the forces to the links' bias forces."""
-        for i in range(FIRST, n):
-            for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
-                f, wrench = external(forces, e, m.body[entry], x[i] + R[i] * vec3(m.body_com[entry]))
+        for i in range(FIRST, here.n):
+            for entry in range(m.body_begin[here.at + i], m.body_begin[here.at + i + 1]):
+                f, wrench = external(
+                    forces, here.e, m.body[entry], sp.on_link(links[i].R, links[i].x, m.body_com[entry])
+                )
                 loads[i].f = loads[i].f - wrench
 
     @wp.func
     def add_forces_adjoint(
         m: Model,
-        at: int,
-        n: int,
+        here: Lane,
         forces: t.array2,
-        e: int,
-        R: mat3s,
-        x: vec3s,
-        W: vec6s,
-        adj_w: vec6s,
-        adj_p: vec6s,
-        adj_forces: vec6s,  # of each body, (force, torque)
+        links: t.links,
+        W: t.vec6s,
+        adj_w: t.vec6s,
+        adj_p: t.vec6s,
+        adj_forces: t.vec6s,  # of each body, (force, torque)
     ):
         """Adds the forces' part of phi to the links' adjoints."""
-        for i in range(FIRST, n):
-            for entry in range(m.body_begin[at + i], m.body_begin[at + i + 1]):
+        for i in range(FIRST, here.n):
+            for entry in range(m.body_begin[here.at + i], m.body_begin[here.at + i + 1]):
                 body = m.body[entry]
-                p = x[i] + R[i] * vec3(m.body_com[entry])
-                f, wrench = external(forces, e, body, p)
+                p = sp.on_link(links[i].R, links[i].x, m.body_com[entry])
+                f, wrench = external(forces, here.e, body, p)
                 turn = wp.spatial_top(W[i])
                 adj_w[i] = adj_w[i] - wrench
                 adj_p[i] = adj_p[i] - force_at(p, wp.cross(f, turn)) - wp.spatial_cross_dual(W[i], wrench)
                 adj_forces[body] = adj_forces[body] - join(point_velocity(W[i], p), turn)
 
     @wp.func
-    def broken_forces(m: Model, at: int, adj_forces: vec6s):
+    def broken_forces(m: Model, here: Lane, adj_forces: t.vec6s):
         """How many numbers of the adjoints of the forces on this lane's bodies are not finite."""
         result = T(0.0)
-        for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
+        for entry in range(m.body_begin[here.at], m.body_begin[here.at + SLOTS]):
             for k in range(6):
                 result = result + block.broken(adj_forces[m.body[entry]][k])
         return result
 
     @wp.func
-    def write_forces_adjoint(m: Model, at: int, e: int, drop: T, adj_forces: vec6s, g_forces: t.array2):
-        for entry in range(m.body_begin[at], m.body_begin[at + SLOTS]):
+    def write_forces_adjoint(m: Model, here: Lane, drop: T, adj_forces: t.vec6s, g_forces: t.array2):
+        for entry in range(m.body_begin[here.at], m.body_begin[here.at + SLOTS]):
             body = m.body[entry]
             for k in range(6):
-                block.write(g_forces, e, 6 * body + k, block.pick(drop, T(0.5), adj_forces[body][k], T(0.0)))
+                block.write(g_forces, here.e, 6 * body + k, block.pick(drop, T(0.5), adj_forces[body][k], T(0.0)))
 
     return by_name(add_forces, add_forces_adjoint, broken_forces, write_forces_adjoint)

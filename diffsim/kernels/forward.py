@@ -32,7 +32,7 @@ SLOPE = 0.05
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
-    T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
+    T, vec2, vec3, vec6, quat = t.T, t.vec2, t.vec3, t.vec6, t.quat
     Model, Law, law_of = t.Model, t.Law, environment_law(spec)
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
@@ -48,8 +48,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
 
-    Load, loads_of = t.Load, wp.array(dtype=t.Load)
-    mat3s, vec3s, vec6s = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6))
+    Load, Link, Lane = t.Load, t.Link, t.Lane
 
     @wp.func
     def too_fast(rate: T):
@@ -65,19 +64,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     def search(
         m: Model,
         law: Law,
-        at: int,
-        n: int,
-        R: mat3s,
-        x: vec3s,
-        V: vec6s,
-        B: vec6s,
+        here: Lane,
+        links: t.links,
+        B: t.vec6s,
         height: T,
-        q: t.array,
-        qd: t.array,
         guess: t.array,
         step: t.array,
-        twist: vec6s,
-        loads: loads_of,
+        twist: t.vec6s,
+        loads: t.loads,
     ):
         """The part of Newton's step that MuJoCo's cost is least after, or all of it where that is near.
 
@@ -85,8 +79,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         s (M + H) s = s.f(0) - ...; it grows with the part, so secants between its signs find where it is zero.
         """
         inertia = T(0.0)
-        for i in range(n):
-            k = at + i
+        for i in range(here.n):
+            k = here.at + i
             a = wp.spatial_top(twist[i])
             l = wp.spatial_bottom(twist[i])
             inertia = inertia + wp.dot(a, loads[i].a * a + T(2.0) * (loads[i].b * l)) + wp.dot(l, loads[i].d * l)
@@ -104,12 +98,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         for trial in range(1 + SEARCHES):  # the first is where the step begins
             if block.any_of(beyond):
                 now = vec2()  # s.f and s.Hs of all constraints after this part of the step
-                for i in range(n):
-                    k = at + i
+                for i in range(here.n):
+                    k = here.at + i
                     if wp.static(CONTACT):
-                        now = now + constraint.contacts_along(m, law, k, R[i], x[i], V[i], B[i], height, twist[i], part)
+                        now = now + constraint.contacts_along(m, law, k, links[i], B[i], height, twist[i], part)
                     if i > 0:
-                        held = constraint.joint_constraint(m, law, k, q[i], qd[i], guess[i] + part * step[i], T(0.0))
+                        held = constraint.joint_constraint(
+                            m, law, k, links[i].q, links[i].qd, guess[i] + part * step[i], T(0.0)
+                        )
                         now = now + T(m.carried[k]) * step[i] * vec2(held[0], held[1] * step[i])
                 if wp.static(THREADS_PER_ENV > 1):
                     now = vec2(sums.add(now[0]), sums.add(now[1]))
@@ -158,42 +154,34 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     ):
         h = T(seconds)
         theta = T(implicitness)
-        tid = wp.tid()
-        e = first + tid / THREADS_PER_ENV  # the environment, or block of environments
-        lane = tid % THREADS_PER_ENV
-        # Variables, not constants: Warp would unroll the loops over links, and their code outgrow a GPU's cache.
+        here = kin.lane_of(m, first, wp.tid())
+        e = here.e
+        lane = here.lane
+        at = here.at
+        n = here.n
         slots = int(SLOTS)
-        n = int(SLOTS)
-        at = lane * SLOTS
-        if wp.static(THREADS_PER_ENV > 1):
-            n = m.count[lane]
-        R = wp.zeros(shape=SLOTS, dtype=mat3)
-        x = wp.zeros(shape=SLOTS, dtype=vec3)
-        S = wp.zeros(shape=SLOTS, dtype=vec6)
-        V = wp.zeros(shape=SLOTS, dtype=vec6)
+        links = wp.zeros(shape=SLOTS, dtype=Link)
         C = wp.zeros(shape=SLOTS, dtype=vec6)
         A = wp.zeros(shape=SLOTS, dtype=vec6)
         U = wp.zeros(shape=SLOTS, dtype=vec6)
         loads = wp.zeros(shape=SLOTS, dtype=Load)
         dinv = wp.zeros(shape=SLOTS, dtype=T)
         u = wp.zeros(shape=SLOTS, dtype=T)
-        q = wp.zeros(shape=SLOTS, dtype=T)
-        qd = wp.zeros(shape=SLOTS, dtype=T)
         motor = wp.zeros(shape=SLOTS, dtype=T)
         law = law_of(m, h, theta, factors, e)
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
-            muscle.activate(m, law, lane, ctrl, e, pull)
+            muscle.activate(m, law, here, ctrl, pull)
         if wp.static(MOTOR):
-            joint.drive(m, law, lane, n, ctrl, e, motor)
+            joint.drive(m, law, here, ctrl, motor)
         for i in range(1, n):
-            q[i] = read(qpos, e, qpos_adr(m, at + i))
-            qd[i] = read(qvel, e, VADR + link_of(m, at + i))
+            links[i].q = read(qpos, e, qpos_adr(m, at + i))
+            links[i].qd = read(qvel, e, VADR + link_of(m, at + i))
         if wp.static(NBALL > 0):
             turn = wp.zeros(shape=NBALL, dtype=quat)
             for b in range(m.ball_count[lane]):
                 turn[b] = wp.normalize(kin.load_quat(qpos, e, qpos_adr(m, at + m.ball_slot[lane * NBALL + b])))
-        R[0] = wp.identity(3, dtype=T)
+        links[0].R = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
             pos = vec3(read(qpos, e, 0), read(qpos, e, 1), read(qpos, e, 2))
             rot = wp.normalize(kin.load_quat(qpos, e, 3))
@@ -212,8 +200,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             row = row0 + sub
             place = kin.carrier_place(m, T(0.0), T(0.0))
             if wp.static(FLOATING):
-                R[0] = wp.quat_to_matrix(rot)
-                V[0] = join(R[0] * w, v)
+                links[0].R = wp.quat_to_matrix(rot)
+                links[0].V = join(links[0].R * w, v)
                 place = kin.carrier_place(m, pos[0], pos[2])
                 if record == 1:
                     for k in range(3):
@@ -224,18 +212,18 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     store(ck_q, row, 3, e, rot[3])
             # 1. outward: poses, velocities, velocity products, inertias and bias forces
             if wp.static(NBALL > 0):
-                kin.place_balls(m, lane, turn, R, q)
-            place = kin.place_links(m, at, n, q, R, x, S, place)
+                kin.place_balls(m, here, turn, links)
+            place = kin.place_links(m, here, links, place)
             for i in range(1, n):
                 k = at + i
-                V[i] = V[m.parent[k]] + S[i] * qd[i]
+                links[i].V = links[m.parent[k]].V + links[i].S * links[i].qd
                 turning = i
                 if wp.static(NBALL > 0):
                     turning = m.inboard[k]
-                C[i] = wp.spatial_cross(V[turning], S[i] * qd[i])
+                C[i] = wp.spatial_cross(links[turning].V, links[i].S * links[i].qd)
                 if record == 1:
-                    store(ck_q, row, qpos_adr(m, k), e, q[i])
-                    store(ck_v, row, VADR + link_of(m, k), e, qd[i])
+                    store(ck_q, row, qpos_adr(m, k), e, links[i].q)
+                    store(ck_v, row, VADR + link_of(m, k), e, links[i].qd)
             if wp.static(NBALL > 0):
                 for b in range(m.ball_count[lane]):
                     if record == 1:
@@ -246,11 +234,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             for i in range(1, INERT + 1):
                 loads[i] = Load()
             for i in range(FIRST, n):
-                loads[i] = link.link_inertia(m, law, at + i, R[i], x[i], V[i], place)
+                loads[i] = link.link_inertia(m, law, at + i, links[i], place)
             if wp.static(FORCED):
-                force.add_forces(m, at, n, forces, e, R, x, loads)
+                force.add_forces(m, here, forces, links, loads)
             if wp.static(MUSCLE):
-                muscle.add_muscles(m, lane, pull, R, x, loads)
+                muscle.add_muscles(m, here, pull, links, loads)
             # 2. inward: articulated inertias. With constraints each pass is a step of Newton's method, the first as if
             # all of them stuck. MuJoCo's implicit damping is one pass more: (M + h b) change = -h b a.
             begin = 0
@@ -263,7 +251,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 vdot = vec3()
                 A[0] = join(vec3(), -vec3(m.gravity))
                 if wp.static(FLOATING):
-                    A[0] = A[0] - join(vec3(), wp.cross(R[0] * w, v))
+                    A[0] = A[0] - join(vec3(), wp.cross(links[0].R * w, v))
                 B[0] = vec6()
                 for i in range(n):
                     free_loads[i] = loads[i]
@@ -286,7 +274,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                             for i in range(FIRST, n):
                                 k = at + i
                                 loads[i] = constraint.add_contacts(
-                                    m, law, k, R[i], x[i], V[i], A[i], B[i], place, stuck, loads[i]
+                                    m, law, k, links[i], A[i], B[i], place, stuck, loads[i]
                                 )
                 if wp.static(SHARERS > 1):
                     sums.sharers.add_loads(loads)
@@ -298,36 +286,36 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     if i > 0 and i < n:
                         k = at + i
                         p = m.parent[k]
-                        sa = wp.spatial_top(S[i])
-                        sl = wp.spatial_bottom(S[i])
+                        sa = wp.spatial_top(links[i].S)
+                        sl = wp.spatial_bottom(links[i].S)
                         own = loads[i]
                         Ua = own.a * sa + own.b * sl
                         Ul = sa * own.b + own.d * sl
                         Ui = join(Ua, Ul)
-                        d = wp.dot(S[i], Ui) + T(m.armature[k])
-                        qi = q[i]
+                        d = wp.dot(links[i].S, Ui) + T(m.armature[k])
+                        qi = links[i].q
                         if wp.static(IMPLICIT):
-                            qi = qi + theta * h * qd[i]
+                            qi = qi + theta * h * links[i].qd
                         free = T(1.0)
                         if wp.static(CLAMP):
-                            free = joint.actuation_free(m, k, motor[i], qi, qd[i])
+                            free = joint.actuation_free(m, k, motor[i], qi, links[i].qd)
                         if wp.static(IMPLICIT):
-                            resistance = joint.resistance(m, law, k, qi, qd[i], free)
+                            resistance = joint.resistance(m, law, k, qi, links[i].qd, free)
                             d = d + theta * h * h * resistance[0] + h * resistance[1]
                         if wp.static(CONSTRAINED):
                             damper = h * joint.damping(m, k, free)
                             ui = -damper * guess[i]
                             if newton == 1:
-                                held = constraint.joint_constraint(m, law, k, qi, qd[i], guess[i], stuck)
-                                ui = joint.actuation(m, k, motor[i], qi, qd[i])
-                                ui = ui + joint.passive_force(m, law, k, qi, qd[i]) + held[0] + held[1] * guess[i]
+                                held = constraint.joint_constraint(m, law, k, qi, links[i].qd, guess[i], stuck)
+                                ui = joint.actuation(m, k, motor[i], qi, links[i].qd)
+                                ui = ui + joint.passive_force(m, law, k, qi, links[i].qd) + held[0] + held[1] * guess[i]
                                 d = d + held[1]
                             else:
                                 d = d + damper
-                            ui = ui - wp.dot(S[i], own.f)
+                            ui = ui - wp.dot(links[i].S, own.f)
                         else:
-                            ui = joint.actuation(m, k, motor[i], qi, qd[i])
-                            ui = ui + joint.passive_force(m, law, k, qi, qd[i]) - wp.dot(S[i], own.f)
+                            ui = joint.actuation(m, k, motor[i], qi, links[i].qd)
+                            ui = ui + joint.passive_force(m, law, k, qi, links[i].qd) - wp.dot(links[i].S, own.f)
                         di = T(1.0) / d
                         if wp.static(FLOATING) or p > 0:
                             va = Ua * di
@@ -354,14 +342,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(FLOATING):
                     L, a0 = base.factor_base(loads[0].a, loads[0].b, loads[0].d, -loads[0].f)
                     A[0] = a0
-                    turning_up = wp.transpose(R[0]) * wp.spatial_top(a0)
-                    speeding_up = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(V[0]), v) + vec3(m.gravity)
+                    turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
+                    speeding_up = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(links[0].V), v) + vec3(m.gravity)
                     if record == 1:
                         base.store_base(ck_f, factor_row, e, L)
                 for i in range(1, n):
                     ai = A[m.parent[at + i]] + C[i]
                     qdd = (u[i] - wp.dot(U[i], ai)) * dinv[i]
-                    A[i] = ai + S[i] * qdd
+                    A[i] = ai + links[i].S * qdd
                     u[i] = qdd
                 if wp.static(CONSTRAINED):
                     if newton == 1:
@@ -382,11 +370,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                             if solve > 0:
                                 U[0] = vec6()  # from here on twists of the step
                                 if wp.static(FLOATING):
-                                    U[0] = join(R[0] * (turning_up - wdot), speeding_up - vdot)
+                                    U[0] = join(links[0].R * (turning_up - wdot), speeding_up - vdot)
                                 for i in range(1, n):
                                     lam[i] = u[i] - guess[i]
-                                    U[i] = U[m.parent[at + i]] + S[i] * lam[i]
-                                part = search(m, law, at, n, R, x, V, B, place, q, qd, guess, lam, U, free_loads)
+                                    U[i] = U[m.parent[at + i]] + links[i].S * lam[i]
+                                part = search(m, law, here, links, B, place, guess, lam, U, free_loads)
                         else:  # where a step is no shorter, half of it
                             part = pick(last_change, change, T(0.5), T(1.0))
                             last_change = change
@@ -404,14 +392,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                             vdot = vdot + part * (speeding_up - vdot)
                             turning_up = wdot
                             speeding_up = vdot
-                            B[0] = join(R[0] * wdot, vdot)
-                            A[0] = join(R[0] * wdot, vdot - wp.cross(R[0] * w, v) - vec3(m.gravity))
+                            B[0] = join(links[0].R * wdot, vdot)
+                            A[0] = join(links[0].R * wdot, vdot - wp.cross(links[0].R * w, v) - vec3(m.gravity))
                         for i in range(1, n):
                             p = m.parent[at + i]
                             guess[i] = guess[i] + part * (u[i] - guess[i])
                             u[i] = guess[i]
-                            A[i] = A[p] + C[i] + S[i] * guess[i]
-                            B[i] = B[p] + S[i] * guess[i]
+                            A[i] = A[p] + C[i] + links[i].S * guess[i]
+                            B[i] = B[p] + links[i].S * guess[i]
                     else:
                         if wp.static(FLOATING):
                             turning_up = wdot + turning_up
@@ -429,14 +417,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 pos = pos + h * v
                 rot = wp.normalize(rot * exp_quat(h * w))
             for i in range(1, n):
-                qd[i] = qd[i] + h * u[i]
-                q[i] = q[i] + h * qd[i]
+                links[i].qd = links[i].qd + h * u[i]
+                links[i].q = links[i].q + h * links[i].qd
                 if record == 1:
                     store(ck_a, row, VADR + link_of(m, at + i), e, u[i])
             if wp.static(NBALL > 0):
                 for b in range(m.ball_count[lane]):
                     i = m.ball_slot[lane * NBALL + b]
-                    turn[b] = wp.normalize(turn[b] * exp_quat(h * vec3(qd[i], qd[i + 1], qd[i + 2])))
+                    turn[b] = wp.normalize(turn[b] * exp_quat(h * vec3(links[i].qd, links[i + 1].qd, links[i + 2].qd)))
 
         # An environment that left the finite numbers, or any imaginable speed, is handed back as it came.
         broken = T(0.0)
@@ -445,7 +433,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 broken = broken + block.broken(pos[k]) + block.broken(rot[k]) + too_fast(v[k]) + too_fast(w[k])
             broken = broken + block.broken(rot[3])
         for i in range(1, n):
-            broken = broken + block.broken(q[i]) + too_fast(qd[i])
+            broken = broken + block.broken(links[i].q) + too_fast(links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[lane]):
                 for k in range(4):
@@ -463,8 +451,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 hand_back(qvel_out, qvel, e, 3 + k, broken, w[k])
             hand_back(qpos_out, qpos, e, 3, broken, rot[3])
         for i in range(1, n):
-            hand_back(qpos_out, qpos, e, qpos_adr(m, at + i), broken, q[i])
-            hand_back(qvel_out, qvel, e, VADR + link_of(m, at + i), broken, qd[i])
+            hand_back(qpos_out, qpos, e, qpos_adr(m, at + i), broken, links[i].q)
+            hand_back(qvel_out, qvel, e, VADR + link_of(m, at + i), broken, links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[lane]):
                 adr = qpos_adr(m, at + m.ball_slot[lane * NBALL + b])

@@ -26,7 +26,7 @@ from diffsim.kernels.wide import blocks
 @cache
 def joint_law(spec: KernelSpec) -> SimpleNamespace:
     t = types(spec)
-    T, Model, Law = t.T, t.Model, t.Law
+    T, Model, Law, Lane = t.T, t.Model, t.Law, t.Lane
     vec2, block = t.vec2, blocks(spec)
     pick = block.pick
     STIFFNESS, DAMPING, LIMIT = (name in spec.features for name in ("stiffness", "damping", "limit"))
@@ -35,13 +35,13 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     CLAMP = "clamp" in spec.features
 
     @wp.func
-    def drive(m: Model, law: Law, lane: int, n: int, ctrl: t.array2, e: int, motor: t.array):
+    def drive(m: Model, law: Law, here: Lane, ctrl: t.array2, motor: t.array):
         """Adds the motors' forces to the links' of a lane."""
         for k in range(NU):
-            i = m.motor_slot[lane * NU + k]
-            motor[i] = motor[i] + T(m.gear[k]) * block.read(ctrl, e, k) + T(m.motor_bias[k])
+            i = m.motor_slot[here.lane * NU + k]
+            motor[i] = motor[i] + T(m.gear[k]) * block.read(ctrl, here.e, k) + T(m.motor_bias[k])
         if wp.static(VARIED):
-            for i in range(1, n):
+            for i in range(1, here.n):
                 motor[i] = law.motor * motor[i]
 
     @wp.func

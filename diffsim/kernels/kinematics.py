@@ -14,16 +14,26 @@ from diffsim.kernels.wide import blocks
 @cache
 def kinematics(spec: KernelSpec) -> SimpleNamespace:
     t = types(spec)
-    T, vec2, vec3, vec6, mat3, quat = t.T, t.vec2, t.vec3, t.vec6, t.mat3, t.quat
-    Model, array = t.Model, t.array
+    T, vec2, vec3, mat3, quat, Model, Lane = t.T, t.vec2, t.vec3, t.mat3, t.quat, t.Model, t.Lane
     sp, read = spatial(spec), blocks(spec).read
     join, log_quat = sp.join, sp.log_quat
-    mat3s, vec3s, vec6s, quats = (wp.array(dtype=kind) for kind in (mat3, vec3, vec6, quat))
     NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
     BALL, STIFFNESS = "ball" in spec.features, "stiffness" in spec.features
     HINGE, SLIDE = "hinge" in spec.features, "slide" in spec.features
-    ENV_LAST, THREADS_PER_ENV = spec.env_last, spec.threads_per_env
+    ENV_LAST, THREADS_PER_ENV, SLOTS = spec.env_last, spec.threads_per_env, spec.slots
     TERRAIN, Place = "terrain" in spec.features, t.Place
+
+    @wp.func
+    def lane_of(m: Model, first: int, thread: int):
+        """What a thread of a launch that begins with environment, or block, `first` computes."""
+        here = Lane()
+        here.e = first + thread / THREADS_PER_ENV
+        here.lane = thread % THREADS_PER_ENV
+        here.at = here.lane * SLOTS
+        here.n = int(SLOTS)  # a variable, not a constant: Warp would unroll loops, and they outgrow a GPU's cache
+        if wp.static(THREADS_PER_ENV > 1):
+            here.n = m.count[here.lane]
+        return here
 
     @wp.func
     def load(a: t.array3, row: int, k: int, e: int):
@@ -64,16 +74,15 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
         return quat_of(load(a, row, k, e), load(a, row, k + 1, e), load(a, row, k + 2, e), load(a, row, k + 3, e))
 
     @wp.func
-    def place_balls(m: Model, lane: int, turn: quats, R: mat3s, q: array):
+    def place_balls(m: Model, here: Lane, turn: t.quats, links: t.links):
         """Into the first link's R the turn of each ball joint, and into q, for the spring, its rotation vector."""
-        for b in range(m.ball_count[lane]):
-            i = m.ball_slot[lane * NBALL + b]
-            R[i] = wp.quat_to_matrix(turn[b])
+        for b in range(m.ball_count[here.lane]):
+            i = m.ball_slot[here.lane * NBALL + b]
+            links[i].R = wp.quat_to_matrix(turn[b])
             if wp.static(STIFFNESS):
                 r = log_quat(turn[b])
-                q[i] = r[0]
-                q[i + 1] = r[1]
-                q[i + 2] = r[2]
+                for k in range(3):
+                    links[i + k].q = r[k]
 
     @wp.func
     def carrier_place(m: Model, x: T, z: T):
@@ -84,42 +93,45 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             return T(m.carrier_height) + z
 
     @wp.func
-    def place_links(m: Model, at: int, n: int, q: array, R: mat3s, x: vec3s, S: vec6s, place: Place):
+    def place_links(m: Model, here: Lane, links: t.links, place: Place):
         """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's place.
 
-        R[i] of a ball joint's first link comes with the joint's own turn.
+        R of a ball joint's first link comes with the joint's own turn.
         """
-        for i in range(1, n):
-            k = at + i
+        for i in range(1, here.n):
+            k = here.at + i
             if wp.static(BALL):
-                turn = R[i]
+                turn = links[i].R
             p = m.parent[k]
-            a = R[p] * vec3(m.axis[k])
+            a = links[p].R * vec3(m.axis[k])
             R_joint = mat3(m.turn0[k])
             if wp.static(HINGE):
                 if i > CARRIER:
-                    R_joint = R_joint + wp.sin(q[i]) * mat3(m.turn1[k]) + wp.cos(q[i]) * mat3(m.turn2[k])
-            R[i] = R[p] * R_joint
+                    R_joint = R_joint + wp.sin(links[i].q) * mat3(m.turn1[k]) + wp.cos(links[i].q) * mat3(m.turn2[k])
+            links[i].R = links[p].R * R_joint
             if wp.static(BALL):
                 if m.outboard[k] == i + 2:
-                    R[i] = R[i] * turn
-                    a = vec3(R[i][0, 0], R[i][1, 0], R[i][2, 0])
-            xi = x[p] + R[p] * vec3(m.position[k])
+                    links[i].R = links[i].R * turn
+                    R = links[i].R
+                    a = vec3(R[0, 0], R[1, 0], R[2, 0])
+            xi = links[p].x + links[p].R * vec3(m.position[k])
             Si = join(a, wp.cross(xi, a))
             if wp.static(SLIDE):
                 if m.slide[k] == 1:
-                    xi = xi + a * q[i]
+                    xi = xi + a * links[i].q
                     Si = join(vec3(), a)
             if wp.static(CARRIER > 0):
                 # The massless slides up to the carrier move its origin: nothing reads where they are.
                 if i <= CARRIER:
                     xi = vec3()
                     if wp.static(TERRAIN):
-                        place = place + q[i] * vec2(a[0], a[2])
+                        place = place + links[i].q * vec2(a[0], a[2])
                     else:
-                        place = place + a[2] * q[i]
-            x[i] = xi
-            S[i] = Si
+                        place = place + a[2] * links[i].q
+            links[i].x = xi
+            links[i].S = Si
         return place
 
-    return by_name(load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, carrier_place, place_links)
+    return by_name(
+        lane_of, load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, carrier_place, place_links
+    )

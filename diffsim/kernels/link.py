@@ -16,24 +16,29 @@ from diffsim.kernels.spec import KernelSpec
 @cache
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
-    T, vec3, vec6, mat3, Model, Law = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law
+    T, vec3, vec6, mat3, Model, Law, Link = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law, t.Link
     momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
     LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
     DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
 
     @wp.func
-    def lift(m: Model, k: int, R: mat3, x: vec3):
+    def mass_of(m: Model, k: int, link: Link):
+        """Centre of mass and inertia about it of link k."""
+        return sp.on_link(link.R, link.x, m.com[k]), link.R * mat3(m.inertia[k]) * wp.transpose(link.R)
+
+    @wp.func
+    def lift(m: Model, k: int, link: Link):
         """Where gravity compensation acts on link k, its force and its wrench."""
-        p = x + R * vec3(m.lift_position[k])
+        p = sp.on_link(link.R, link.x, m.lift_position[k])
         f = -T(m.lift[k]) * vec3(m.gravity)
         return p, f, sp.force_at(p, f)
 
     @wp.func
-    def link_inertia(m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, place: Place):
+    def link_inertia(m: Model, law: Law, k: int, link: Link, place: Place):
         """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
-        com = x + R * vec3(m.com[k])
-        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        com, inertia = mass_of(m, k, link)
+        V = link.V
         mass = T(m.mass[k])
         if wp.static(VARIED):
             inertia = law.mass * inertia
@@ -43,16 +48,16 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         Id = wp.diag(vec3(mass, mass, mass))
         F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
         if wp.static(LIFT):
-            _p, _f, up = lift(m, k, R, x)
+            _p, _f, up = lift(m, k, link)
             if wp.static(VARIED):
                 up = law.mass * up
             F = F - up
         if wp.static(DAMPED):
             F = F + T(m.base_damping[k]) * V
         if wp.static(DRAG):
-            F = F - drag.drag_wrench(m, k, R, com, V)
+            F = F - drag.drag_wrench(m, k, link.R, com, V)
         if wp.static(CONTACT):
-            Ia, Ib, Id, F = contact.add_contacts(m, law, k, R, x, V, place, Ia, Ib, Id, F)
+            Ia, Ib, Id, F = contact.add_contacts(m, law, k, link, place, Ia, Ib, Id, F)
         load = Load()
         load.a = Ia
         load.b = Ib
@@ -61,15 +66,13 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         return load
 
     @wp.func
-    def link_adjoint(
-        m: Model, law: Law, k: int, R: mat3, x: vec3, V: vec6, A: vec6, W: vec6, place: Place, adj_factors: t.array
-    ):
+    def link_adjoint(m: Model, law: Law, k: int, link: Link, A: vec6, W: vec6, place: Place, adj_factors: t.array):
         """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position.
 
         adj_factors, here and in all laws, are written if varied only.
         """
-        com = x + R * vec3(m.com[k])
-        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        com, inertia = mass_of(m, k, link)
+        V = link.V
         Iv = momentum(T(m.mass[k]), com, inertia, V)
         adj_a = momentum(T(m.mass[k]), com, inertia, W)
         adj_w = momentum(T(m.mass[k]), com, inertia, A) + wp.spatial_cross_dual(V, Iv)
@@ -77,7 +80,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
         adj_p = vec6()
         if wp.static(LIFT):  # as an external force, see force.py
-            p, f, up = lift(m, k, R, x)
+            p, f, up = lift(m, k, link)
             adj_w = adj_w - up
             adj_p = -sp.force_at(p, wp.cross(f, wp.spatial_top(W))) - wp.spatial_cross_dual(W, up)
         if wp.static(VARIED):
@@ -92,19 +95,18 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             adj_w = adj_w + T(m.base_damping[k]) * V
             adj_v = adj_v + T(m.base_damping[k]) * W
         if wp.static(DRAG):
-            adj_w = adj_w - drag.drag_wrench(m, k, R, com, V)
-            adj_v = adj_v + drag.drag_adjoint(m, k, R, com, V, W)
+            adj_w = adj_w - drag.drag_wrench(m, k, link.R, com, V)
+            adj_v = adj_v + drag.drag_adjoint(m, k, link.R, com, V, W)
         if wp.static(CONTACT):
             adj_a, adj_v, adj_w, adj_p = contact.add_contacts_adjoint(
-                m, law, k, R, x, V, A, W, place, adj_a, adj_v, adj_w, adj_p, adj_factors
+                m, law, k, link, A, W, place, adj_a, adj_v, adj_w, adj_p, adj_factors
             )
         return adj_a, adj_v, adj_w, adj_p
 
     @wp.func
-    def damping_adjoint(m: Model, law: Law, k: int, R: mat3, x: vec3, D: vec6, W: vec6, adj_factors: t.array):
+    def damping_adjoint(m: Model, law: Law, k: int, link: Link, D: vec6, W: vec6, adj_factors: t.array):
         """The adjoints of D and W in W . I D, with I the inertia of one link."""
-        com = x + R * vec3(m.com[k])
-        inertia = R * mat3(m.inertia[k]) * wp.transpose(R)
+        com, inertia = mass_of(m, k, link)
         adj_d = momentum(T(m.mass[k]), com, inertia, W)
         adj_w = momentum(T(m.mass[k]), com, inertia, D)
         if wp.static(VARIED):

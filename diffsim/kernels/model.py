@@ -224,6 +224,8 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     T = wp.float64 if spec.block > 1 else U
     vec2, vec3, vec4, vec6 = (wp.types.vector(n, T) for n in (2, 3, 4, 6))
     mat3, mat6, quat = wp.types.matrix((3, 3), T), wp.types.matrix((6, 6), T), wp.types.quaternion(T)
+    Link = struct("Link", {"R": mat3, "x": vec3, "S": vec6, "V": vec6, "q": T, "qd": T})
+    Load = struct("Load", {"a": mat3, "b": mat3, "d": mat3, "f": vec6})
     constants = dict.fromkeys("h theta k_n k_d k_t mu k_limit d_limit mass motor".split(), T)
     return SimpleNamespace(
         T=T,
@@ -244,8 +246,16 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         # h: s, of a substep; theta: how implicit it is; constants of the laws, or factors of those that each link has
         # its own of (k_limit to motor, read where they vary); whose environments' row of Model.terrain is read
         Law=struct("Law", constants | {"block": int}),
+        # a lane of an environment, or of a block of them, e; the entries of its n links in Model's arrays begin at `at`
+        Lane=struct("Lane", dict.fromkeys(("e", "lane", "at", "n"), int)),
+        # where a link is (about the carrier, in world axes), its joint's axis, its velocity, and its joint's state
+        Link=Link,
+        links=wp.array(dtype=Link),
         # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force
-        Load=struct("Load", {"a": mat3, "b": mat3, "d": mat3, "f": vec6}),
+        Load=Load,
+        loads=wp.array(dtype=Load),
+        vec6s=wp.array(dtype=vec6),
+        quats=wp.array(dtype=quat),
     )
 
 

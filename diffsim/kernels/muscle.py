@@ -29,18 +29,16 @@ SHORTEST = 1e-6  # m
 @cache
 def muscle_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
-    T, vec3, vec6, Model, Law, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.array
+    T, vec3, vec6, Model, Law, Lane, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.Lane, t.array
     join, point_velocity = sp.join, sp.point_velocity
-    loads_of = wp.array(dtype=t.Load)
-    mat3s, vec3s, vec6s = wp.array(dtype=t.mat3), wp.array(dtype=vec3), wp.array(dtype=vec6)
     VARIED, block = spec.varied, blocks(spec)
 
     @wp.func
-    def activate(m: Model, law: Law, lane: int, ctrl: t.array2, e: int, pull: array):
+    def activate(m: Model, law: Law, here: Lane, ctrl: t.array2, pull: array):
         """Into pull the maximum force times the activation, of each of the lane's muscles."""
-        for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
+        for entry in range(m.muscle_begin[here.lane], m.muscle_begin[here.lane + 1]):
             k = m.muscle[entry]
-            pull[k] = T(m.gear[k]) * block.read(ctrl, e, k) + T(m.motor_bias[k])
+            pull[k] = T(m.gear[k]) * block.read(ctrl, here.e, k) + T(m.motor_bias[k])
             if wp.static(VARIED):
                 pull[k] = law.motor * pull[k]
 
@@ -62,13 +60,15 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
         return join(wp.transpose(R) * wp.spatial_top(v), wp.transpose(R) * point_velocity(v, x))
 
     @wp.func
-    def add_muscles(m: Model, lane: int, pull: array, R: mat3s, x: vec3s, loads: loads_of):
+    def add_muscles(m: Model, here: Lane, pull: array, links: t.links, loads: t.loads):
         """Adds the muscles to the links' bias forces."""
-        for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
+        for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):
             i = m.pair_link[2 * pair]
             j = m.pair_link[2 * pair + 1]
-            turn = wp.transpose(R[i]) * R[j]
-            shift = wp.transpose(R[i]) * (x[j] - x[i])
+            R = links[i].R
+            x = links[i].x
+            turn = wp.transpose(R) * links[j].R
+            shift = wp.transpose(R) * (links[j].x - x)
             force = vec3()
             torque = vec3()
             for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
@@ -77,29 +77,23 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
                 f = d * (pull[m.segment_muscle[s]] / length_of(d))
                 force = force + f
                 torque = torque + wp.cross(a, f)
-            wrench = outward(R[i], x[i], torque, force)
+            wrench = outward(R, x, torque, force)
             loads[i].f = loads[i].f - wrench
             loads[j].f = loads[j].f + wrench
 
     @wp.func
     def add_muscles_adjoint(
-        m: Model,
-        lane: int,
-        pull: array,
-        R: mat3s,
-        x: vec3s,
-        W: vec6s,
-        adj_w: vec6s,
-        adj_p: vec6s,
-        adj_pull: array,
+        m: Model, here: Lane, pull: array, links: t.links, W: t.vec6s, adj_w: t.vec6s, adj_p: t.vec6s, adj_pull: array
     ):
         """Adds the muscles' part of phi to the adjoints of the links and of pull."""
-        for pair in range(m.lane_begin[lane], m.lane_begin[lane + 1]):
+        for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):
             i = m.pair_link[2 * pair]
             j = m.pair_link[2 * pair + 1]
-            turn = wp.transpose(R[i]) * R[j]
-            shift = wp.transpose(R[i]) * (x[j] - x[i])
-            w = inward(R[i], x[i], W[j] - W[i])
+            R = links[i].R
+            x = links[i].x
+            turn = wp.transpose(R) * links[j].R
+            shift = wp.transpose(R) * (links[j].x - x)
+            w = inward(R, x, W[j] - W[i])
             force = vec3()
             torque = vec3()
             place = vec3()
@@ -120,8 +114,8 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
                 torque = torque + wp.cross(a, f)
                 place = place + e
                 place_torque = place_torque + wp.cross(a, e)
-            wrench = outward(R[i], x[i], torque, force)
-            gp = outward(R[i], x[i], place_torque, place) + wp.spatial_cross_dual(W[i], wrench)
+            wrench = outward(R, x, torque, force)
+            gp = outward(R, x, place_torque, place) + wp.spatial_cross_dual(W[i], wrench)
             adj_w[i] = adj_w[i] - wrench
             adj_w[j] = adj_w[j] + wrench
             adj_p[i] = adj_p[i] - gp

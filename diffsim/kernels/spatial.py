@@ -16,7 +16,7 @@ from diffsim.kernels.wide import blocks
 @cache
 def spatial(spec: KernelSpec) -> SimpleNamespace:
     t, pick = types(spec), blocks(spec).pick
-    T, vec3, vec6, mat3, quat = t.T, t.vec3, t.vec6, t.mat3, t.quat
+    T, vec3, vec6, mat3, quat, uvec3 = t.T, t.vec3, t.vec6, t.mat3, t.quat, t.scene.vec3
 
     @wp.func
     def join(a: vec3, b: vec3):
@@ -30,6 +30,11 @@ def spatial(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def point_velocity(v: vec6, p: vec3):
         return wp.spatial_bottom(v) + wp.cross(wp.spatial_top(v), p)
+
+    @wp.func
+    def on_link(R: mat3, x: vec3, p: uvec3):
+        """Where a point of a link is."""
+        return x + R * vec3(p)
 
     @wp.func
     def momentum(mass: T, com: vec3, inertia: mat3, v: vec6):
@@ -85,5 +90,15 @@ def spatial(spec: KernelSpec) -> SimpleNamespace:
         return (wp.normalize(q) * quat(g[0], g[1], g[2], T(0.0))) * (T(2.0) / wp.length(q))
 
     return by_name(
-        join, force_at, point_velocity, momentum, exp_quat, exp_adjoint, log_quat, log_adjoint, to_tangent, from_tangent
+        join,
+        force_at,
+        point_velocity,
+        on_link,
+        momentum,
+        exp_quat,
+        exp_adjoint,
+        log_quat,
+        log_adjoint,
+        to_tangent,
+        from_tangent,
     )

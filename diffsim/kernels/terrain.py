@@ -28,7 +28,7 @@ from diffsim.kernels.wide import blocks
 @cache
 def terrain_contact(spec: KernelSpec) -> wp.Function:
     t, sp, block, BLOCK = types(spec), spatial(spec), blocks(spec), spec.block
-    T, U, vec2, vec3, vec4, vec6, mat3, Model = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3, t.Model
+    T, U, vec2, vec3, vec4, mat3, Model = t.T, t.U, t.vec2, t.vec3, t.vec4, t.mat3, t.Model
     uvec4 = t.scene.vec4
     point_velocity, IMPLICIT = sp.point_velocity, spec.implicit
 
@@ -138,20 +138,20 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         return result
 
     @wp.func
-    def sphere_on_terrain(m: Model, law: t.Law, c: int, R: mat3, x: vec3, V: vec6, place: vec2):
+    def sphere_on_terrain(m: Model, law: t.Law, c: int, link: t.Link, place: vec2):
         """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
         theta h ahead if implicit), E and the curvature k."""
-        centre = x + R * vec3(m.contact_position[c])
+        centre = sp.on_link(link.R, link.x, m.contact_position[c])
         r = T(m.contact_radius[c])
         reach = r
         if wp.static(IMPLICIT):
-            fastest = wp.length(point_velocity(V, centre)) + r * wp.length(wp.spatial_top(V))
+            fastest = wp.length(point_velocity(link.V, centre)) + r * wp.length(wp.spatial_top(link.V))
             reach = r + law.theta * law.h * fastest
         hit = nearest_of_each(m, law.block, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
         n = vec3(hit[1], T(0.0), hit[2])
         E = mat3(n[2], T(0.0), n[0], T(0.0), T(1.0), T(0.0), -n[0], T(0.0), n[2])
         p = centre - r * n
-        v = wp.transpose(E) * point_velocity(V, p)
+        v = wp.transpose(E) * point_velocity(link.V, p)
         depth = hit[0]
         if wp.static(IMPLICIT):
             depth = depth + law.theta * law.h * v[2]
