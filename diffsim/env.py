@@ -114,11 +114,10 @@ class DiffEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.generator = torch.Generator(self.device)
-        if seed is None:
-            self.generator.seed()
-        else:
+        if seed is not None:
             self.generator.manual_seed(check_seed(seed))
-
+        else:
+            self.generator.seed()
         self._no_action = torch.zeros(num_envs, scene.nu, dtype=self.dtype, device=self.device)
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
@@ -142,12 +141,11 @@ class DiffEnv(VectorEnv):
             ValueError: several seeds, as one generator draws all start states; a mask of another shape or dtype;
                 unknown options.
         """
-        mask = self._mask(options)
+        mask = self._mask(options) if options else torch.ones_like(self.episode_step, dtype=torch.bool)
         if seed is not None:
             self.generator.manual_seed(check_seed(seed))
-        if mask is None:
+        if not options:
             self._cut()
-            mask = torch.ones_like(self.episode_step, dtype=torch.bool)
         self._begin(mask, (start[0] for start in self._draw(1)))
         self._starts, self._time = self._draw(self.horizon), 0
         self._show()
@@ -220,10 +218,8 @@ class DiffEnv(VectorEnv):
         self.episode_step.masked_fill_(mask, 0)
         self._episode_return.masked_fill_(mask, 0.0)
 
-    def _mask(self, options: dict[str, Any] | None) -> Tensor | None:
-        """The environments that reset's options name, or None for all; raises ValueError for other options."""
-        if options is None or options == {}:
-            return None
+    def _mask(self, options: dict[str, Any]) -> Tensor:
+        """The environments that reset's options name; raises ValueError for other options."""
         if not isinstance(options, Mapping) or options.keys() != {"reset_mask"}:
             raise ValueError(f"options are {options!r}, must be a dictionary of reset_mask alone")
         mask = options["reset_mask"]

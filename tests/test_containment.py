@@ -146,6 +146,8 @@ def test_blow_up_ends_the_episode_without_early_termination_too():
         ({"num_envs": 2.5}, "num_envs"),
         ({"horizon": 0}, "horizon.*0"),
         ({"substeps": 0}, "substeps.*0"),
+        ({"substeps": 2**31}, "substeps is 2147483648, must be at most 1000000"),  # beyond int32 a kernel took none
+        ({"substeps": 10**6, "horizon": 2148}, "horizon times substeps is 2148000000, must be at most 2147483647"),
         ({"threads": 0}, "threads.*0"),
         ({"integrator": "rk4"}, "rk4.*semi_implicit, implicit"),
         ({"substeps": 7, "integrator": "extrapolated"}, "substeps is 7, must be even"),

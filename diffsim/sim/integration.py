@@ -6,7 +6,7 @@ from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 INTEGRATORS = ("semi_implicit", "implicit", "extrapolated", "mujoco")
-MOST_PASSES = 1000
+MOST_SUBSTEPS, MOST_PASSES = 1_000_000, 1000
 PASSES = 4  # at four substeps MuJoCo's own acceleration, to rounding in most states: docs/physics.md
 
 
@@ -32,26 +32,14 @@ class Integration(NamedTuple):
     touchdown: bool = True
 
     @classmethod
-    def explicit(cls, contact: str, substeps: int) -> Integration:
-        """Euler's method on soft or MuJoCo's contact."""
-        return cls("mujoco" if contact == "mujoco" else "semi_implicit", substeps)
-
-    @property
-    def contact(self) -> str:
-        """Whose laws of contact and limits: "soft", springs and dampers, or "mujoco", MuJoCo's constraints."""
-        return "mujoco" if self.constrained else "soft"
+    def explicit(cls, kind: str, substeps: int) -> Integration:
+        """Euler's method, on MuJoCo's contact if a contact or an integrator of that kind is "mujoco", else on soft."""
+        return cls("mujoco" if kind == "mujoco" else "semi_implicit", substeps)
 
     @property
     def constrained(self) -> bool:
+        """Whether contact and limits are MuJoCo's constraints, and no springs and dampers."""
         return self.integrator == "mujoco"
-
-    @property
-    def implicit(self) -> bool:
-        return self.integrator == "implicit"
-
-    @property
-    def extrapolated(self) -> bool:
-        return self.integrator == "extrapolated"
 
     def replaced(self, integrator: str | None = None, **others: Any) -> Integration:
         """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
@@ -60,15 +48,15 @@ class Integration(NamedTuple):
         return new._replace(**{name: value for name, value in others.items() if value is not None})
 
     def check(self) -> Integration:
-        """Itself, with substeps a plain int; raises ValueError, with what is allowed, if it cannot be integrated so."""
+        """Itself, with plain ints; raises ValueError, with what is allowed, if it cannot be integrated so."""
         if self.integrator not in INTEGRATORS:
             raise ValueError(f"unknown integrator {self.integrator!r}; choose from {', '.join(INTEGRATORS)}")
-        substeps = check_count("substeps", self.substeps)
-        if self.extrapolated and substeps % 2:
-            raise ValueError(f"substeps is {self.substeps}, must be even for the extrapolated integrator")
+        substeps = check_count("substeps", self.substeps, MOST_SUBSTEPS)
+        if self.integrator == "extrapolated" and substeps % 2:
+            raise ValueError(f"substeps is {substeps}, must be even for the extrapolated integrator")
         if not is_real(self.theta) or not 0 <= self.theta <= 1:
             raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
-        if self.theta and not self.implicit:
+        if self.theta and self.integrator != "implicit":
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
         if not isinstance(self.touchdown, bool):
             raise ValueError(f"touchdown is {self.touchdown!r}, must be True or False")

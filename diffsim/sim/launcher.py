@@ -58,7 +58,7 @@ class Launcher:
             division,
             real,
             options.forces,
-            implicit=how.implicit,
+            implicit=how.integrator == "implicit",
             constrained=how.constrained,
             touchdown=how.touchdown and how.constrained,
             varied=options.factors,
@@ -114,16 +114,18 @@ class Launcher:
         With MuJoCo's constraints also the acceleration where the last pass began, and where damping follows them the
         factors of both.
         """
-        spec, n, device = self.spec, self.num_envs, str(self.device)
+        spec, n = self.spec, self.num_envs
         widths = (spec.nq, spec.nv, (1 + spec.constrained) * spec.nv, spec.nfactor)
         counts = (count, count, count, spec.solves * count)
         numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
         check_memory("checkpoints", n, numbers * self.dtype.itemsize, self.device)
-        if spec.block == 1:
-            sizes = [(c, k, n) if spec.env_last else (c, n, k) for c, k in zip(counts, widths, strict=True)]
-            return [wp.zeros(size, dtype=spec.dtype, device=device) for size in sizes]
-        values = [torch.zeros(c, self.num_blocks, k, spec.block) for c, k in zip(counts, widths, strict=True)]
-        return [array_of_vectors(value, types(spec).T) for value in values]
+        wide = spec.block > 1
+        arrays = list[Any]()
+        for rows, width in zip(counts, widths, strict=True):
+            each = (self.num_blocks, width, spec.block) if wide else (width, n) if spec.env_last else (n, width)
+            values = torch.zeros(rows, *each, dtype=self.dtype, device=self.device)
+            arrays.append(array_of_vectors(values, types(spec).T) if wide else wp.from_torch(values))
+        return arrays
 
 
 def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:
@@ -163,10 +165,7 @@ def check_memory(what: str, num_envs: int, bytes_each: int, device: torch.device
     else:  # Windows does not tell
         return
     if num_envs * bytes_each > there:
-        enough = (
-            f"enough for fewer than {there // bytes_each:,} environments" if there >= bytes_each else "too few for one"
-        )
         raise TooLargeError(
             f"num_envs is {num_envs:,}: the {what} would take {num_envs * bytes_each / 2**30:,.0f} GiB, but {device} "
-            f"has {there / 2**30:,.0f} GiB, {enough}"
+            f"has {there / 2**30:,.0f} GiB, enough for {there // bytes_each:,} environments"
         )

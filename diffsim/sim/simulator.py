@@ -15,6 +15,7 @@ from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory
 from diffsim.sim.options import Options
 
+DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # with the integrator mujoco
 State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 
 
@@ -68,6 +69,7 @@ class Simulator:
         if scene.terrain is not None and len(scene.terrain) not in (1, num_envs):
             raise ValueError(f"terrain has {len(scene.terrain)} profiles, must have 1 or one for each of {num_envs}")
         self.options = Options(integration, **options).check()
+        check_count("horizon times substeps", horizon * self.options.integration.substeps, most=2**31 - 1)
         self.scene, self.num_envs, self.control_dt, self.horizon = scene, num_envs, control_dt, horizon
         self.integration, self.dtype = self.options.integration, self.options.dtype
         self.device = torch.device(self.options.device)
@@ -94,7 +96,7 @@ class Simulator:
         self._slot, self._last = 0, horizon  # of the next differentiable step, of the last step
         self._versions = [0] * horizon  # each slot serves a new step after each round of the ring
         self._coarse: Simulator | None = None  # the other one of the two steps that are extrapolated
-        if how.extrapolated:
+        if how.integrator == "extrapolated":
             half = Integration("semi_implicit", how.substeps // 2)
             self._coarse = Simulator(self.scene, n, half, control_dt, horizon, **options)
             self._coarse.nonfinite_gradients = self.nonfinite_gradients
@@ -119,9 +121,7 @@ class Simulator:
 
     @factors.setter
     def factors(self, value: torch.Tensor) -> None:
-        self.check_tensor("factors", value, self._factors.shape[1])
-        self._check_factors(value)
-        self._factors = value
+        self._factors = self._check_given("factors", value, *self._factors.shape[1:])
 
     @property
     def forces(self) -> torch.Tensor:
@@ -129,9 +129,7 @@ class Simulator:
 
     @forces.setter
     def forces(self, value: torch.Tensor) -> None:
-        self.check_tensor("forces", value, *self._forces.shape[1:])
-        self._check_forces(value)
-        self._forces = value
+        self._forces = self._check_given("forces", value, *self._forces.shape[1:])
 
     def step(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
         """Advance all environments by one control step, differentiable in its arguments, `factors` and `forces`.
@@ -156,10 +154,9 @@ class Simulator:
     def advance(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
         """`step`, of arguments that are known to be of the right shape, dtype and device."""
         if self.device.type == "cpu":  # a GPU's would have to be waited for
-            if self._factors.shape[1]:
-                self._check_factors(self._factors)
-            if self._forces.shape[1]:
-                self._check_forces(self._forces)
+            for name, given in (("factors", self._factors), ("forces", self._forces)):
+                if given.shape[1]:
+                    self._check_given(name, given, *given.shape[1:])
         start = (qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
         if torch.is_grad_enabled() and any(part.requires_grad for part in start):
             slot, self._slot = self._slot, (self._slot + 1) % self.horizon
@@ -243,28 +240,27 @@ class Simulator:
         if value.device != self.device:
             raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
 
-    def _check_factors(self, factors: torch.Tensor) -> None:
-        """Raise ValueError unless all (N, len(FACTORS) or 0) are finite and not negative, and what divides positive."""
-        bad = ~((factors >= 0) & (factors < math.inf))
-        if factors.shape[1] and self.integration.constrained:
-            divisors = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]
-            bad[:, divisors] |= factors[:, divisors] == 0
-        if bool(bad.any()):
-            env, column = bad.nonzero()[0].tolist()
-            raise ValueError(
-                f"the factor of {FACTORS[column]} is {factors[env, column].item()} in environment {env}; factors must "
-                "be finite and not negative, with the integrator mujoco those of k_n, k_d and k_limit positive"
+    def _check_given(self, name: str, value: torch.Tensor, *size: int) -> torch.Tensor:
+        """Factors or forces; raises ValueError unless they are finite, and factors not negative, divisors positive."""
+        self.check_tensor(name, value, *size)
+        bad = ~torch.isfinite(value)
+        if name == "factors":
+            bad |= value < 0
+            if self.integration.constrained and size[0]:
+                bad[:, DIVISORS] |= value[:, DIVISORS] == 0
+        if not bool(bad.any()):
+            return value
+        env, part, *column = bad.nonzero()[0].tolist()
+        if name == "factors":
+            what, rest = (
+                f"factor of {FACTORS[part]}",
+                " and not negative, with the integrator mujoco those of k_n, k_d and k_limit positive",
             )
-
-    def _check_forces(self, forces: torch.Tensor) -> None:
-        """Raise ValueError unless all (N, nbody or 0, 6) are finite."""
-        if not bool(torch.isfinite(forces).all()):
-            env, body, column = (~torch.isfinite(forces)).nonzero()[0].tolist()
-            name = self.scene.mj_model.body(body).name or f"number {body}"
-            raise ValueError(
-                f"{'force' if column < 3 else 'torque'} {'xyz'[column % 3]} on body {name} is "
-                f"{forces[env, body, column].item()} in environment {env}; forces must be finite"
-            )
+        else:
+            body = self.scene.mj_model.body(part).name or f"number {part}"
+            what, rest = f"{'force' if column[0] < 3 else 'torque'} {'xyz'[column[0] % 3]} on body {body}", ""
+        number = value[(env, part, *column)].item()
+        raise ValueError(f"the {what} is {number} in environment {env}; {name} must be finite{rest}")
 
 
 class ControlStep(torch.autograd.Function):

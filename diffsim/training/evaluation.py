@@ -200,7 +200,7 @@ def evaluate_checkpoint(
     print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     if args.finer:
         substeps = FINER * args.substeps
-        explicit = Integration.explicit(Integration(args.integrator).contact, substeps)
+        explicit = Integration.explicit(args.integrator, substeps)
         finer = dataclasses.replace(args, **{k: getattr(explicit, k) for k in ("integrator", "substeps", "theta")})
         value = measure(finer).returns.median().item()
         share = kept(evaluation.returns.median().item(), value)
