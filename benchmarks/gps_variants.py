@@ -1,31 +1,221 @@
-"""The variants with which the paper of guided policy search compares it: gps.py with some of its lines changed.
+"""Guided policy search as the paper compares it (Figure 2), and over terrains, with a plan and guides on each.
 
     python benchmarks/gps_variants.py --case dagger --env hopper --demonstration benchmarks/plans/hopper_500.npz
+    python benchmarks/gps_variants.py --env walker --horizon 160 --terrain level incline:10 step:-5 --practice rough:10
 
-Takes the flags of gps.py. --resume and --evaluate take the checkpoints of this script.
+Takes the flags of gps.py, too. --resume and --evaluate take the checkpoints of this script. A plan.npz of several
+terrains is a demonstration for each of them; on another terrain, planning starts with the first window of its first
+trajectory.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from tables import ROOT
 from torch import Tensor
 
-from diffsim.planning.lbfgs import maximise
-from diffsim.training import command, evaluate_checkpoint, parse
+from diffsim import DiffEnv
+from diffsim.planning import REAL, Plan, System, save_demonstration
+from diffsim.robot.scene import Array, Scene, TerrainError
+from diffsim.terrain import Elevation, incline, root, rough, step
+from diffsim.training import evaluate_checkpoint, fail, script
+from diffsim.training.evaluation import Evaluation
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
 
-LEAST = 5.0  # effective samples: half of what the policy draws
+Case = Literal["guided", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
+MAKERS: dict[str, Callable[..., Array]] = {
+    "level": lambda: incline(0.0),
+    "incline": incline,
+    "step": lambda height, start=1.0: step(height / 100, start),
+    "rough": lambda degrees, segment=1.0, seed=0.0, start=1.0: rough(seed, segment, degrees, start=start),
+}
+USAGE = "level, incline:DEGREES[:START], step:CENTIMETRES[:START] or rough:DEGREES[:SEGMENT[:SEED[:START]]]"
+KINDS = {("incline", 1), ("step", 1), ("rough", 1), ("rough", 2)}  # of practice, and how many numbers each has
 
 
-class NonGuided(gps.Search):
+@dataclass
+class VariantArgs(gps.Args):
+    """What differs from gps.py."""
+
+    MAY_CHANGE = (*gps.Args.MAY_CHANGE, "practice")
+
+    case: Case = "guided"
+    """the search of gps.py, or a variant of the paper's algorithm"""
+    terrain: tuple[str, ...] = ("level",)
+    """train on each, with its own guides: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
+    practice: tuple[str, ...] = ()
+    """the policy's trajectories each go over a random terrain of these kinds, up to that size, not over --terrain"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        paper = {} if self.case == "guided" else {"variant": "full", "perturb": 0.0}
+        bounds = {"regularizer_bounds": (0.0, 0.0)} if self.case == "unregularized" else {}
+        return super().task_defaults() | paper | bounds
+
+    def check(self) -> None:
+        super().check()
+        if not self.terrain:
+            fail("--terrain needs at least one name: level, incline:DEGREES, step:CM or rough:DEGREES")
+        for name in ("samples", "guiding_samples"):
+            if getattr(self, name) < (least := self.guides * len(self.terrain)):
+                fail(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
+        if self.adaptive and len(self.terrain) > 1:
+            fail("--adaptive takes one --terrain")
+        named_terrains(*self.terrain, *(random_terrain(kind, torch.Generator()) for kind in self.practice))
+
+
+# Terrains by their names ----------------------------------------------------------------------------------------------
+
+
+def named_terrains(*names: str) -> Array:
+    """(M, K, 2) profiles of M names, K of the longest; USAGE without numbers that have defaults, or with them.
+
+    Raises:
+        TerrainError: another name, a number too few or too many, or one that its function refuses.
+    """
+    profiles = []
+    for name in names:
+        kind, *numbers = name.split(":")
+        try:
+            profiles.append(MAKERS[kind](*map(float, numbers)))
+        except (KeyError, TypeError) as error:
+            raise TerrainError(f"terrain {name!r} must be {USAGE}") from error
+        except ValueError as error:
+            raise TerrainError(f"terrain {name!r}: {error}") from error
+    most = max(map(len, profiles))
+    for i, p in enumerate(profiles):  # the last segment goes on
+        more = p[-1] + np.arange(1, most - len(p) + 1)[:, None] * (p[-1] - p[-2])
+        profiles[i] = np.concatenate((p, more))
+    return np.stack(profiles)
+
+
+def random_terrain(kind: str, rng: torch.Generator) -> str:
+    """The name of a terrain drawn from those of a kind, a name without place or seed, up to its size up and down.
+
+    It begins between x = 0.5 and 1.5 m.
+    """
+    name, *numbers = kind.split(":")
+    if (name, len(numbers)) not in KINDS:
+        usage = "incline:DEGREES, step:CENTIMETRES or rough:DEGREES[:SEGMENT]"
+        raise TerrainError(f"kind of terrain {kind!r} must be {usage}")
+    named_terrains(kind)  # the steepest or highest one
+    size, place = torch.rand(2, generator=rng, dtype=torch.float64).tolist()
+    if name == "rough":
+        seed = int(torch.randint(2**31, (1,), generator=rng))
+        return ":".join((name, *numbers, *["1"] * (2 - len(numbers)), f"{seed}", f"{0.5 + place:.4f}"))
+    return f"{name}:{(2 * size - 1) * float(numbers[0]):.6g}:{0.5 + place:.4f}"
+
+
+# Planning over them ---------------------------------------------------------------------------------------------------
+
+
+class Ground(System):
+    """A robot over a terrain (K, 2), or trajectory i of a rollout over number i % M of (M, K, 2).
+
+    The root's height in a state is that over the ground below. Feedback by similarity does not heed its place along x,
+    as a guide's is that of its own terrain.
+    """
+
+    def __init__(self, env: DiffEnv, terrain: Array, threads: int | None = None) -> None:
+        scene = env.scene.with_terrain(terrain)
+        assert scene.terrain is not None
+        self.profiles = scene.terrain
+        self._elevations: dict[int, Elevation] = {}
+        super().__init__(env, threads, scene)
+        self.counts[: self.nv] -= torch.tensor(root(scene)[1][: self.nv]).to(self.counts)
+
+    def copies(self, count: int, first: int = 0) -> Scene:
+        """The scene of so many trajectories from number `first` on."""
+        M = len(self.profiles)
+        return self.scene if M == 1 else self.scene.with_terrain(self.profiles[np.arange(first, first + count) % M])
+
+    def rollout(self, x: Tensor, steps: int, act: Callable[[int, Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        ground = self._elevation(len(x))
+        start = self._moved(x, ground.lift)
+        x, u, finite = super().rollout(start, steps, lambda t, x: act(t, self._moved(x, ground.lower)))
+        return self._moved(x, ground.lower), u, finite
+
+    def jacobians(self, x: Tensor, u: Tensor, following: Tensor) -> Tensor:
+        if len(self.profiles) > 1:
+            raise ValueError("Jacobians need one terrain for all steps")
+        ground, nq, nv = self._elevation(1), self.nq, self.nv
+        f_z = super().jacobians(self._moved(x, ground.lift), u, self._moved(following, ground.lift))
+        before, after = (F.pad(ground.gradient(part[:, :nq])[..., :nv, :nv], (0, nv, 0, nv)) for part in (x, following))
+        f_z[..., : self.nd] = f_z[..., : self.nd] + f_z[..., : self.nd] @ before
+        return f_z - after @ f_z
+
+    def _elevation(self, count: int) -> Elevation:
+        """The ground below so many trajectories."""
+        if count not in self._elevations:
+            self._elevations[count] = Elevation(self.copies(count), self.device, REAL)
+        return self._elevations[count]
+
+    def _moved(self, x: Tensor, move: Callable[[Tensor], Tensor]) -> Tensor:
+        """x (n, nx) or (n, T, nx), a row for each ground, with qpos lifted or lowered."""
+        qpos = move(x[..., : self.nq].movedim(0, -2)).movedim(-2, 0)
+        return torch.cat((qpos, x[..., self.nq :]), -1)
+
+
+class Search(gps.Search):
+    """Plans and guides on each of --terrain; the policy's trajectory i goes over number i % n, or a random one."""
+
+    args: VariantArgs
+
+    def __init__(self, args: VariantArgs, env: DiffEnv) -> None:
+        super().__init__(args, env)
+        self.grounds = [self.over(name) for name in args.terrain]
+        self.system = self.over(*args.terrain) if len(self.grounds) > 1 else self.grounds[0]
+
+    def over(self, *names: str) -> System:
+        return (
+            self.system if names == ("level",) else Ground(self.env, named_terrains(*names), self.args.threads or None)
+        )
+
+    def plans(self, say: Callable[[str], None], file: Path) -> list[Plan]:
+        args, known, plans = self.args, list[str](), list[Plan]()
+        if args.demonstration and args.demonstration.is_file():
+            with np.load(args.demonstration) as example:
+                known = example["terrain"].tolist() if "terrain" in example else ["level"]
+        for name, ground in zip(args.terrain, self.grounds, strict=True):
+            say(f"planning over {name}")
+            start = (known.index(name), args.horizon) if name in known else (0, args.window or args.horizon)
+            plans.append(self.plan(ground, say, *start))
+            x, u = (torch.stack([getattr(plan, part)[0] for plan in plans]) for part in "xu")
+            save_demonstration(self.system, x, u, file, terrain=args.terrain[: len(plans)])
+        return plans
+
+    def draw(self, theta: Tensor, source: int = -1) -> gps.Samples:
+        count, kinds = self.args.samples, self.args.practice
+        if not kinds:
+            return super().draw(theta, source)
+        self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
+        start = self.starts(count, source)
+        system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
+        return self.roll_out(system, theta, noise, start, source)
+
+    def evaluate(self) -> Evaluation:
+        found = super().evaluate()
+        if not isinstance(self.system, Ground):
+            return found
+        scene = self.system.copies(len(found.returns), 1)  # number 0 is the one without noise
+        qpos = Elevation(scene, self.system.device, REAL).lift(found.qpos)
+        return dataclasses.replace(found, qpos=qpos, scene=scene)
+
+
+# The variants ---------------------------------------------------------------------------------------------------------
+
+
+class NonGuided(Search):
     """S begins without the guides; they only pretrain the policy."""
 
     guided = False
@@ -86,54 +276,15 @@ class DAgger(NonGuided):
         return self.metrics(new)
 
 
-class OneStart(gps.Search):
-    """Line 7 from theta* alone, not from theta* fitted to the best sample, too."""
-
-    def optimise(self, S: gps.Samples) -> tuple[Tensor, dict[str, float]]:
-        policy, objective = self.network, self.objective(S.log_mixture, S.reward / self.scale)
-        iterations = self.args.lbfgs_iterations
-        theta, value = maximise(lambda theta: gps.sparse(objective, policy, theta, S), policy.theta, iterations)
-        return theta, {"gps/phi": value}
+CASES: dict[Case, type[Search]] = {"guided": Search, "unregularized": Search, "nonguided": NonGuided}
+CASES |= {"restart": Restart, "single-example": SingleExample, "policy-gradient": PolicyGradient, "dagger": DAgger}
 
 
-class Effective(gps.Search):
-    """Tang and Abbeel 2010: in place of the regulariser a bound on the effective samples of each step."""
-
-    def objective(self, mixture: Tensor, reward: Tensor) -> Callable[[Tensor], Tensor]:
-        def value(log_pi: Tensor) -> Tensor:
-            effective = 1 / gps.log_weights(log_pi, mixture).softmax(0).square().sum(0)
-            missing = (LEAST - effective).clamp(min=0)
-            return gps.phi(log_pi, mixture, reward, 0.0) - missing.square().sum()
-
-        return value
-
-
-Name = Literal[
-    "unregularized", "effective", "one-start", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
-]
-CASES: dict[Name, type[gps.Search]] = {"unregularized": gps.Search, "nonguided": NonGuided, "restart": Restart}
-CASES |= {"effective": Effective, "single-example": SingleExample, "policy-gradient": PolicyGradient, "dagger": DAgger}
-CASES["one-start"] = OneStart
-
-
-@dataclass
-class VariantArgs(gps.Args):
-    """Which variant."""
-
-    case: Name = "nonguided"
-    """the variant of Figure 2, of its footnote on effective samples, or of Section 5's two starts"""
-
-    def task_defaults(self) -> dict[str, Any]:
-        bounds = {"regularizer_bounds": (0.0, 0.0)} if self.case == "unregularized" else {}
-        return super().task_defaults() | {"variant": "full", "perturb": 0.0} | bounds
-
-
-@command
-def main(argv: Sequence[str] | None = None) -> None:
-    args = parse(VariantArgs, argv)
-    search = CASES[args.case]
-    evaluate_checkpoint(args, search, search.evaluate) if args.evaluate else gps.train(args, search)
-
+main = script(
+    VariantArgs,
+    lambda args: gps.train(args, CASES[args.case]),
+    lambda args: evaluate_checkpoint(args, CASES[args.case], Search.evaluate),
+)
 
 if __name__ == "__main__":
     main()

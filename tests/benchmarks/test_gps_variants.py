@@ -1,16 +1,33 @@
-"""benchmarks/gps_variants.py: what each variant of Figure 2 does otherwise."""
+"""benchmarks/gps_variants.py: the variants of Figure 2, terrains by their names, planning and the search over them."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from pathlib import Path
+from typing import Any
 
 import gps_variants
+import numpy as np
 import pytest
 import torch
-from learners import assert_same, run
+from gps_variants import Ground, named_terrains, random_terrain
+from learners import assert_same, read_progress, refusal, run
+from scenes import task_scene
 
 import diffsim
-import gps
+from diffsim.planning import LinearGaussian, System, nearest_feedback, save_demonstration
+from diffsim.terrain import Elevation, incline, rough, step
+from diffsim.training import parse
+from diffsim.training.checkpoint import load, restore
+from diffsim.view import render
+
+SLOPES = "level", "incline:15:-1", "incline:-15:-1"  # all but the first begin behind the start
+SMALL = (
+    "--env hopper --horizon 8 --window 4 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 "
+    "--guiding-samples 6 --samples 6 --active 12 --stored 16 --lbfgs-iterations 2 --iterations 2 --eval-every 0 "
+    "--eval-episodes 2 --perturb 0 --quiet"
+).split()
 
 TINY = (
     "--env cartpole --horizon 8 --restarts 3 --screening 4 --ilqr-iterations 3 --pretraining 5 --hidden 8 "
@@ -19,10 +36,237 @@ TINY = (
 ).split()
 
 
+def hopper(**options: Any) -> diffsim.DiffEnv:
+    return diffsim.make("hopper", 1, dtype=torch.float64, substeps=8, **options)
+
+
+def make_search(*flags: str) -> gps_variants.Search:
+    args = parse(gps_variants.VariantArgs, [*SMALL, "--device", "cpu", *flags])
+    return gps_variants.Search(args, diffsim.make("hopper", 1))
+
+
+def restored(path: Path) -> gps_variants.Search:
+    state = load(path / "checkpoint.pt", "gps_variants")
+    search = gps_variants.Search(gps_variants.VariantArgs(**state["args"]), diffsim.make("hopper", 1))
+    restore(search, state)
+    return search
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "profile"),
+    [
+        ("level", incline(0.0)),
+        ("incline:-10", incline(-10.0)),
+        ("incline:5:1.4", incline(5.0, start=1.4)),
+        ("step:-5", step(-0.05)),
+        ("step:2:0.7", step(0.02, start=0.7)),
+        ("rough:8", rough(0, degrees=8.0)),
+        ("rough:8:2:7:0.5", rough(7, 2.0, 8.0, start=0.5)),
+    ],
+)
+def test_terrains_by_their_names(name: str, profile: np.ndarray) -> None:
+    np.testing.assert_array_equal(named_terrains(name), profile[None])
+
+
+def test_terrains_in_one_array_keep_their_heights() -> None:
+    names = "incline:10", "step:-30", "rough:10:25"
+    stacked, x = named_terrains(*names), np.linspace(-2.0, 60.0, 200)
+    assert stacked.shape == (3, 5, 2)
+    qpos = torch.zeros(len(x), 6).double()
+    qpos[:, 0] = torch.tensor(x)
+    for name, profile in zip(names, stacked, strict=True):
+        scenes = (task_scene("hopper").with_terrain(vertices) for vertices in (named_terrains(name), profile))
+        one, two = (Elevation(scene, "cpu", torch.float64).height(qpos) for scene in scenes)
+        torch.testing.assert_close(one, two)
+        assert one.abs().max() > 0.25
+
+
+def test_random_terrains_are_of_their_kind() -> None:
+    """Uniform in both directions up to the size; each begins at its own place, and rough ground has its own seed."""
+    rng = torch.Generator().manual_seed(1)
+    for kind in ("incline:10", "step:5"):
+        names = [random_terrain(kind, rng).split(":") for _ in range(200)]
+        assert {name for name, _, _ in names} == {kind.split(":")[0]}
+        sizes, starts = (np.array([float(name[i]) for name in names]) for i in (1, 2))
+        sizes /= float(kind.split(":")[1])
+        assert -1 < sizes.min() < -0.9 and 0.9 < sizes.max() < 1 and abs(sizes.mean()) < 0.2
+        assert 0.5 < starts.min() < 0.55 and 1.45 < starts.max() < 1.5
+        assert abs(np.corrcoef(sizes, starts)[0, 1]) < 0.2
+    for kind, segment in (("rough:10", "1"), ("rough:10:2", "2")):
+        drawn = [random_terrain(kind, rng) for _ in range(20)]
+        assert all(name.startswith(f"rough:10:{segment}:") for name in drawn)
+        assert len({name.split(":")[3] for name in drawn}) == len({name.split(":")[4] for name in drawn}) == 20
+        assert named_terrains(*drawn)[:, 1, 0].min() > 0.5
+    one, other = (random_terrain("step:5", torch.Generator().manual_seed(3)) for _ in range(2))
+    assert one == other
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--terrain hill", "terrain 'hill' must be level, incline:DEGREES"),
+        ("--terrain level:1", "terrain 'level:1' must be level, incline:DEGREES"),
+        ("--terrain rough:1:2:3:4:5", "must be level, incline:DEGREES"),
+        ("--terrain rough:ten", "could not convert string to float: 'ten'"),
+        ("--terrain level step:0", "terrain 'step:0': height is 0.0"),
+        ("--terrain", "--terrain needs at least one name: level, incline:DEGREES"),
+        ("--practice incline:100", "terrain 'incline:100': degrees is 100.0"),  # whatever is drawn
+        ("--practice rough:10 step:nan", "terrain 'step:nan': height is nan"),
+        ("--practice incline:10:1", "kind of terrain 'incline:10:1' must be incline:DEGREES"),
+        ("--practice level", "kind of terrain 'level' must be incline:DEGREES"),
+        ("--terrain level step:1 step:2 --samples 2", "--samples must be at least 3, not 2"),
+        ("--terrain level step:1 --adaptive 1", "--adaptive takes one --terrain"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    arguments: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert message in refusal(lambda: gps_variants.main(["--env", "hopper", *arguments.split()]), capsys)
+
+
+# Planning over them ---------------------------------------------------------------------------------------------------
+
+
+def test_states_and_jacobians_are_over_the_ground() -> None:
+    """On a slope that begins behind the start: the environment's."""
+    profile = incline(15.0, start=-2.0)
+    env = hopper(terrain=profile, stochastic_init=False, horizon=1)
+    system = Ground(hopper(), profile)
+    start = torch.cat((env.qpos, env.qvel), 1)
+    assert start[0, 1] > 0.4 + system.start()[0, 1]
+    torch.testing.assert_close(system.observe(system.start()), env.reset()[0])
+    u = torch.full((1, 3), 0.1).double()
+    x, _, _ = system.rollout(system.start(), 40, lambda t, _: u)
+    lifted = Elevation(system.scene, "cpu", torch.float64).lift(x[0, :, :6])
+    torch.testing.assert_close(lifted[0], start[0, :6])
+    for t in range(1, 41):
+        obs, reward, *_ = env.step(torch.tanh(u))
+        torch.testing.assert_close(lifted[t], env.qpos[0])
+        torch.testing.assert_close(system.reward(x[:, t], u), reward)
+        torch.testing.assert_close(system.observe(x[:, t]), obs)
+    assert system.check_jacobians(x[0, 30:40:3], u.expand(4, -1)).max() < 1e-4
+
+
+def test_several_terrains_at_once() -> None:
+    """Trajectory i goes over terrain i % M, and a controller gets its state over that."""
+    profiles = named_terrains("incline:15:-1", "step:30:0.05", "rough:10:1:3:-5")
+    together, seen = Ground(hopper(), profiles), list[torch.Tensor]()
+    start = together.start().repeat(5, 1)
+    start[3:, :2] += torch.tensor([0.3, 0.1])
+
+    def act(_: int, x: torch.Tensor) -> torch.Tensor:
+        seen.append(x)
+        return 0.5 * x[:, 6:9]
+
+    x, u, finite = together.rollout(start, 30, act)
+    assert finite.all() and torch.equal(torch.stack(seen, 1), x[:, :-1])
+    for i in range(5):
+        one = Ground(hopper(), profiles[i % 3]).rollout(start[i : i + 1], 30, act)
+        assert torch.equal(one[0][0], x[i]) and torch.equal(one[1][0], u[i])
+    with pytest.raises(ValueError, match="Jacobians need one terrain"):
+        together.jacobians(x[:, 0], u[:, 0], x[:, 1])
+
+
+def test_the_place_does_not_count_for_feedback_by_similarity(rng: np.random.Generator) -> None:
+    """A guide's own is that of its own terrain; over level ground feedback heeds it."""
+    level, over = System(hopper()), Ground(hopper(), incline(10.0))
+    x, u = level.start()[0].expand(3, -1), torch.tensor(rng.normal(size=(2, 3)))
+    K = torch.tensor(rng.normal(size=(2, 3, 12)))
+    guide = LinearGaussian(x, u, K, torch.eye(3).double().expand(2, 3, 3), u.sum(), u.sum())
+    near, scale = x[:1] + 0.01 * torch.tensor(rng.normal(size=(1, 12))), torch.ones(len(level.observed)).double()
+    far = near + 2.0 * torch.eye(12).double()[:1]
+    one, other = (nearest_feedback(over, [guide], state, scale)[0][0] for state in (near, far))
+    assert torch.equal(one, other)
+    torch.testing.assert_close(one, u[0] + K[0, :, 1:] @ (near - x[:1])[0, 1:])
+    one, other = (nearest_feedback(level, [guide], state, scale)[0][0] for state in (near, far))
+    torch.testing.assert_close(other - one, 2.0 * K[0, :, 0])
+
+
+# The search -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_search_on_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A guide on each, which is sampled there; trajectory i of the policy goes over terrain i % 3; a plan of each."""
+    taught, learn = list[list[int]](), gps_variants.Search.learn
+    with monkeypatch.context() as patch:
+        patch.setattr(gps_variants.Search, "learn", lambda s, S: (taught.append(S.source.tolist()), learn(s, S))[1])
+        run(gps_variants, tmp_path, *SMALL, "--terrain", *SLOPES)
+    assert taught[0] == [0, 1]  # every third of 0, 0, 1, 1, 2, 2
+    search = restored(tmp_path)
+    assert len(search.guides) == search.S.initial == 3
+    assert search.plan_steps == int(float(read_progress(tmp_path)[0]["sim_model_steps"]))
+    monkeypatch.setattr(search, "noise", lambda count, rng=None: torch.zeros(count, 8, 3).double())
+    S, own = search.follow(search.guides, 6), search.draw(search.network.theta)
+    for i, guide in enumerate(search.guides):
+        assert (S.source == i).sum() == 2
+        torch.testing.assert_close(S.x[S.source == i], guide.x.expand(2, -1, -1))
+        alone = search.roll_out(search.grounds[i], search.network.theta, search.noise(1), guide.x[:1])
+        torch.testing.assert_close(own.x[i::3], alone.x.expand(2, -1, -1))
+    assert not any(torch.allclose(own.x[0], own.x[i]) for i in (1, 2))
+    plan = np.load(tmp_path / "plan.npz")
+    assert tuple(plan["terrain"]) == SLOPES and plan["action"].shape == (3, 8, 3)
+    again = make_search("--terrain", *SLOPES[::-1], "--demonstration", str(tmp_path / "plan.npz"))
+    again.args.ilqr_iterations = 0  # each is the start of its own terrain's guide, and is followed to its end
+    for made, guide in zip(again.plans(print, tmp_path / "again.npz"), search.guides[::-1], strict=True):
+        torch.testing.assert_close(made.x[0], guide.x)
+    evaluation = search.evaluate()  # beside these two one without noise, which is the first
+    world = evaluation.qpos[0, :, 1] - search.guides[0].x[0, 1]
+    torch.testing.assert_close(world, torch.tensor([1.0, -1.0]).double() * math.tan(math.radians(15.0)))
+    films: list[Any] = []
+    monkeypatch.setattr(render, "film", lambda path, scene, *_: films.append(scene.terrain))
+    for returns, name in (((0.0, 1.0), SLOPES[1]), ((1.0, 0.0), SLOPES[2])):  # of two, the worse one is filmed
+        dataclasses.replace(evaluation, returns=torch.tensor(returns)).save_video(tmp_path / "video.mp4")
+        np.testing.assert_allclose(films[-1][0, :3], named_terrains(name)[0])
+
+
+def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each trajectory has its own, drawn anew of the kinds in turn; a resumed run draws the same."""
+    kinds, drawn = ("incline:20", "rough:10:2"), list[str]()
+
+    def draw(kind: str, rng: torch.Generator) -> str:
+        drawn.append(kind)
+        return f"incline:{40 * torch.rand(1, generator=rng).item() - 20}:-1"
+
+    monkeypatch.setattr(gps_variants, "random_terrain", draw)
+    arguments = [*SMALL, "--practice", *kinds]
+    whole = run(gps_variants, tmp_path / "whole", *arguments)
+    assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
+    start, S = whole["modules"]["learner"]["guides"][0][0][0], whole["modules"]["S"]
+    own = S["samples"][0][S["samples"][5] > 0]
+    assert len(own) >= 6 and len(own[:, 1].unique(dim=0)) == len(own) and (own[:, 0] == start).all()
+    search = restored(tmp_path / "whole")
+    monkeypatch.setattr(search, "noise", lambda count: torch.zeros(count, 8, 3).double())
+    assert len(search.draw(search.network.theta).x[:, 1].unique(dim=0)) == 6
+    run(gps_variants, tmp_path / "parts", *arguments, "--stop-after", 1)
+    gps_variants.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
+    parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
+    assert_same(parts["modules"], whole["modules"])
+
+
+def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None:
+    """Its first window is followed, and the rest is planned."""
+    path, system = tmp_path / "level.npz", System(diffsim.make("hopper", 1))
+    u = 0.1 * torch.ones(1, 8, 3).double()
+    x, _, _ = system.rollout(system.start(), 8, lambda t, _: u[:, t])
+    save_demonstration(system, x[0], u[0], path)
+    search = make_search(*"--terrain level step:-20:0.01 --demonstration".split(), str(path))
+    search.args.ilqr_iterations = 0
+    level, down = search.plans(print, tmp_path / "plan.npz")
+    torch.testing.assert_close(level.x, x)
+    assert down.x.shape == x.shape and not torch.allclose(down.u, u)
+    torch.testing.assert_close(search.grounds[1].rollout(down.x[:, 0], 8, lambda t, _: down.u[:, t])[0], down.x)
+
+
+# The variants ---------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("case", list(gps_variants.CASES))
 def test_variants(case: str, tmp_path: Path) -> None:
     modules = run(gps_variants, tmp_path, *TINY, "--case", case)["modules"]
-    search, S, guided = modules["learner"], modules["S"], case in ("unregularized", "effective", "one-start")
+    search, S, guided = modules["learner"], modules["S"], case in ("guided", "unregularized")
     assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
     assert (search["w_r"] == 0) == (case == "unregularized")
     assert (len(S["samples"][0][:, 0].unique(dim=0)) > 3) == (case == "restart")
@@ -30,37 +274,3 @@ def test_variants(case: str, tmp_path: Path) -> None:
     assert case != "dagger" or len(search["lessons"][0]) == 8 + 2 * 4
     moved = not torch.equal(modules["network"]["theta"], S["generators"][S["best"]][0])
     assert moved == (case in ("policy-gradient", "dagger"))
-
-
-def test_a_bound_on_effective_samples(tmp_path: Path) -> None:
-    """The proposal keeps it at every step, where that of the search without the regulariser does not."""
-    least = []
-    for case in ("unregularized", "effective"):
-        flags = [*TINY, "--case", case, *"--lbfgs-iterations 40 --pretraining 40 --noise 0.3 --device cpu".split()]
-        args = gps_variants.parse(gps_variants.VariantArgs, flags)
-        search = gps_variants.CASES[args.case](args, diffsim.make("cartpole", 1))
-        search.prepare(lambda _: None, tmp_path / f"{case}.npz")
-        S = search.S.samples
-        log_pi = search.network.log_prob(search.optimise(S)[0], S.obs, S.u)
-        least.append((1 / gps.log_weights(log_pi, S.log_mixture).softmax(0).square().sum(0)).min().item())
-    assert least[0] < 4.0 < 4.9 < least[1]
-
-
-def test_one_start(tmp_path: Path) -> None:
-    """It proposes what the search does where the start at theta* wins; otherwise Phi is lower."""
-    args = gps_variants.parse(gps_variants.VariantArgs, [*TINY, "--case", "one-start", "--device", "cpu"])
-    search = gps_variants.OneStart(args, diffsim.make("cartpole", 1))
-    search.prepare(lambda _: None, tmp_path / "plan.npz")
-    one, alone = search.optimise(search.S.samples)
-    both, two = gps_variants.gps.Search.optimise(search, search.S.samples)
-    assert "gps/start" not in alone and torch.equal(one, both) == (two["gps/start"] == 0)
-    assert alone["gps/phi"] == two["gps/phi"] if two["gps/start"] == 0 else alone["gps/phi"] < two["gps/phi"]
-
-
-def test_resume(tmp_path: Path) -> None:
-    """The checkpoint says which variant it is of."""
-    whole = run(gps_variants, tmp_path / "whole", *TINY, "--case", "restart")
-    run(gps_variants, tmp_path / "parts", *TINY, "--case", "restart", "--stop-after", "1")
-    gps_variants.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
-    parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
-    assert_same(parts["modules"], whole["modules"])

@@ -1,0 +1,119 @@
+"""Trainings that are compared by what their progress says: of PFPN's dog, and of guided policy search.
+
+    python benchmarks/suites.py                                  all of cases.json; what has finished is kept
+    python benchmarks/suites.py --only walker --cells full adaptive --seeds 1
+    python benchmarks/suites.py --draw-only --update-results     only the tables
+
+A suite of cases.json has groups of runs, each a table of a page. It says which numbers of progress.csv are a run's line
+of the csv file, and how a table's line shows those of all seeds. What follows "--" goes to the scripts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from typing import NamedTuple
+
+from cells import Case, Runner, ScriptFlags, spread
+from common import TASKS, Tasks, check_names, run
+from groups import Cells, grouped, numbers
+from tables import Row, markdown, read_csv
+from tyro.conf import Suppress
+
+KEY = ("group", "cell", "seed")
+READ: dict[str, Callable[[Sequence[float]], float]] = {
+    "first": lambda values: values[0],
+    "last": lambda values: values[-1],
+    "mean": mean,
+    "most": max,
+}
+SHOW: dict[str, Callable[[Sequence[float]], str]] = {
+    "mean": lambda values: f"{mean(values):.0f}",
+    "tenth": lambda values: f"{mean(values):.1f}",
+    "spread": spread,
+    "share": lambda values: f"{max(values):.0%}",
+    "each": lambda values: ", ".join(f"{value:.1f}" for value in values),
+    "all": lambda values: "-".join(dict.fromkeys(f"{value:.0f}" for value in (min(values), max(values)))),
+}
+
+
+class Suite(NamedTuple):
+    csv: str
+    page: str
+    columns: dict[str, tuple[str, str]]  # of the csv file: how to READ which column of progress.csv, or a flag ("args")
+    table: dict[str, tuple[str, str]]  # how to SHOW which column of the csv file
+    cells: dict[str, str]  # flags by the cells' names
+    groups: dict[str, list[tuple[list[str], list[int], str]]]  # cells, seeds, and their script, task and other flags
+
+
+SUITES = {
+    name: Suite(**case)
+    for name, case in json.loads(Path(__file__).with_name("cases.json").read_text())["suites"].items()
+}
+GROUPS = {group: name for name, suite in SUITES.items() for group in suite.groups}
+
+
+@dataclass
+class Args(ScriptFlags):
+    env: Suppress[Tasks] = TASKS
+    device: str = "cpu"  # torch device of the runs
+    runs: Path = ScriptFlags.runs.parent  # directory of the runs: {runs}/{suite}/{group}__{cell}__{seed}
+    only: tuple[str, ...] = tuple(GROUPS)  # groups
+    cells: tuple[str, ...] = ()  # cells (default: all of a group)
+    seeds: tuple[int, ...] = ()  # seeds (default: all of a cell)
+    train_only: bool = False  # write no csv: several such commands may run side by side
+
+
+def cases(args: Args, group: str) -> Iterator[tuple[str, Case]]:
+    """Cells and what their runs are."""
+    suite = SUITES[GROUPS[group]]
+    for names, seeds, command in suite.groups[group]:
+        script, task, *flags = command.split()
+        for cell in (name for name in names if name in (args.cells or names)):
+            for seed in args.seeds or seeds:
+                folder = args.runs / GROUPS[group] / f"{group}__{cell}__{seed}"
+                yield cell, Case(folder, task, seed, script, (*flags, *suite.cells[cell].split()))
+
+
+def line(suite: Suite, folder: Path) -> dict[str, object]:
+    """What the progress of a run says; empty if it has not been evaluated."""
+    rows = read_csv(folder / "progress.csv")
+    if not any(numbers(rows, column) for column in ("eval_return", "eval_objective")):
+        return {}
+    args, found = json.loads((folder / "args.json").read_text()), dict[str, object]()
+    for name, (how, column) in suite.columns.items():
+        values = [args[column]] if how == "args" else numbers(rows, column)
+        found[name] = f"{READ.get(how, mean)(values):.6g}" if values else ""
+    return found
+
+
+def table(suite: Suite, rows: Sequence[Cells]) -> list[Row]:
+    """A line for each cell."""
+    lines = list[Row]()
+    for (cell,), own in grouped(rows, "cell").items():
+        values = {title: (how, numbers(own, column)) for title, (how, column) in suite.table.items()}
+        lines.append(
+            {"case": cell} | {title: SHOW[how](found) if found else "" for title, (how, found) in values.items()}
+        )
+    return lines
+
+
+def main(args: Args) -> None:
+    check_names("--only", args.only, GROUPS)
+    check_names("--cells", args.cells, {cell for suite in SUITES.values() for cell in suite.cells})
+    runner = Runner(args)
+    for group in args.only:
+        suite = SUITES[GROUPS[group]]
+        for cell, case in () if args.draw_only else cases(args, group):
+            runner.train(case)
+            if not args.train_only and (found := line(suite, case.folder)):
+                args.keep(suite.csv, {"group": group, "cell": cell, "seed": case.seed} | found, KEY)
+        rows = [row for row in args.read(suite.csv) if row["group"] == group]
+        args.publish(group, markdown(table(suite, rows)), suite.page, everywhere=True)
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)

@@ -1,0 +1,137 @@
+"""benchmarks/gps_controllers.py on a small run: what is kept, what falls, and the tables."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import gps_controllers as controllers
+import numpy as np
+import pytest
+import torch
+from common import DOCS, RESULTS, CheckpointFlags
+from gps_variants import named_terrains
+from learners import run
+from tables import markdown, read_csv
+
+import gps
+
+SMALL = (
+    "--env hopper --horizon 12 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 --samples 2 "
+    "--guiding-samples 4 --active 8 --stored 8 --iterations 1 --lbfgs-iterations 2 --eval-every 0 --eval-episodes 1"
+).split()
+
+
+@pytest.fixture(scope="module")
+def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs") / "hopper__feedback__1"
+    run(gps, directory, *SMALL, "--quiet")
+    return directory
+
+
+@pytest.fixture
+def search(hopper: Path) -> gps.Search:
+    return controllers.load_search(hopper / "checkpoint.pt")
+
+
+def test_the_command(hopper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guide keeps its return from its own start; a second call draws from the csv file alone."""
+    monkeypatch.setattr(controllers, "COUNT", 4)
+    controllers.main(CheckpointFlags(checkpoints=(hopper,), output=tmp_path))
+    rows = {(row["kind"], row["size"], row["controller"]): row for row in read_csv(tmp_path / "gps_controllers.csv")}
+    assert len(rows) == 27 and rows["start", "0", "ddp"]["kept"] == "1" > rows["start", "1", "policy"]["kept"]
+    before = (tmp_path / "gps_controllers.csv").read_bytes()
+    controllers.main(CheckpointFlags(draw_only=True, output=tmp_path))
+    assert before == (tmp_path / "gps_controllers.csv").read_bytes()
+
+
+def test_walkers_fall_on_a_steep_slope(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plan walks over level ground; on 60 degrees the robot that starts on the slope does not."""
+    monkeypatch.setattr(controllers, "PLACES", [-0.5, 0.5])
+    monkeypatch.setattr(controllers, "TERRAINS", {"incline (degrees)": (0.0, 60.0)})
+    level, steep = (roll(controllers.controllers(search)["ddp"]) for _, _, roll in controllers.walking(search))
+    torch.testing.assert_close(level[0][1, -1], search.guides[0].x[-1], rtol=1e-3, atol=1e-3)
+    assert controllers.walked(search, *level).tolist() == [True, True]
+    assert controllers.walked(search, *steep).tolist() == [False, True]
+    x, u, finite = level
+    x[0, 5, 1] = -1.0  # it falls, and stands up again
+    assert controllers.walked(search, x, u, finite).tolist() == [False, True]
+
+
+def test_humanoids_run_until_they_fall(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(controllers, "COUNT", 4)
+    monkeypatch.setattr(controllers, "RUNNING", ((0.0, 99.0), (3.0,)))
+    found = {
+        (kind, size): controllers.seconds(search, *roll(controllers.controllers(search)["ddp"]))
+        .double()
+        .round(decimals=6)
+        for kind, size, roll in controllers.running(search)
+    }
+    assert found["start", 0.0].tolist() == [0.2] * 4 and found["start", 99.0].min() < 0.2
+    assert [len(each) for each in found.values()] == [4] * 4
+    assert found["rough, 1 m (degrees)", 3.0].tolist() == [0.2] * 4  # level for the first metre
+
+
+def test_controllers_by_time_and_by_what_looks_alike(search: gps.Search) -> None:
+    guide, act = search.guides[0], controllers.controllers(search)
+    torch.testing.assert_close(act["tbdp"](0, guide.x[8:9]), guide.u[8:9])
+    torch.testing.assert_close(act["ddp"](8, guide.x[8:9]), guide.u[8:9])
+    assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
+
+
+def test_a_push_moves_the_state_before_its_step(search: gps.Search) -> None:
+    """A quarter of the time in; a controller keeps its clock, and what left the finite numbers stays."""
+    system, start, seen = search.system, search.system.start().expand(2, -1), list[int]()
+    kick = torch.zeros(2, system.nd).double()
+    kick[:, system.nv] = torch.tensor([1.5, -1.5])
+
+    def act(t: int, x: torch.Tensor) -> torch.Tensor:
+        seen.append(t)
+        return torch.tensor([[0.3] * 3, [math.nan if t == 1 else 0.3] * 3]).double()
+
+    x, u, finite = controllers.pushed(system, start, 12, kick, act)
+    assert seen == list(range(12)) and x.shape == (2, 13, 12) and u.shape == (2, 12, 3)
+    assert finite.tolist() == [[True] * 12, [True] + [False] * 11]
+    plain = system.rollout(start[:1], 12, lambda t, _: u[:1, t])[0]
+    torch.testing.assert_close(x[0, :4], plain[0, :4])
+    after = system.rollout(system.retract(x[:1, 3], kick[:1]), 9, lambda t, _: u[:1, t])[0]
+    torch.testing.assert_close(x[0, 4:], after[0, 1:])
+
+
+def test_terrains() -> None:
+    for terrain, sizes in controllers.TERRAINS.items():
+        for size in sizes:
+            profiles = named_terrains(*controllers.names(terrain, size))
+            assert len(profiles) == 10 and all((p[p[:, 0] < 0.5, 1] == 0).all() for p in profiles)
+            assert len({p.tobytes() for p in profiles}) == 10
+    slope = named_terrains(*controllers.names("incline (degrees)", 10.0))
+    np.testing.assert_allclose(slope[:, 1:, 1], [[0.0, math.tan(math.radians(10.0))]] * 10)
+    np.testing.assert_allclose(named_terrains(*controllers.names("step (cm)", -5.0))[:, 2, 1], -0.05)
+    for segment in (1, 2):
+        rough = named_terrains(*controllers.names(f"rough, {segment} m (degrees)", 10.0))
+        np.testing.assert_allclose(np.diff(rough[:, 1:-1, 0]), segment)
+
+
+def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
+    rows = [
+        dict(env="walker", variant=case, seed=str(seed), kind="step (cm)", size=size, controller=name)
+        | dict(kept="", walked=str(share), seconds="")
+        for case, shares in (("feedback-terrain", (1.0, 0.0, 0.5)), ("feedback-slope", (0.5, 0.25, 1.0)))
+        for size in ("5", "-5")
+        for name, share in zip(controllers.CONTROLLERS, shares, strict=True)
+        for seed in (1, 2)
+    ]
+    rows += [row | {"seed": "3", "size": "5", "walked": "1"} for row in rows[:6:2]]
+    tables = controllers.printed(rows)
+    assert not tables["gps generalisation"] and not tables["gps humanoid"]
+    up, _, everywhere = tables["gps terrain"]
+    assert up["one slope"] == everywhere["one slope"] == "50% / 25% / 100%"
+    assert up["11 terrains, random"] == "100% / 33% / 67%" and everywhere["11 terrains, random"] == "100% / 20% / 60%"
+
+
+def test_pages_have_the_tables_of_the_csv_file() -> None:
+    tables = controllers.printed(read_csv(RESULTS / "cpu" / "gps_controllers.csv"))
+    pages = (DOCS / "gps.md").read_text() + (DOCS / "gps_terrain.md").read_text()
+    assert all(f"<!-- {name} -->\n{markdown(table)}<!--" in pages for name, table in tables.items())
+    row = next(row for row in tables["gps terrain"] if row["trial"] == "incline (degrees) 10")
+    assert row["one slope"] == "50% / 60% / 100%"  # the figure of the claim on Figure 3

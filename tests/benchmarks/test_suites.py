@@ -1,0 +1,92 @@
+"""benchmarks/suites.py: what it reads off runs, and that pages show it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import suites
+from common import DOCS, RESULTS, ROOT
+from gps_variants import VariantArgs
+from learners import refusal
+from tables import markdown, read_csv
+
+import gps
+import pfpn
+import pfpn_sac
+from diffsim.training import parse
+
+SCRIPTS = {"benchmarks/gps_variants": VariantArgs, "pfpn": pfpn.Args, "pfpn_sac": pfpn_sac.Args}
+PLANS = json.loads((ROOT / "benchmarks" / "cases.json").read_text())["plans"]
+
+
+@pytest.mark.parametrize("group", suites.GROUPS)
+def test_each_run_of_the_page_is_a_command(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whose cells are of as many samples; the page has the table of the csv file."""
+    monkeypatch.chdir(ROOT)
+    suite, runs = suites.SUITES[suites.GROUPS[group]], list(suites.cases(suites.Args(), group))
+    for _, case in runs:
+        args = parse(SCRIPTS[case.script], ["--env", case.env, "--device", "cpu", *case.flags])
+        assert args.iterations > 1
+    rows = [row for row in read_csv(RESULTS / "cpu" / f"{suite.csv}.csv") if row["group"] == group]
+    assert {(row["cell"], int(row["seed"])) for row in rows} <= {(cell, case.seed) for cell, case in runs}
+    assert rows and markdown(suites.table(suite, rows)) in (DOCS / suite.page).read_text()
+    some = suites.Args(cells=(runs[-1][0],), seeds=(7,))
+    assert {(cell, case.seed) for cell, case in suites.cases(some, group)} == {(runs[-1][0], 7)}
+
+
+def test_the_flags_of_plans() -> None:
+    files = {path.stem for path in (ROOT / "benchmarks" / "plans").glob("*.npz")}
+    assert files == {*PLANS, "swimmer_500", "humanoid_500", "walker_switch_300"}
+    for flags in PLANS.values():
+        assert parse(VariantArgs if "--terrain" in flags else gps.Args, flags.split())
+
+
+def test_an_unknown_name_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for flag, others in (("only", "cartpole, hopper"), ("cells", "")):
+        error = refusal(lambda flag=flag: suites.main(suites.Args(**{flag: ("figure 3",)})), capsys)
+        assert f"--{flag}: there is no 'figure 3'; choose from {others}" in error
+
+
+def write(folder: Path, returns: list[float], dead: float | None) -> None:
+    folder.mkdir(parents=True)
+    (folder / "args.json").write_text('{"horizon": 32}')
+    rows = []
+    for k, value in enumerate(returns, start=1):
+        row = {"iteration": k, "control_steps": 1000.0 * k, "return": "" if k == 1 else value, "eval_return": ""}
+        if dead is not None:
+            row |= {"particles_dead_mean": dead if k == 2 else 0, "particles_dead_max": 0, "particles_moved": 10.0 * k}
+        rows.append(row)
+    rows[-1]["eval_return"] = 2 * returns[-1] if returns[-1] else ""
+    with (folder / "progress.csv").open("w") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def test_a_cell_is_a_line_over_its_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that was stopped before an evaluation is none; a finished one is not trained again."""
+    groups, trained = {"one": [(["a", "b", "c"], [1, 2], "pfpn ant")]}, list[Path]()
+    suite = suites.SUITES["pfpn"]._replace(cells={"a": "", "b": "--policy gaussian", "c": ""}, groups=groups)
+    suite.columns["T"] = ("args", "horizon")
+    monkeypatch.setattr(suites, "SUITES", {"some": suite})
+    monkeypatch.setattr(suites, "GROUPS", {"one": "some"})
+    monkeypatch.setattr("cells.Runner.train", lambda _, case: trained.append(case.folder))
+    for number, last in ((1, 100.0), (2, 120.0)):
+        write(tmp_path / "some" / f"one__a__{number}", [0.0, 50.0, last], 0.25)
+    write(tmp_path / "some" / "one__b__1", [0.0, 10.0, 30.0], None)
+    write(tmp_path / "some" / "one__b__2", [0.0, 10.0, 0.0], None)
+    suites.main(suites.Args(runs=tmp_path, output=tmp_path / "out", only=("one",)))
+    assert len(trained) == 6
+    rows = read_csv(tmp_path / "out" / "pfpn_cells.csv")
+    assert [(row["cell"], row["seed"], row["T"]) for row in rows] == [
+        ("a", "1", "32"),
+        ("a", "2", "32"),
+        ("b", "1", "32"),
+    ]
+    first, second = suites.table(suite, rows)
+    shown = {"case": "a", "return": "220 ± 20", "in training": "80"}
+    assert first == shown | {"dead by mean": "25%", "by largest": "0%", "moved": "30"}
+    assert second == {"case": "b", "return": "60", "in training": "20"} | dict.fromkeys([*first][3:], "")
