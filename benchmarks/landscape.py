@@ -24,12 +24,13 @@ import numpy as np
 import torch
 from cells import Case, Runner, ScriptFlags
 from common import TASKS, Line, Panel, TaskName, Tasks, can_draw, plot, run
-from motions import Array, shac
 from tables import ROOT, Row, markdown
 from torch import Tensor
 from torch.func import functional_call, vmap
+from worlds import Array
 
 import diffsim
+import shac
 from diffsim import DiffEnv
 from diffsim.training import Count, checkpoint
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -25,18 +24,25 @@ def test_of_each_state_the_fastest_turn_counts_and_over_states_the_median() -> N
     assert found == {"ours": {"forward": 5.0}}
 
 
-def test_memory_is_the_most_that_the_script_ever_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_knows_its_first_iteration_and_the_most_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = """import json, pathlib, sys, time
+if sys.argv[-1] == "fail":
+    raise SystemExit(3)
 held = b"x" * (300 << 20)
 del held
-pathlib.Path(sys.argv[1], "args.json").write_text(json.dumps({"num_envs": 64}))
-time.sleep(0.1)"""
-    monkeypatch.setattr(speed, "command", lambda args, name, *flags: [sys.executable, "-c", code, flags[-1]])
-    (row,) = speed.measure_memory(speed.Args(), "ant")
-    assert row["environments"] == 64 and isinstance(found := row["memory (GiB)"], float) and 0.3 < found < 0.4
-    monkeypatch.setattr(speed, "command", lambda *_: [sys.executable, "-c", "raise SystemExit(3)"])
-    with pytest.raises(UsageError, match="SystemExit.* failed"):
-        list(speed.measure_memory(speed.Args(), "ant"))
+run = pathlib.Path(sys.argv[sys.argv.index("--run-dir") + 1])
+(run / "args.json").write_text(json.dumps({"num_envs": 64}))
+(run / "progress.csv").write_text("iteration\\n1\\n")
+time.sleep(0.5)"""
+    (tmp_path / "shac.py").write_text(code)
+    monkeypatch.setattr(speed, "ROOT", tmp_path)
+    found = speed.trial(args := speed.Args(), "ant", 3)
+    assert found.about == {"task": "ant", "environments": 64, "script": "shac"} and found.progress == [
+        {"iteration": "1"}
+    ]
+    assert 0.3 < found.memory < 0.4 and 0 < found.first < 5
+    with pytest.raises(UsageError, match="shac.py.* fail failed"):
+        speed.trial(args, "ant", 3, "fail")
 
 
 def test_the_front_is_what_no_other_point_beats() -> None:
