@@ -126,9 +126,6 @@ class Args(Flags):
     imitation: Natural = 20
     """feedback: the first so many iterations imitate the guides, the others search"""
 
-    def env_options(self) -> dict[str, Any]:
-        return super().env_options() | {"control_dt": self.control_dt}
-
     def task_defaults(self) -> dict[str, Any]:
         own = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
         return own | {"eval_every": 10, "eval_episodes": 50}
@@ -179,7 +176,7 @@ class Search:
         self.lessons: tuple[Tensor, ...] = ()  # what feedback fits
         self.student = self.network.theta  # the last of feedback's fits
 
-    def prepare(self, say: Callable[[str], None], file: Path) -> dict[str, float]:
+    def prepare(self, say: Callable[[str], None], file: Callable[[], Path]) -> dict[str, float]:
         """Lines 1 to 4. Tells its progress, writes the plan to a file as soon as it exists, returns metrics."""
         args, policy, plans = self.args, self.network, self.plans(say, file)
         self.plan_return = -sum(plan.cost.min().item() for plan in plans) / len(plans)
@@ -232,10 +229,10 @@ class Search:
         S.prune(args.stored)
         return metrics | self.metrics(new)
 
-    def plans(self, say: Callable[[str], None], file: Path) -> list[Plan]:
+    def plans(self, say: Callable[[str], None], file: Callable[[], Path]) -> list[Plan]:
         """Line 1: a plan for each ground."""
         plan = self.plan(self.system, say)
-        save_demonstration(self.system, plan.x[0], plan.u[0], file)
+        save_demonstration(self.system, plan.x[0], plan.u[0], file())
         return [plan]
 
     def plan(self, system: System, say: Callable[[str], None], row: int = 0, steps: int = 0) -> Plan:
@@ -646,7 +643,7 @@ def train(args: Args, learner: type[Search] = Search) -> None:
     run = Run(args)
     search = run.restore(learner(args, run.eval_env))
     if run.iteration == 0:
-        run.log(search.prepare(run.message, run.directory / "plan.npz"), search.control_steps)
+        run.log(search.prepare(run.message, lambda: run.directory / "plan.npz"), search.control_steps)
     for iteration in run:  # lines 5 to 18
         before = search.control_steps
         run.log(search.iterate(iteration), search.control_steps - before)

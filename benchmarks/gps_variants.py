@@ -181,7 +181,7 @@ class Search(gps.Search):
             self.system if names == ("level",) else Ground(self.env, named_terrains(*names), self.args.threads or None)
         )
 
-    def plans(self, say: Callable[[str], None], file: Path) -> list[Plan]:
+    def plans(self, say: Callable[[str], None], file: Callable[[], Path]) -> list[Plan]:
         args, known, plans = self.args, list[str](), list[Plan]()
         if args.demonstration and args.demonstration.is_file():
             with np.load(args.demonstration) as example:
@@ -191,7 +191,7 @@ class Search(gps.Search):
             start = (known.index(name), args.horizon) if name in known else (0, args.window or args.horizon)
             plans.append(self.plan(ground, say, *start))
             x, u = (torch.stack([getattr(plan, part)[0] for plan in plans]) for part in "xu")
-            save_demonstration(self.system, x, u, file, terrain=args.terrain[: len(plans)])
+            save_demonstration(self.system, x, u, file(), terrain=args.terrain[: len(plans)])
         return plans
 
     def draw(self, theta: Tensor, source: int = -1) -> gps.Samples:

@@ -1,14 +1,16 @@
-"""The directory of a run: who may write there; progress.csv, tensorboard and a progress bar."""
+"""The directory of a run: progress.csv, tensorboard and a progress bar."""
 
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import os
 import sys
 import tempfile
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -16,9 +18,6 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from diffsim.training.errors import fail
-
-if sys.platform != "win32":
-    import fcntl
 
 # The first columns of every progress.csv.
 COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_return", "eval_length", "eval_speed")
@@ -33,35 +32,15 @@ def check_writable(directory: Path) -> None:
         fail(f"cannot write to run directory {directory}: {error.strerror}")
 
 
-class Lock:
-    """The right to train into a directory. It ends with the process, however that ends.
-
-    The directory itself is locked, so no file is left behind. On Windows, and on file systems without locks, anyone has
-    the right.
-    """
-
-    def __init__(self) -> None:
-        self._descriptor: int | None = None
-
-    def acquire(self, directory: Path) -> None:
-        """End the script if another process has the right; does nothing where there is no directory yet."""
-        if sys.platform == "win32" or self._descriptor is not None or not directory.is_dir():
-            return
-        self._descriptor = os.open(directory, os.O_RDONLY)
+def make_unused(wanted: Path) -> Path:
+    """Make a directory of this name, or with a number behind it where the name is taken."""
+    for number in itertools.count(2):
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.release()
-            fail(f"another process trains into {directory}")
-        except OSError:  # no locks here
-            self.release()
-
-    def release(self) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-    __del__ = release
+            wanted.mkdir(parents=True)
+            return wanted
+        except FileExistsError:
+            wanted = wanted.with_name(f"{wanted.name.partition('.')[0]}.{number}")
+    raise AssertionError
 
 
 class EpisodeStatistics:
@@ -92,16 +71,16 @@ class ProgressFile:
 
     def __init__(self, path: Path, iteration: int) -> None:
         self.path, self.columns = path, list(COLUMNS)
-        rows: list[dict[str, str]] = []
-        if iteration > 0 and path.is_file():
-            with path.open(newline="") as file:
-                reader = csv.DictReader(file)
-                # A crash may leave rows of later iterations, and half of a line.
-                rows = [row for row in reader if None not in row.values() and int(row["iteration"]) <= iteration]
-                self.columns = list(reader.fieldnames or self.columns)
-        self._rewrite(rows)
+        self._begin(self._rows(iteration) if iteration > 0 and path.is_file() else [])
 
-    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+    def _rows(self, last: float = math.inf) -> list[dict[str, str]]:
+        """Up to an iteration. A crash may leave rows of later ones, and half of a line."""
+        with self.path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            self.columns = list(reader.fieldnames or COLUMNS)
+            return [row for row in reader if None not in row.values() and int(row["iteration"]) <= last]
+
+    def _begin(self, rows: list[dict[str, str]]) -> None:
         """Replace the file in one step, and go on at its end."""
         temporary = self.path.with_suffix(".csv.tmp")
         with temporary.open("w", newline="") as file:
@@ -114,10 +93,9 @@ class ProgressFile:
     def write(self, row: Mapping[str, float]) -> None:
         if new := [name for name in row if name not in self.columns]:
             self._file.close()
-            with self.path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
+            rows = self._rows()
             self.columns += new
-            self._rewrite(rows)
+            self._begin(rows)
         csv.DictWriter(self._file, self.columns, restval="").writerow(row)
         self._file.flush()
 
@@ -130,24 +108,34 @@ def column(scalar: str) -> str:
     return scalar.removeprefix("charts/episodic_").replace("/", "_")
 
 
-class ProgressLog:
-    """The three of them for one run. Opened late, so that a run that fails at its start leaves nothing behind.
+class Screen:
+    """Stdout for as long as someone reads it; what trains goes on without."""
 
-    A resumed run goes on after iteration and control_steps, which are 0 otherwise; total counts all iterations.
-    """
+    def write(self, text: str) -> None:
+        with suppress(OSError):
+            print(text, end="", flush=True)
+
+    def flush(self) -> None:
+        """`write` does it."""
+
+
+SCREEN = Screen()
+
+
+def say(text: object) -> None:
+    """Print a line."""
+    SCREEN.write(f"{text}\n")
+
+
+class ProgressLog:
+    """The three of them for one run. A resumed run goes on after iteration and control_steps, which are 0 otherwise."""
 
     def __init__(
-        self,
-        directory: Path,
-        iteration: int,
-        control_steps: int,
-        hyperparameters: Mapping[str, object],
-        total: int,
-        quiet: bool,
+        self, directory: Path, iteration: int, control_steps: int, args: Mapping[str, object], total: int, quiet: bool
     ) -> None:
         self.file = ProgressFile(directory / "progress.csv", iteration)
         self.tensorboard = SummaryWriter(str(directory), purge_step=control_steps + 1 if iteration else None)
-        table = "\n".join(f"|{name}|{value}|" for name, value in hyperparameters.items())
+        table = "\n".join(f"|{name}|{value}|" for name, value in args.items())
         self.tensorboard.add_text("hyperparameters", f"|name|value|\n|-|-|\n{table}")
         self.total, self.quiet = total, quiet
         self.bar: tqdm[NoReturn] | None = None
@@ -160,15 +148,15 @@ class ProgressLog:
         if self.quiet:
             return
         if self.bar is None:  # after the first iteration, which compiled and says nothing about the rest
-            interval = 0.1 if sys.stdout.isatty() else 10.0
-            self.bar = tqdm(total=self.total, initial=iteration, file=sys.stdout, mininterval=interval, ncols=100)
+            interval = 0.1 if sys.stdout is not None and sys.stdout.isatty() else 10.0
+            self.bar = tqdm(total=self.total, initial=iteration, file=SCREEN, mininterval=interval, ncols=100)
         self.bar.update(iteration - self.bar.n)
         if "charts/episodic_return" in scalars:
             self.bar.set_postfix_str(f"return {scalars['charts/episodic_return']:.1f}", refresh=False)
 
     def message(self, text: str) -> None:
         if not self.quiet:
-            tqdm.write(text, file=sys.stdout)
+            tqdm.write(text, file=SCREEN)
 
     def close(self) -> None:
         if self.bar is not None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,9 +22,9 @@ from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
 from diffsim.training import checkpoint, gait
 from diffsim.training.checkpoint import Learner, SavedPolicy
-from diffsim.training.directory import check_writable
+from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
-from diffsim.training.flags import Args, Flags
+from diffsim.training.flags import Args, Flags, parse_penalty
 
 L = TypeVar("L", bound=Learner)
 
@@ -31,6 +32,9 @@ VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
 ENOUGH = 0.97  # of the return, kept there
+# Flags that diffsim.make takes as they are; control_dt is one of gps.py.
+OPTIONS = {*"integrator substeps theta passes touchdown contact early_termination clip control_dt".split()}
+SETTINGS = OPTIONS | {"env", "penalty", "device", "eval_episodes"}
 
 
 @dataclass
@@ -152,19 +156,20 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 # Environments as the flags say, and --evaluate ------------------------------------------------------------------------
 
 
-def make_env(args: Flags, num_envs: int, horizon: int = 1, seed: int = 0, **options: Any) -> DiffEnv:
-    """The task as the flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
+def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, seed: int = 0, **others: Any) -> DiffEnv:
+    """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
+    options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
+    options |= dict(penalty=parse_penalty(args.penalty), threads=args.threads or None)
     try:
-        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **args.env_options() | options)
+        return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options | others)
     except ValueError as error:
         fail(error)
 
 
 def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **changes: Any) -> DiffEnv:
     """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
-    names = {field.name for field in dataclasses.fields(Flags)} & saved.args.keys()
-    args = Flags(**{name: saved.args[name] for name in names} | {"device": "cpu", "threads": 0} | changes)
-    env = make_env(args, num_envs, forces=forces, control_dt=saved.args.get("control_dt"))
+    args = SimpleNamespace(**vars(Flags()) | saved.args | {"device": "cpu", "threads": 0} | changes)
+    env = make_env(args, num_envs, forces=forces)
     fitting(saved.network, env)
     return env
 
@@ -197,7 +202,7 @@ def evaluate_checkpoint(
         return evaluate(env, fitting(checkpoint.load_policy(path).network, env))
 
     evaluation, found = measure(args), dict[str, Any]()
-    print(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
+    say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     if args.finer:
         substeps = FINER * args.substeps
         explicit = Integration.explicit(args.integrator, substeps)
@@ -206,21 +211,21 @@ def evaluate_checkpoint(
         share = kept(evaluation.returns.median().item(), value)
         found["finer"] = {"substeps": substeps, "return": value, "kept": share}
         warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-        print(f"{finer.integrator} with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
+        say(f"{finer.integrator} with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
     write_evaluation(args, evaluation, state["iteration"], **found)
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
     """Print the gait, and leave evaluation.json and, if asked for, the video in the run's directory."""
     assert args.run_dir
-    names = "env integrator substeps theta passes contact penalty early_termination clip device eval_episodes".split()
-    settings = {name: getattr(args, name) for name in names} | dict(script=args.script(), iteration=iteration)
+    settings = {name: value for name, value in vars(args).items() if name in SETTINGS}
     if feet := evaluation.gait():
-        print(gait.table(feet))
+        say(gait.table(feet))
         found["gait"] = {name: foot._asdict() for name, foot in feet.items()}
+    settings |= dict(script=args.script(), iteration=iteration)
     evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
     if args.capture_video:
         try:
-            print(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
+            say(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
         except (OSError, RuntimeError) as error:
             fail(error)

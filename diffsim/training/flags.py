@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from diffsim.tasks import FILE, Contact, HumanoidImitation, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
-from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, fits, flag
+from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, flag
 from diffsim.training.variation import parse_ranges
 
 ClipFile = Annotated[
@@ -44,7 +43,7 @@ class RunFlags:
     device: str = "auto"
     """torch device of simulation and learning, e.g. cpu or cuda:0 (auto: the GPU if there is one)"""
     run_dir: Path | None = None
-    """directory of the run (default: runs/{env}__{script}__{seed}__{time}, or the resumed checkpoint's)"""
+    """directory of the run (default: a new runs/{env}__{script}__{seed}__{time}, or the resumed checkpoint's)"""
     eval_every: Natural = 100
     """evaluate the deterministic policy every this many iterations (0: only at the end)"""
     eval_episodes: Count = 64
@@ -107,12 +106,6 @@ class Flags(RunFlags):
         """Defaults that depend on other flags, such as the task, the device or the preset."""
         return {}
 
-    def env_options(self) -> dict[str, Any]:
-        """What diffsim.make takes of them."""
-        names = ("integrator", "substeps", "theta", "passes", "touchdown", "contact", "early_termination", "clip")
-        options = {name: getattr(self, name) for name in names}
-        return options | dict(penalty=parse_penalty(self.penalty), threads=self.threads or None)
-
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
         if self.clip and not issubclass(find_task(self.env), HumanoidImitation):
@@ -168,7 +161,11 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
     if args.resume and args.evaluate:
         fail("--resume and --evaluate exclude each other")
     if path := args.resume or args.evaluate:
-        args = _continue(kind, argv, args, path)
+        try:
+            args = _continue(kind, argv, args, path)
+            check_ranges(args)
+        except (AttributeError, KeyError, TypeError) as error:
+            fail(f"{path} is damaged: {error}")
     else:
         task, args.device = find_task(args.env), distributed.choose_device(args.device)
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
@@ -188,9 +185,8 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
             render.check_video("video.mp4")
         except RuntimeError as error:
             fail(f"--capture-video: {error}")
-    if args.run_dir is None:
-        name = f"{find_task(args.env).name}__{args.script()}__{args.seed}__{int(time.time())}"
-        args.run_dir = path.parent if path else Path("runs") / name
+    if path and args.run_dir is None:
+        args.run_dir = path.parent
     return args
 
 
@@ -211,8 +207,6 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     known = {name: value for name, value in saved["args"].items() if name in hints and not name.isupper()}
     if given.resume and (unknown := [flag(name) for name in saved["args"] if name not in known]):
         fail(f"{path} was written by a {kind.script()}.py with other flags: {', '.join(unknown)}")
-    if wrong := [name for name, value in known.items() if not fits(hints[name], value)]:
-        fail(f"{path} is damaged: {', '.join(map(flag, wrong))} of another type")
     defaults = kind(**known)
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import torch
 
@@ -58,25 +57,6 @@ def check_ranges(args: object) -> None:
         for value, allowed in _ranges(hint, getattr(args, name, None)):
             if complaint := allowed.complaint(value):
                 fail(f"{flag(name)} {complaint}")
-
-
-def fits(hint: Any, value: Any) -> bool:
-    """Whether a value, as a checkpoint may hold it, has the type of a flag."""
-    origin, kinds = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return fits(kinds[0], value)
-    if origin is Literal:
-        return any(type(value) is type(kind) and value == kind for kind in kinds)
-    if origin in (Union, UnionType):
-        return any(fits(kind, value) for kind in kinds)
-    if origin is tuple:
-        kinds = kinds[:1] * len(value) if isinstance(value, tuple) and kinds[-1] is Ellipsis else kinds
-        return isinstance(value, tuple) and len(value) == len(kinds) and all(map(fits, kinds, value))
-    if origin is list:
-        return isinstance(value, list) and all(fits(kinds[0], x) for x in value)
-    if origin is dict:
-        return isinstance(value, dict) and all(fits(kinds[0], k) and fits(kinds[1], x) for k, x in value.items())
-    return hint is Any or type(value) is hint
 
 
 def _ranges(hint: Any, value: Any) -> list[tuple[Any, Range]]:

@@ -1,4 +1,4 @@
-"""One training run: its directory and schedule, its log, written without waiting for the device, its checkpoints."""
+"""One training run: its directory and schedule, its log and its checkpoints."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from torch import Tensor
 
 from diffsim.env import ActionError, DiffEnv
 from diffsim.sim.options import check_device
+from diffsim.tasks import find_task
 from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
-from diffsim.training.directory import EpisodeStatistics, Lock, ProgressLog, check_writable
+from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, make_unused, say
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import Evaluation, make_env, write_evaluation
 from diffsim.training.flags import Flags, ParallelFlags
@@ -32,8 +33,10 @@ L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
-REPORT_EVERY = 10.0  # s between lines about skipped updates
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 RANK_SEED = 1_000_003  # between the seeds of two ranks
+LOG_EVERY = 10  # iterations between two at whose end a GPU is waited for, to write all of them
+RUNS = Path("runs")  # where runs are that are given no directory
 
 
 def is_due(iteration: int, every: int) -> bool:
@@ -41,7 +44,7 @@ def is_due(iteration: int, every: int) -> bool:
 
 
 class Mark:
-    """A moment in a device's work; a GPU is not waited for until someone asks."""
+    """A moment in a device's work, which goes on."""
 
     def __init__(self, device: torch.device) -> None:
         self.time, self.event = time.perf_counter(), None
@@ -49,22 +52,15 @@ class Mark:
             self.event = torch.cuda.Event(enable_timing=True)
             self.event.record(torch.cuda.current_stream(device))
 
-    def wait(self) -> None:
-        if self.event is not None:
-            self.event.synchronize()
-
     def since(self, earlier: Mark) -> float:
-        """Seconds from an earlier mark to this one, which must have been waited for."""
+        """Seconds from an earlier mark to this one, whose work is done."""
         if self.event is not None and earlier.event is not None:
             return earlier.event.elapsed_time(self.event) / 1e3
         return self.time - earlier.time
 
 
-Timing = tuple[str, Mark, Mark]  # name, begin, end
-
-
 @dataclass
-class Entry:
+class Record:
     """An iteration that is not written yet: the device may still work on it."""
 
     iteration: int
@@ -72,29 +68,22 @@ class Entry:
     names: list[str]
     numbers: Tensor  # of the names, then how many signals have arrived
     scalars: dict[str, float]  # that are known already
-    begin: Mark
-    end: Mark
-    timings: list[Timing]
-    evaluation: Evaluation | None = None
+    times: dict[str, tuple[Mark, Mark]]  # begin and end, by name
 
 
 class Run:
     """Iterate over it: it yields the number of each iteration, and evaluates, saves and stops when due.
 
-    `log` neither waits for the device nor writes: on a GPU an iteration is written while the next one is computed. Of
-    several ranks only the first writes anything.
-
-    The script's arguments must be complete. Random numbers are seeded by args.seed here.
+    Of several ranks only the first writes anything. The script's arguments must be complete. Random numbers are seeded
+    by args.seed here.
     """
 
     simulator = checkpoint.HOME  # which its environments have
 
     def __init__(self, args: Flags) -> None:
-        assert args.run_dir
-        self.args, self.directory = args, args.run_dir
+        self.args = args
         self.writes = distributed.rank() == 0
         self._state = checkpoint.load(args.resume, args.script()) if args.resume else None
-        self._lock = Lock()
         if self.writes:
             self._check_directory()
         try:
@@ -113,36 +102,44 @@ class Run:
         self._samples = 0  # control steps of an iteration, of all ranks
         self._learner: Learner | None = None
         self._log: ProgressLog | None = None
-        self._pending: Entry | None = None
-        self._timings: list[Timing] = []
-        self._evaluation: tuple[int, Evaluation] | None = None
-        self._scalars: dict[str, float] = {}
+        self._records: list[Record] = []
+        self._times: dict[str, tuple[Mark, Mark]] = {}
         self._mark = Mark(self.device)
+        self._evaluation: tuple[int, Evaluation] | None = None
+        self._scalars: dict[str, float] = {}  # that were written last
+        self._told = 0.0  # how many skipped updates a message told
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
         self._stopping = False
-        self._skipped = self._report = 0.0  # updates told to be skipped, when the next line may come [s]
 
     # Setting up ------------------------------------------------------------------------------------------------------
 
     def make_env(self, num_envs: int, horizon: int) -> DiffEnv:
         """This rank's share of the training environments, with its own random start states."""
         self._samples = num_envs * horizon
-        seed = self.args.seed + distributed.rank() * RANK_SEED
         args, size = self.args, num_envs // distributed.size()
-        if args.eval_episodes > size:
-            self.eval_env.detach()  # makes them now: an error of what does not fit should not wait
-        if not isinstance(args, ParallelFlags) or not args.randomise:
-            self._env = make_env(args, size, horizon, seed)
-            return self._env
-        self._env = make_env(args, size, horizon, seed, factors=True)
-        self._variation = Variation(self._env, parse_ranges(args.randomise), args.redraw, seed)
+        seed = args.seed + distributed.rank() * RANK_SEED
+        ranges = parse_ranges(args.randomise) if isinstance(args, ParallelFlags) else {}
+        self._env = make_env(args, size, horizon, seed, factors=bool(ranges))
+        if isinstance(args, ParallelFlags) and ranges:
+            self._variation = Variation(self._env, ranges, args.redraw, seed)
         return self._env
 
     @cached_property
     def eval_env(self) -> DiffEnv:
         """The environments of evaluations, made when they are first needed."""
         return make_env(self.args, self.args.eval_episodes)
+
+    @cached_property
+    def directory(self) -> Path:
+        """Made when it is first needed, so that a run that fails at its start leaves nothing behind."""
+        args = self.args
+        with self._writing():
+            if args.run_dir is None:
+                name = f"{find_task(args.env).name}__{args.script()}__{args.seed}__{int(time.time())}"
+                args.run_dir = make_unused(RUNS / name)
+            args.run_dir.mkdir(parents=True, exist_ok=True)
+        return args.run_dir
 
     def restore(self, learner: L) -> L:
         """Register the learner, which checkpoints hold from now on, and continue it if the run is resumed.
@@ -174,7 +171,7 @@ class Run:
             except ActionError:
                 self._check_weights()  # they say more
                 raise
-            self._timings.append((f"time/{function.__name__}", begin, Mark(self.device)))
+            self._times[f"time/{function.__name__}"] = begin, Mark(self.device)
             return metrics
 
         return timed
@@ -193,7 +190,7 @@ class Run:
 
     def __iter__(self) -> Iterator[int]:
         self._open()
-        self._start_clock()
+        self._mark = Mark(self.device)
         try:
             while self.iteration < self.last and not self._stopping:
                 self.iteration += 1
@@ -219,53 +216,48 @@ class Run:
         if self._env is not None:
             tensors |= self._env.take_statistics()
         signals = torch.full((), float(len(self._signals)), device=self.device)
-        numbers = distributed.average(torch.stack([*tensors.values(), signals])).to("cpu", non_blocking=True)
+        numbers = distributed.average(torch.stack([*tensors.values(), signals]))
         scalars = {name: float(value) for name, value in metrics.items() if not isinstance(value, Tensor)}
-        previous, end = self._pending, Mark(self.device)
-        steps = self._samples if control_steps is None else control_steps
-        self._pending = Entry(self.iteration, steps, list(tensors), numbers, scalars, self._mark, end, self._timings)
-        self._start_clock(end)
-        self._write(previous)  # while the device works on this one
+        steps, begin, self._mark = control_steps or self._samples, self._mark, Mark(self.device)
+        times = self._times | {"time/total": (begin, self._mark)}
+        self._records.append(Record(self.iteration, steps, list(tensors), numbers, scalars, times))
+        self._times = {}
 
     def log_evaluation(self, evaluation: Evaluation) -> None:
         """Take the evaluation of the iteration that was logged last."""
-        entry = self._pending
-        assert entry is not None, "log the iteration first"
-        entry.evaluation = evaluation
-        entry.scalars |= evaluation.scalars()
+        self._records[-1].scalars |= evaluation.scalars()
         self._evaluation = self.iteration, evaluation
+        self.message(f"iteration {self.iteration}: {evaluation}")
 
     def message(self, text: str) -> None:
         """Print a line above the progress bar, unless --quiet."""
         if self._log is not None:
             self._log.message(text)
         elif self.writes and not self.args.quiet:
-            print(text, flush=True)
-
-    def _start_clock(self, mark: Mark | None = None) -> None:
-        self._mark, self._timings = mark or Mark(self.device), []
+            say(text)
 
     def _end_iteration(self) -> None:
+        """Write and save what is due. Ranks write after the same iterations, as only then they learn of signals."""
         saving = self.iteration == self.last or is_due(self.iteration, self.args.save_every)
-        if self.device.type == "cpu" or self._evaluates() or saving or self._stopping:
-            self._write(self._pending)
-            self._pending = None
+        pausing = saving or self._evaluates()
+        interrupted = bool(self._signals) and distributed.size() == 1
+        if self.device.type == "cpu" or pausing or interrupted or len(self._records) == LOG_EVERY:
+            for record in self._records:
+                self._write(record)
+            self._records.clear()
         if saving or self._stopping:
             self._save()
-        if saving or self._evaluates():
-            self._start_clock()
+        if pausing:
+            self._mark = Mark(self.device)
 
-    def _write(self, entry: Entry | None) -> None:
-        """Wait until the device has finished an iteration, if there is one, and write it."""
-        if entry is None:
-            return
-        entry.end.wait()
-        ranks, (*numbers, signals) = distributed.size(), entry.numbers.tolist()
+    def _write(self, record: Record) -> None:
+        """Wait until the device has finished an iteration, and write it."""
+        ranks, (*numbers, signals) = distributed.size(), record.numbers.tolist()
         self._stopping = self._stopping or signals > 0
-        seconds = entry.end.since(entry.begin)
-        self.seconds += seconds
-        self.control_steps += entry.steps
-        scalars = dict(zip(entry.names, numbers, strict=True)) | entry.scalars
+        times = {name: end.since(begin) for name, (begin, end) in record.times.items()}
+        self.seconds += times["time/total"]
+        self.control_steps += record.steps
+        scalars = dict(zip(record.names, numbers, strict=True)) | record.scalars | times
         if "episodes" in scalars:
             self._episodes.add(*(ranks * scalars.pop(name) for name in ("episodes", "return", "length")))
             for name in TOTALS:
@@ -273,29 +265,24 @@ class Run:
             scalars |= self._totals
             if self._episodes.windows:
                 scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
-        scalars |= {"charts/SPS": entry.steps / seconds, "time/total": seconds}
-        scalars |= {name: end.since(begin) for name, begin, end in entry.timings}
+        scalars["charts/SPS"] = record.steps / times["time/total"]
         self._scalars = scalars
-        if entry.evaluation is not None:
-            self.message(f"iteration {entry.iteration}: {entry.evaluation}")
-        skipped = scalars.get("grad/skipped", 0.0)
-        if skipped > self._skipped and time.monotonic() >= self._report:
-            self._skipped, self._report = skipped, time.monotonic() + REPORT_EVERY
-            self.message(f"iteration {entry.iteration}: updates skipped so far for their gradients: {skipped:.0f}")
+        if (skipped := scalars.get("grad/skipped", 0.0)) > 2 * self._told:
+            self._told = skipped
+            self.message(f"iteration {record.iteration}: updates skipped so far for their gradients: {skipped:.0f}")
         if self._log is not None:
             with self._writing():
-                self._log.write(entry.iteration, self.control_steps, self.seconds, scalars)
+                self._log.write(record.iteration, self.control_steps, self.seconds, scalars)
 
     # Files and signals -----------------------------------------------------------------------------------------------
 
     def _check_directory(self) -> None:
         """That a run can be written there; leaves nothing behind."""
-        path, args = self.directory, self.args
+        args, path = self.args, self.args.run_dir or RUNS
+        check_writable(path)
         existing = path / "checkpoint.pt"
         if existing.exists() and (args.resume is None or not args.resume.samefile(existing)):
             fail(f"{path} holds another run's checkpoint.pt: --resume it, or choose another --run-dir")
-        check_writable(path)
-        self._lock.acquire(path)
         if args.track:
             try:
                 import wandb  # noqa: F401
@@ -306,14 +293,13 @@ class Run:
         """Begin to write and to receive signals, once."""
         if self._handlers:
             return
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in SIGNALS:
             self._handlers[number] = signal.signal(number, self._receive)
         if not self.writes:
             return
-        args, directory, arguments = self.args, self.directory, dataclasses.asdict(self.args)
+        directory, args = self.directory, self.args
+        arguments = dataclasses.asdict(args)
         with self._writing():
-            directory.mkdir(parents=True, exist_ok=True)
-            self._lock.acquire(directory)
             (directory / "args.json").write_text(json.dumps(arguments, indent=2, default=str) + "\n")
             if args.track:
                 import wandb
@@ -334,10 +320,10 @@ class Run:
         try:
             yield
         except OSError as error:
-            fail(f"cannot write to {self.directory}: {error.strerror}; {self._kept()}")
+            fail(f"cannot write to {self.args.run_dir or RUNS}: {error.strerror}; {self._kept()}")
 
     def _kept(self) -> str:
-        path = self.directory / "checkpoint.pt"
+        path = (self.args.run_dir or RUNS) / "checkpoint.pt"
         return f"{path} is of iteration {self._saved}" if path.is_file() else "no checkpoint was saved"
 
     def _check_weights(self) -> None:
@@ -372,26 +358,24 @@ class Run:
         if self._log is not None:
             with suppress(OSError) if sys.exc_info()[0] else self._writing():  # one message is enough
                 self._log.close()
-        self._lock.release()
         distributed.finalize()
 
     def _summarise(self) -> None:
         if not self.writes:
             return
         args, path = self.args, self.directory
-        print(
+        say(
             f"{args.env}: {self.iteration} iterations, {self.control_steps:,} control steps, "
             f"{self.seconds:.1f} s of training"
         )
-        if "grad/skipped" in self._scalars:
+        if (skipped := self._scalars.get("grad/skipped")) is not None:
             states, gradients = (self._totals[f"sim/{name}"] for name in TOTALS)
-            skipped = int(self._scalars["grad/skipped"])
-            print(f"skipped {skipped} updates, contained {states} non-finite states and {gradients} gradients")
+            say(f"skipped {skipped:.0f} updates, contained {states} non-finite states and {gradients} gradients")
         if self._evaluation:
             iteration, evaluation = self._evaluation
-            print(f"evaluation of iteration {iteration}, {args.eval_episodes} episodes: {evaluation}")
-        print(f"written to {path}")
+            say(f"evaluation of iteration {iteration}, {args.eval_episodes} episodes: {evaluation}")
+        say(f"written to {path}")
         if self.iteration < args.iterations:
-            print(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} goes on")
+            say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} goes on")
         elif self._evaluation:
             write_evaluation(args, self._evaluation[1], self.iteration)

@@ -210,7 +210,7 @@ def test_a_search_on_several_terrains(tmp_path: Path, monkeypatch: pytest.Monkey
     assert tuple(plan["terrain"]) == SLOPES and plan["action"].shape == (3, 8, 3)
     again = make_search("--terrain", *SLOPES[::-1], "--demonstration", str(tmp_path / "plan.npz"))
     again.args.ilqr_iterations = 0  # each is the start of its own terrain's guide, and is followed to its end
-    for made, guide in zip(again.plans(print, tmp_path / "again.npz"), search.guides[::-1], strict=True):
+    for made, guide in zip(again.plans(print, lambda: tmp_path / "again.npz"), search.guides[::-1], strict=True):
         torch.testing.assert_close(made.x[0], guide.x)
     evaluation = search.evaluate()  # beside these two one without noise, which is the first
     world = evaluation.qpos[0, :, 1] - search.guides[0].x[0, 1]
@@ -254,7 +254,7 @@ def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None
     save_demonstration(system, x[0], u[0], path)
     search = make_search(*"--terrain level step:-20:0.01 --demonstration".split(), str(path))
     search.args.ilqr_iterations = 0
-    level, down = search.plans(print, tmp_path / "plan.npz")
+    level, down = search.plans(print, lambda: tmp_path / "plan.npz")
     torch.testing.assert_close(level.x, x)
     assert down.x.shape == x.shape and not torch.allclose(down.u, u)
     torch.testing.assert_close(search.grounds[1].rollout(down.x[:, 0], 8, lambda t, _: down.u[:, t])[0], down.x)

@@ -99,7 +99,6 @@ def test_weights_are_compared_before_layers_are_built(tmp_path: Path, capsys: py
         ("args critic_hidden", (b"x",)),
         ("args substeps", torch.Size([3])),
         ("args target_alpha", None),
-        ("args initial_log_std", 0),
         ("args integrator", "explicit"),
         ("args check", 1),
         ("ranks 0 env", None),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import importlib
 import inspect
 import itertools
 import re
@@ -180,17 +179,6 @@ def test_defaults_are_the_tables(script: ModuleType) -> None:
             assert args.horizon == (16 if env == "g1" and script.__name__ in ("shac", "sapo") else 8)
         expected |= dict(integrator=preset.integrator, substeps=preset.substeps, theta=preset.theta)
         assert {name: getattr(args, name) for name in expected} == expected
-        assert re.fullmatch(rf"runs/{env}__{script.__name__}__1__\d+", str(args.run_dir))
-
-
-@pytest.mark.parametrize("name", "shac sapo bptt ppo_baseline sac_baseline mbpo pods pfpn pfpn_sac gps".split())
-def test_arguments_have_the_types_of_their_flags(name: str) -> None:
-    """As they are checked when they come from a checkpoint, which holds no paths."""
-    script = importlib.import_module(name)
-    hints = get_type_hints(script.Args, include_extras=True)
-    for env in ("cartpole", "walker"):
-        args = vars(parse(script.Args, ["--env", env, *(["--no-early-termination"] if name == "pods" else [])]))
-        assert [key for key in args if key != "run_dir" and not ranges.fits(hints[key], args[key])] == []
 
 
 def test_the_command_line_is_before_the_task_is_before_the_class() -> None:
