@@ -87,9 +87,13 @@ def at_rest(m: mujoco.MjModel) -> mujoco.MjData:
 def mass_matrix(m: mujoco.MjModel) -> Array:
     """(nv, nv) in the reference pose; armature included. MuJoCo's own takes the slides of one body for independent."""
     data, matrix = at_rest(m), np.diag(m.dof_armature)
-    for body in range(1, m.nbody):
-        linear, angular = np.zeros((2, 3, m.nv))
-        mujoco.mj_jacBodyCom(m, data, linear, angular, body)
-        turn = data.ximat[body].reshape(3, 3).T @ angular
-        matrix += m.body_mass[body] * linear.T @ linear + turn.T @ (m.body_inertia[body, :, None] * turn)
-    return matrix
+    mujoco.mj_crb(m, data)
+    moved, (angular, linear) = data.crb[m.dof_bodyid], np.split(data.cdof, 2, axis=1)
+    moment, mass, inertia = moved[:, 6:9], moved[:, 9:], moved[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+    turn = (inertia @ angular[:, :, None])[:, :, 0] + np.cross(moment, linear)
+    force = np.concatenate((turn, mass * linear - np.cross(moment, angular)), 1)
+    ways = list[NDArray[np.int64]]()  # from the world to each
+    for dof, parent in enumerate(m.dof_parentid.tolist()):
+        ways.append(np.append(ways[parent], dof) if parent >= 0 else np.array([dof]))
+        matrix[dof, ways[dof]] += data.cdof[ways[dof]] @ force[dof]
+    return np.tril(matrix) + np.tril(matrix, -1).T

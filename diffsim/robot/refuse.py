@@ -24,10 +24,10 @@ from diffsim.robot.elements import (
 )
 from diffsim.robot.scene import PENALTY_CONSTANTS, Array, Scene
 
-Kind, Joint = mujoco.mjtObj, mujoco.mjtJoint
+Joint, Transmission = mujoco.mjtJoint, mujoco.mjtTrn
 Mask = NDArray[np.bool_]
 # The kind of an element, a mask of those elements or their names, and what is not simulated of them
-Row = tuple[mujoco.mjtObj | str, ArrayLike, str]
+Row = tuple[str, ArrayLike | list[str], str]
 
 # Flags that the reader obeys, and flags that choose between MuJoCo's own numerical methods.
 OBEYED = {"constraint", "contact", "damper", "equality", "frictionloss", "gravity", "limit", "passive", "spring"}
@@ -37,19 +37,31 @@ EXTRAS = {"diagexact", "energy", "fwdinv", "invdiscrete", "island", "multiccd", 
 # Fields of a scene that may be infinite, and that are NaN where the file does not name them
 UNLIMITED, UNNAMED = {"lower", "upper", "force_low", "force_high"}, PENALTY_CONSTANTS
 
+# Arrays of MuJoCo's model that must be 0, of which only newer versions have some, and those that must not be negative
+ZERO = """eq_active0 geom_adhesion geom_surfacevel jnt_springyield jnt_stiffnesspoly dof_dampingpoly pair_adhesion
+    pair_solreffriction tendon_stiffness tendon_stiffnesspoly tendon_damping tendon_dampingpoly tendon_limited
+    tendon_frictionloss tendon_armature tendon_actfrclimited tendon_springyield actuator_damping actuator_dampingpoly
+    actuator_armature actuator_delay""".split()
+POSITIVE = "jnt_stiffness dof_armature dof_damping dof_frictionloss geom_friction geom_solmix pair_friction".split()
+# What a file calls them, where that is another word
+WORDS = {"active0": "this constraint", "limited": "range", "actfrclimited": "actuatorfrcrange"}
+WORDS |= {"stiffnesspoly": "a second number of stiffness", "dampingpoly": "a second number of damping"}
+ELEMENTS = {"eq": "equality", "jnt": "joint", "dof": "joint"}
+ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
+ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
+ONLY_DRAWN = "; set contype and conaffinity to 0 if only drawn"
+
 
 def obstacles(m: mujoco.MjModel) -> list[str]:
     """One line per reason, with the names of all elements that it holds for; empty if the file can be simulated."""
     lines = []
-    for rows in (_file, _bodies, _joints, _inertia, _tendons, _actuators, _contacts):
+    for rows in (_file, _numbers, _bodies, _joints, _inertia, _tendons, _actuators, _contacts):
         for kind, which, why in rows(m):
-            if isinstance(kind, str):
-                names = list(map(str, np.atleast_1d(which)))
-            else:
-                names = [label(m, kind, index) for index in np.flatnonzero(which).tolist()]
-                kind = str(kind).rsplit("mjOBJ_", 1)[-1].lower()
-            if names:
-                lines.append(f"{kind} {listed(names)}: {why}")
+            if not isinstance(which, list):
+                element = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+                which = [label(m, element, index) for index in np.flatnonzero(which).tolist()]
+            if which:
+                lines.append(f"{kind} {listed(which)}: {why}")
     return lines
 
 
@@ -64,29 +76,27 @@ def beyond(scene: Scene) -> list[str]:
     return [f"{', '.join(names)}: not finite in single precision"] if names else []
 
 
-def _any(m: mujoco.MjModel, fields: str) -> Mask:
-    """(n,) of which elements one of these arrays is not 0; some of them only newer versions of MuJoCo have."""
-    there = [np.asarray(getattr(m, field)) for field in fields.split() if hasattr(m, field)]
-    masks = [values.any(tuple(range(1, values.ndim))) for values in there]
-    return np.logical_or.reduce(masks) if masks else np.zeros(1, bool)
-
-
 def _file(m: mujoco.MjModel) -> Iterator[Row]:
-    group = np.array(m.actuator_group)
-    off = (group >= 0) & (group < 31) & ((m.opt.disableactuator >> group.clip(0, 30)) & 1 == 1)
     constants = {name: numeric(m, name) for name in (*PENALTY_CONSTANTS, "muscle_strength")}
-    wrong = [name for name, values in constants.items() if len(values) > 1 or (values < 0).any()]
     yield "option flag", sorted(disabled_flags(m) - OBEYED - METHODS), "cannot be disabled here"
     yield "option flag", sorted(enabled_flags(m) - EXTRAS), "cannot be enabled here"
     yield "option", ["wind"] * bool(np.any(m.opt.wind)), "only a fluid at rest is simulated"
-    fluid = [name for name in ("density", "viscosity") if getattr(m.opt, name) < 0]
-    yield "option", fluid, "must not be negative"
+    yield "option", [name for name in ("density", "viscosity") if getattr(m.opt, name) < 0], "must not be negative"
+    wrong = [name for name, values in constants.items() if len(values) > 1 or (values < 0).any()]
     yield "numeric", wrong, "must be one number, not negative"
     yield "file", ["without a joint"] * (not m.njnt), "there is nothing to simulate"
-    yield Kind.mjOBJ_EQUALITY, m.eq_active0, "equality constraints are not simulated"
-    yield Kind.mjOBJ_FLEX, np.ones(m.nflex), "deformable bodies are not simulated"
-    yield Kind.mjOBJ_PLUGIN, np.ones(m.nplugin), "plugins are not simulated"
-    yield Kind.mjOBJ_ACTUATOR, off, "its group is in actuatorgroupdisable; remove the actuator"
+    yield "flex", np.ones(m.nflex), "deformable bodies are not simulated"
+    yield "plugin", np.ones(m.nplugin), "plugins are not simulated"
+
+
+def _numbers(m: mujoco.MjModel) -> Iterator[Row]:
+    for field in (*ZERO, *POSITIVE):
+        prefix, _, name = field.partition("_")
+        wrong = np.array([np.any(each if field in ZERO else each < 0) for each in getattr(m, field, ())], bool)
+        if prefix == "dof":
+            wrong = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(wrong)])
+        why = "must not be negative" if field in POSITIVE else "is not simulated"
+        yield ELEMENTS.get(prefix, prefix), wrong, f"{WORDS.get(name, name)} {why}"
 
 
 def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
@@ -96,89 +106,73 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
         second[others] = m.body_rootid[others] != m.body_rootid[m.jnt_bodyid[0]]
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
-    yield Kind.mjOBJ_BODY, m.body_mocapid >= 0, "mocap is not simulated"
-    yield Kind.mjOBJ_BODY, second, "a second base beside a floating one"
-    yield Kind.mjOBJ_BODY, welded & fluid, "in a fluid each body needs a joint; merge its geoms"
-    yield Kind.mjOBJ_GEOM, m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
-    yield Kind.mjOBJ_GEOM, _any(m, "geom_adhesion"), "adhesion is not simulated"
-    yield Kind.mjOBJ_GEOM, _any(m, "geom_surfacevel"), "surfacevel is not simulated"
+    yield "body", m.body_mocapid >= 0, "mocap is not simulated"
+    yield "body", second, "a second base beside a floating one"
+    yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
+    yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
 
 
 def _joints(m: mujoco.MjModel) -> Iterator[Row]:
-    kind, dof, limited = Kind.mjOBJ_JOINT, m.jnt_dofadr, m.jnt_limited != 0
+    limited, bounded = m.jnt_limited != 0, m.jnt_actfrclimited != 0
     free, ball = m.jnt_type == Joint.mjJNT_FREE, m.jnt_type == Joint.mjJNT_BALL
-    armature, damping, loss = (getattr(m, f"dof_{name}")[dof] for name in ("armature", "damping", "frictionloss"))
+    armature, loss = (values[m.jnt_dofadr] != 0 for values in (m.dof_armature, m.dof_frictionloss))
     fluid = m.opt.density + m.opt.viscosity > 0
     first = (np.arange(m.njnt) == 0) & (m.body_parentid[m.jnt_bodyid] == 0)
-    plastic = np.asarray(getattr(m, "jnt_plasticadr", -1)) >= 0
-    tendons = (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON).any()
-    curved = np.isin(range(m.njnt), m.dof_jntid[np.flatnonzero(_any(m, "dof_dampingpoly"))])
-    negative = np.minimum.reduce((m.jnt_stiffness, armature, damping, loss)) < 0
-    bounded = m.jnt_actfrclimited != 0
-    yield kind, negative, "armature, damping, stiffness and frictionloss must not be negative"
-    yield kind, curved | _any(m, "jnt_stiffnesspoly"), "damping and stiffness are linear here, one number each"
-    yield kind, _any(m, "jnt_springyield") | plastic, "springs that yield are not simulated"
-    yield kind, ball & limited, "the limit of a ball joint is not simulated"
-    yield kind, limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
-    yield kind, bounded & tendons, "actuatorfrcrange beside muscles is not simulated"
-    yield kind, bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
-    yield kind, free & ((m.jnt_stiffness != 0) | (loss != 0)), "a free joint has no stiffness or frictionloss here"
-    yield kind, free & (armature != 0) & fluid, "armature of a free joint in a fluid is not simulated"
-    yield kind, free & ~first, "one free joint, of the first moving body, is simulated"
+    tendons = (m.actuator_trntype == Transmission.mjTRN_TENDON).any()
+    yield "joint", ball & limited, "the limit of a ball joint is not simulated"
+    yield "joint", limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
+    yield "joint", bounded & tendons, "actuatorfrcrange beside muscles is not simulated"
+    yield "joint", bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
+    yield "joint", free & ((m.jnt_stiffness != 0) | loss), "a free joint has no stiffness or frictionloss here"
+    yield "joint", free & armature & fluid, "armature of a free joint in a fluid is not simulated"
+    yield "joint", free & ~first, "one free joint, of the first moving body, is simulated"
 
 
 def _inertia(m: mujoco.MjModel) -> Iterator[Row]:
-    matrix = mass_matrix(m) if m.nv else np.eye(0)
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0))
-    shared = np.zeros(m.nv, bool)
-    if np.isfinite(matrix).all() and scale.all() and m.nv:
-        values, shapes = np.linalg.eigh(matrix / np.outer(scale, scale))
-        shared[:] = (abs(shapes[:, 0]) > 0.1) & (values[0] < 1e-7)
-    joints = np.arange(m.njnt)
-    yield Kind.mjOBJ_JOINT, np.isin(joints, m.dof_jntid[scale == 0]), "it moves no inertia"
-    yield Kind.mjOBJ_JOINT, np.isin(joints, m.dof_jntid[shared]), "these joints together have a motion without inertia"
+    matrix = mass_matrix(m)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled, idle = matrix / np.outer(scale, scale), np.zeros(m.nv, bool)
+    try:
+        np.linalg.cholesky(scaled - 1e-7 * np.eye(m.nv))  # in a fraction of the time of eigenvalues
+    except np.linalg.LinAlgError:
+        values, shapes = np.linalg.eigh(scaled)
+        idle = (abs(shapes[:, values < 1e-7]) > 0.1).any(1)
+    yield "joint", np.isin(range(m.njnt), m.dof_jntid[idle]), "they have a motion without inertia"
 
 
 def _tendons(m: mujoco.MjModel) -> Iterator[Row]:
     """One without force of its own and without actuator has no effect, whatever its path."""
-    for name in ("stiffness", "damping", "limited", "frictionloss", "armature", "actfrclimited", "springyield"):
-        yield Kind.mjOBJ_TENDON, _any(m, f"tendon_{name}"), f"{name} of a tendon is not simulated"
     spatial, held = np.ones(m.ntendon, bool), np.zeros(m.nsite, bool)
-    for tendon in np.unique(m.actuator_trnid[m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]).tolist():
+    for tendon in np.unique(m.actuator_trnid[m.actuator_trntype == Transmission.mjTRN_TENDON, 0]).tolist():
         path = slice(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon])
         spatial[tendon] = (m.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE).all()
         if spatial[tendon]:
             held[m.wrap_objid[path]] = True
     world = (m.body_weldid[m.site_bodyid] == 0) & floating(m)
-    yield Kind.mjOBJ_TENDON, ~spatial, "only spatial tendons through sites, without pulleys or wrapping geoms"
-    yield Kind.mjOBJ_SITE, held & world, "a muscle of a floating robot cannot hold on to the world"
-
-
-ON_JOINT = "motors on a hinge, a slide or one axis of a ball joint, position and velocity servos on a hinge or a slide"
-ON_TENDON = "<muscle> with a gear of 1 and a ctrlrange within [0, 1], or motors that pull and never push, on a tendon"
+    yield "tendon", ~spatial, "only spatial tendons through sites, without pulleys or wrapping geoms"
+    yield "site", held & world, "a muscle of a floating robot cannot hold on to the world"
 
 
 def _actuators(m: mujoco.MjModel) -> Iterator[Row]:
-    kind, count = Kind.mjOBJ_ACTUATOR, len(m.actuator_trntype)  # a PID has several of nu controls
-    tendon, motor = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, motors(m)
+    count = len(m.actuator_trntype)  # a PID has several of nu controls
+    tendon, group = m.actuator_trntype == Transmission.mjTRN_TENDON, np.array(m.actuator_group)
+    off = (group >= 0) & (group < 31) & ((m.opt.disableactuator >> group.clip(0, 30)) & 1 == 1)
     pulls, turns = _pulls(m, count), _turns(m)
     negative = servos(m) & (m.actuator_biasprm[:count, 1:3] > 0).any(1)
     bounded, joint = m.actuator_forcelimited[:count] != 0, np.where(tendon, -1, m.actuator_trnid[:count, 0])
     shared = (joint[:, None] == joint).sum(1) > 1
-    idle = tendon & ~motor & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
-    for name, fields in {"damping": "damping actuator_dampingpoly", "armature": "armature", "delay": "delay"}.items():
-        yield kind, _any(m, f"actuator_{fields}"), f"{name} is not simulated"
-    yield kind, tendon & ~pulls, f"only {ON_TENDON}"
-    yield kind, ~tendon & ~turns, f"only {ON_JOINT}, without activation dynamics, or muscles on tendons"
-    yield kind, turns & negative, "stiffness and damping of a servo must not be negative"
-    yield kind, tendon & bounded, "forcerange of what pulls a tendon is not simulated"
-    yield kind, turns & bounded & shared, "forcerange is simulated of a joint's only actuator"
-    yield kind, pulls & idle, "its force follows from what it moves, and it moves nothing; give force"
+    idle = tendon & ~motors(m) & (m.actuator_gainprm[:count, 2] < 0) & (m.actuator_acc0[:count] <= 0)
+    yield "actuator", off, "its group is in actuatorgroupdisable; remove the actuator"
+    yield "actuator", tendon & ~pulls, f"only {ON_TENDON}"
+    yield "actuator", ~tendon & ~turns, f"only {ON_JOINT}, without activation dynamics, or muscles on tendons"
+    yield "actuator", turns & negative, "stiffness and damping of a servo must not be negative"
+    yield "actuator", pulls & idle, "its force follows from what it moves, and it moves nothing; give force"
+    yield "actuator", bounded & (tendon | shared), "forcerange is simulated of a joint's only actuator"
 
 
 def _turns(m: mujoco.MjModel) -> Mask:
     """Motors and servos of a hinge or of a slide, and motors of one axis of a ball joint."""
-    turns = (motors(m) | servos(m)) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    turns = (motors(m) | servos(m)) & (m.actuator_trntype == Transmission.mjTRN_JOINT)
     found = np.flatnonzero(turns)
     kind, axes = m.jnt_type[m.actuator_trnid[found, 0]], np.count_nonzero(m.actuator_gear[found, :3], axis=1)
     turns[found] = np.where(kind == Joint.mjJNT_BALL, motors(m)[found] & (axes <= 1), kind != Joint.mjJNT_FREE)
@@ -201,26 +195,22 @@ def _pulls(m: mujoco.MjModel, count: int) -> Mask:
 
 
 def _contacts(m: mujoco.MjModel) -> Iterator[Row]:
-    data, pairs, only_drawn = at_rest(m), ground_pairs(m), "; set contype and conaffinity to 0 if only drawn"
+    pairs = ground_pairs(m)
     touching, shaped, mixed = np.zeros(m.ngeom, bool), np.ones(m.ngeom, bool), np.zeros(m.ngeom, bool)
     touching[[ground for ground, _ in pairs]] = True
     other = (m.geom_type != mujoco.mjtGeom.mjGEOM_PLANE) | (touching.sum() > 1)
-    tilted = ~np.isclose(data.geom_xmat[:, 2::3], [0.0, 0.0, 1.0]).all(1)
+    tilted = ~np.isclose(at_rest(m).geom_xmat[:, 2::3], [0.0, 0.0, 1.0]).all(1)
     for ground, geom in pairs:
         shaped[geom] = m.geom_type[geom] in POINTS
         mixed[geom] = _mixed(pair_law(m, ground, geom).solref)
-    negative = (m.geom_friction.min(1) < 0) | (m.geom_solmix < 0)
+    first, second = m.pair_friction[:, :2].T
     ends = {tuple(sorted(pair)) for pair in pairs}
     declared = np.isin(range(m.npair), [k for pair, k in declared_pairs(m).items() if pair in ends])
-    yield Kind.mjOBJ_GEOM, negative, "friction and solmix must not be negative"
-    yield Kind.mjOBJ_GEOM, touching & other, f"contact is simulated with one ground plane only{only_drawn}"
-    yield Kind.mjOBJ_GEOM, touching & ~other & tilted, "the ground plane must be horizontal"
-    yield Kind.mjOBJ_GEOM, ~shaped, f"its shape cannot touch the ground here{only_drawn}"
-    yield Kind.mjOBJ_GEOM, mixed, "solref mixes a positive with another number"
-    first, second = m.pair_friction[:, :2].T
-    yield Kind.mjOBJ_PAIR, declared & (m.pair_friction.min(1) < 0), "friction must not be negative"
-    yield Kind.mjOBJ_PAIR, declared & (first != second), "friction differs by direction; it is isotropic here"
-    yield Kind.mjOBJ_PAIR, declared & m.pair_solreffriction.any(1), "solreffriction is not simulated"
+    yield "geom", touching & other, f"contact is simulated with one ground plane only{ONLY_DRAWN}"
+    yield "geom", touching & ~other & tilted, "the ground plane must be horizontal"
+    yield "geom", ~shaped, f"its shape cannot touch the ground here{ONLY_DRAWN}"
+    yield "geom", mixed, "solref mixes a positive with another number"
+    yield "pair", declared & (first != second), "friction differs by direction; it is isotropic here"
 
 
 def _mixed(solref: Array) -> Mask:
