@@ -9,7 +9,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions, version
 from importlib.resources import files
 from pathlib import Path
 
@@ -37,13 +37,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
     argv = sys.argv[1:] if argv is None else argv
     commands: dict[str, Callable[..., object]] = {
-        each.__name__: each for each in (demo, drive, train, new, view, check, export)
+        each.__name__: each for each in (demo, drive, train, view, check, export)
     }
     match [*argv]:  # a script heeds its own flags and errors
         case ["view", *flags]:
             return run_script("view", flags)
         case ["train", learner, *flags] if not learner.startswith("-"):
-            return run_script(known(learner), flags)
+            return run_script(learner, flags)
     try:
         if argv:
             tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="diffsim", description=__doc__)
@@ -107,21 +107,10 @@ def drive(
 
 def train(learner: Positional[str]) -> None:
     """Train with a learner of the package: diffsim train shac --env ant, and --help for its flags."""
-    run_script(known(learner), [])
 
 
 def view() -> None:
     """Show a run as video, page, window or plot: diffsim view runs/<run> --web ant.html, and --help for its flags."""
-
-
-def new(learner: Positional[str], script: Positional[Path]) -> None:
-    """Copy the one file of a learner, to edit: diffsim new shac my_shac.py; then python my_shac.py --env ant."""
-    source = find_script(known(learner))
-    if script.exists() or script.suffix != ".py":
-        fail(f"{script} exists already" if script.exists() else f"{script}: a script ends in .py")
-    with render.whole_file(script) as part:
-        shutil.copyfile(source, part)
-    print(f"{script}: a copy of {source.name}; python {script} --env ant trains with it")
 
 
 def check(robot: Positional[Path]) -> None:
@@ -149,19 +138,13 @@ def export(checkpoint: Positional[Path], output: Positional[Path]) -> None:
     print(f"{output}: {saved.args['env']}, {saved.script}.py, iteration {saved.iteration}, {size:.0f} kB")
 
 
-def known(learner: str) -> str:
-    return learner if learner in LEARNERS else fail(f"unknown learner {learner!r}: choose from {', '.join(LEARNERS)}")
-
-
-def find_script(name: str) -> Path:
-    """A script of the repository: the wheel has them in the package, a clone beside it."""
-    inside = PACKAGE / "learners"
-    return (inside if inside.is_dir() else PACKAGE.parent) / f"{name}.py"
-
-
 def run_script(name: str, flags: Sequence[str]) -> None:
+    """A script of the repository: the wheel has them in the package, a clone beside it."""
+    if name not in (*LEARNERS, "view"):
+        fail(f"unknown learner {name!r}: choose from {', '.join(LEARNERS)}")
+    inside = PACKAGE / "learners"
     sys.argv[1:] = flags
-    runpy.run_path(str(find_script(name)), run_name="__main__")
+    runpy.run_path(str((inside if inside.is_dir() else PACKAGE.parent) / f"{name}.py"), run_name="__main__")
 
 
 # The report -----------------------------------------------------------------------------------------------------------
@@ -169,72 +152,53 @@ def run_script(name: str, flags: Sequence[str]) -> None:
 
 def report() -> str:
     """All that a question about an installation needs, in some twenty lines."""
-    machine = [f"{name:<10} {text}" for name, text in describe_machine().items()]
-    blocks = describe_tasks(), machine, [f"! {hint}" for hint in find_troubles()]
+    hints, machine = find_gpu_troubles(), describe_machine()
+    needed: dict[str, Callable[[], object]] = {"kernels": startup.check_kernel_cache, "OpenGL": render.check_opengl}
+    for name, works in (needed | {"videos": lambda: render.check_video("demo.mp4").suffix}).items():
+        try:
+            machine[name] = str(works())
+        except (RuntimeError, ValueError) as error:
+            machine[name] = "none"
+            hints.append(str(error))
+    blocks = describe_tasks(), [f"{name:<10} {text}" for name, text in machine.items()], [f"! {hint}" for hint in hints]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
 def describe_tasks() -> list[str]:
     lines = [f"{'task':<18} {'obs':>4} {'act':>4}  {'episode':<18} {'substeps':>8}  demo"]
     for name, task in TASKS.items():
-        scene = task.load_robot()
         episode = f"{task.episode_length} steps, {task.episode_length * task.control_dt:.1f} s"
-        shipped = "yes" if (POLICIES / f"{name}.pt").is_file() else "-"
-        lines.append(f"{name:<18} {task.obs_dim:>4} {scene.nu:>4}  {episode:<18} {task.substeps:>8}  {shipped}")
+        demo = "yes" if (POLICIES / f"{name}.pt").is_file() else "-"
+        numbers = f"{task.obs_dim:>4} {task.load_robot().nu:>4}  {episode:<18} {task.substeps:>8}"
+        lines.append(f"{name:<18} {numbers}  {demo}")
     return lines
 
 
 def describe_machine() -> dict[str, str]:
     gpus = [torch.cuda.get_device_properties(k) for k in range(torch.cuda.device_count())]
     devices = [f"cuda:{k}, {gpu.name}, {gpu.total_memory / 2**30:.0f} GiB" for k, gpu in enumerate(gpus)]
-    packages = ("torch", "warp-lang", "mujoco", "gymnasium", "numpy")
-    try:
-        drawing = render.check_opengl()
-    except RuntimeError:
-        drawing = "none"
+    packages = [f"{name} {version(name)}" for name in ("torch", "warp-lang", "mujoco", "gymnasium", "numpy")]
+    own = [each.version for each in distributions(name="diffsim-rl")] or ["(not installed)"]
     return {
-        "diffsim": f"{_version('diffsim-rl')}, {files('diffsim')}",
-        "versions": ", ".join([f"python {platform.python_version()}", *(f"{p} {_version(p)}" for p in packages)]),
+        "diffsim": f"{own[0]}, {PACKAGE}",
+        "versions": ", ".join([f"python {platform.python_version()}", *packages]),
         "devices": "; ".join([f"cpu, {available_cores()} cores", *devices]),
-        "kernels": _kernel_cache(),
-        "OpenGL": drawing,
     }
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "(not installed)"
-
-
-def _kernel_cache() -> str:
-    try:
-        return str(startup.check_kernel_cache())
-    except ValueError:
-        return "none"
-
-
-def find_troubles() -> list[str]:
-    """What is likely to disappoint on this machine, each with its remedy."""
-    hints = []
-    driver = startup.nvidia_driver() or shutil.which("nvidia-smi") is not None
-    if driver and not torch.cuda.is_available():
-        if torch.version.cuda is None:
-            hints.append("this torch is a build for the CPU: see https://pytorch.org/get-started for one with CUDA")
-        elif "CUDA_VISIBLE_DEVICES" in os.environ:
-            shown = os.environ["CUDA_VISIBLE_DEVICES"]
-            hints.append(f"torch sees no GPU with CUDA_VISIBLE_DEVICES={shown!r}: unset it")
-        else:
-            hints.append(f"torch sees no GPU: the driver may be older than CUDA {torch.version.cuda}, see nvidia-smi")
-    elif torch.cuda.is_available() and not wp.is_cuda_available():
-        hints.append("torch sees a GPU and Warp does not: the driver is too old for Warp, see nvidia-smi")
-    for works in (startup.check_kernel_cache, render.check_opengl, lambda: render.check_video("demo.mp4")):
-        try:
-            works()
-        except (RuntimeError, ValueError) as error:
-            hints.append(str(error))
-    return hints
+def find_gpu_troubles() -> list[str]:
+    """Why there is no GPU on a machine that has a driver, with the remedy."""
+    driver, seen = startup.nvidia_driver() or shutil.which("nvidia-smi") is not None, torch.cuda.is_available()
+    shown = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if seen and not wp.is_cuda_available():
+        return ["torch sees a GPU and Warp does not: the driver is too old for Warp, see nvidia-smi"]
+    if seen or not driver:
+        return []
+    if torch.version.cuda is None:
+        return ["this torch is a build for the CPU: see https://pytorch.org/get-started for one with CUDA"]
+    if shown is not None:
+        return [f"torch sees no GPU with CUDA_VISIBLE_DEVICES={shown!r}: unset it"]
+    return [f"torch sees no GPU: the driver may be older than CUDA {torch.version.cuda}, see nvidia-smi"]
 
 
 if __name__ == "__main__":

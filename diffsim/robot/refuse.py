@@ -136,7 +136,7 @@ def _inertia(m: mujoco.MjModel) -> Iterator[Row]:
         np.linalg.cholesky(scaled - 1e-7 * np.eye(m.nv))  # in a fraction of the time of eigenvalues
     except np.linalg.LinAlgError:
         values, shapes = np.linalg.eigh(scaled)
-        idle = (abs(shapes[:, values < 1e-7]) > 0.1).any(1)
+        idle |= np.abs(shapes[:, values < 1e-7]).max(1, initial=0.0) > 0.1
     yield "joint", np.isin(range(m.njnt), m.dof_jntid[idle]), "they have a motion without inertia"
 
 
