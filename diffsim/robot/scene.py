@@ -33,7 +33,7 @@ class SceneError(ValueError):
 
 
 class TerrainError(ValueError):
-    """A terrain that cannot be made of its name, or not for a robot."""
+    """A terrain that is none, or not for a robot."""
 
 
 class Spheres(NamedTuple):
@@ -253,8 +253,8 @@ class Scene:
                 segment is a wall.
 
         Raises:
-            ValueError: another shape, numbers that are not finite, x that decreases, walls at an end or back to back,
-                or a robot that touches no ground.
+            TerrainError: another shape, numbers that are not finite, x that decreases, walls at an end or back to
+                back, or a robot that touches no ground.
         """
         if not self.ncontact:
             raise TerrainError(f"{self.name} touches no ground, so it has no terrain")
@@ -262,31 +262,27 @@ class Scene:
 
 
 def _check_terrain(vertices: ArrayLike) -> Array:
-    """(M, K, 2) float64, M = 1 of a single profile; raises ValueError as Scene.with_terrain does."""
+    """(M, K, 2) float64, M = 1 of a single profile."""
     try:
         profiles = np.array(vertices, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError("terrain must be numbers in an array (K, 2) or (environments, K, 2)") from error
+        raise TerrainError("terrain must be numbers in an array (K, 2) or (environments, K, 2)") from error
     shape = profiles.shape
     profiles = profiles[None] if len(shape) == 2 else profiles
     if profiles.ndim != 3 or profiles.shape[2] != 2 or profiles.shape[1] < 2 or not len(profiles):
-        raise ValueError(f"terrain has shape {shape}, must be (K, 2) or (environments, K, 2) with K of 2 or more")
-    x, z = profiles[..., 0], profiles[..., 1]
-    wall = np.diff(x) == 0
-    faults = {
-        "is not finite": ~(np.abs(profiles) <= np.finfo(np.float32).max).all(2),
-        "has a larger x than the next one; x must ascend": np.diff(x) < 0,
-        "equals the next one": wall & (np.diff(z) == 0),
-        "begins a wall at an end of the terrain, where it would go on for ever": (
-            wall & np.isin(range(wall.shape[1]), (0, wall.shape[1] - 1))
-        ),
-        "ends one wall and begins another; two vertices may share an x, not three": (
-            wall & np.insert(wall, 0, False, axis=1)[:, :-1]
-        ),
-    }
-    for why, wrong in faults.items():
-        if wrong.any():
-            row, vertex = np.argwhere(wrong)[0]
+        raise TerrainError(f"terrain has shape {shape}, must be (K, 2) or (environments, K, 2) with K of 2 or more")
+    with np.errstate(invalid="ignore"):
+        along, up = np.moveaxis(np.diff(profiles, axis=1), 2, 0)
+    wall = (along == 0) & (up != 0)
+    wall[:, [0, -1]] = False  # it would go on for ever
+    wall[:, 1:] &= along[:, :-1] > 0
+    for good, must in (
+        ((np.abs(profiles) <= np.finfo(np.float32).max).all(2), "be finite"),
+        ((along > 0) | wall, "have a smaller x than the next one, or begin a wall, one alone and not at an end"),
+    ):
+        if not good.all():
+            row, vertex = np.argwhere(~good)[0]
             where = f" of environment {row}" if len(profiles) > 1 else ""
-            raise ValueError(f"terrain: vertex {vertex}{where} ({x[row, vertex]:g}, {z[row, vertex]:g}) {why}")
+            x, z = profiles[row, vertex]
+            raise TerrainError(f"terrain: vertex {vertex}{where} ({x:g}, {z:g}) must {must}")
     return profiles

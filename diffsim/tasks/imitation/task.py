@@ -46,8 +46,8 @@ class HumanoidImitation(Task):
         scene = self.load_robot()
         model, trunk = scene.mj_model, scene.contact_link == 0
         self.clip = read_clip(self.default_clip) if clip is None else clip
-        self.clip.check(model)
         self._kinematics = Kinematics(model, device, dtype)
+        self.clip.check(model)
         geoms = [model.geom(name).id for name in self.ends]
         self._bodies = torch.tensor(model.geom_bodyid[geoms] - 1, device=device, dtype=torch.int64)
         self._points = torch.tensor(model.geom_pos[geoms], device=device, dtype=dtype)
