@@ -77,18 +77,22 @@ def test_system_identification(truth: dict[str, float], monkeypatch: pytest.Monk
         assert estimate == pytest.approx(factor, rel=0.05)
 
 
-@pytest.mark.slow
-def test_pictures(tmp_path: Path) -> None:
-    """Those of docs/examples.md."""
+@pytest.fixture
+def opengl() -> None:
     try:
         render.check_opengl()
     except RuntimeError as error:
         pytest.skip(str(error))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("opengl")
+def test_pictures(tmp_path: Path) -> None:
+    """Those of docs/examples.md."""
     load("system_identification").main(tmp_path / "found.png")
     load("trajectory_optimisation").optimise(guesses=2, iterations=1, video=tmp_path / "swing_up.gif")
-    assert (tmp_path / "found.png").read_bytes()[:4] == b"\x89PNG" and (
-        tmp_path / "swing_up.gif"
-    ).stat().st_size > 10_000
+    assert (tmp_path / "found.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "swing_up.gif").stat().st_size > 10_000
     with pytest.raises(ValueError, match="a video ends in"):
         load("trajectory_optimisation").optimise(video=tmp_path / "swing_up.avi")
 
@@ -143,12 +147,9 @@ def test_first_steps(shown: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("opengl")
 def test_first_steps_train_and_film(shown: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "")
-    try:
-        render.check_opengl()
-    except RuntimeError as error:
-        pytest.skip(str(error))
     path = os.pathsep.join([str(EXAMPLES.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
 
     def system(command: str) -> None:

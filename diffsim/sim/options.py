@@ -64,16 +64,13 @@ def check_dtype(dtype: torch.dtype) -> torch.dtype:
 def check_device(device: str | torch.device) -> torch.device:
     """The device, with an index if it is a GPU; raises ValueError unless it is the CPU or a GPU that is there."""
     try:
-        result = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda") from error
-    if device is None or result.type not in ("cpu", "cuda"):  # torch takes None for its default device
+        result = torch.device("none" if device is None else device)  # torch takes None for its default device
+    except (RuntimeError, TypeError):
+        result = None
+    if result is None or result.type not in ("cpu", "cuda"):
         raise ValueError(f"unknown device {str(device)!r}; choose cpu or cuda")
     if result.type == "cuda":
-        if not torch.cuda.is_available():
-            raise ValueError(f"device {str(device)!r} asked for, but PyTorch sees no CUDA GPU here; choose cpu")
-        count = torch.cuda.device_count()
-        if (result.index or 0) >= count:
-            raise ValueError(f"device {str(device)!r} asked for, but there are {count} CUDA GPUs")
+        if (result.index or 0) >= (count := torch.cuda.device_count()):
+            raise ValueError(f"device {str(device)!r} asked for, but PyTorch sees {count} CUDA GPUs here; choose cpu")
         result = torch.device("cuda", torch.cuda.current_device() if result.index is None else result.index)
     return result
