@@ -1,89 +1,56 @@
-"""Policies, the states that they visit, and motions from there: what the benchmarks of the simulator share."""
+"""Shipped policies, the states that they visit, and motions from there: what the benchmarks of the simulator share."""
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 import mujoco
 import numpy as np
 import torch
-from common import CommonFlags, TaskName
-from tables import ROOT
+from common import TaskName
 from torch import Tensor, nn
+from worlds import Array, Here, State, in_double, rollout, starts
 
 import diffsim
-from diffsim import Integration, Simulator
+from diffsim import DiffEnv, Integration, Simulator
 from diffsim.__main__ import POLICIES
-from diffsim.training import Count, fail, load_policy
+from diffsim.training import load_policy
 
-sys.path.append(str(ROOT))
-import shac as shac  # noqa: E402
-
-CONTROL_DT = 1 / 60
-Array = np.ndarray
-
-Integrator = Literal["semi_implicit", "implicit 0", "implicit 0.5", "extrapolated"]  # with its theta
-INTEGRATORS: tuple[Integrator, ...] = get_args(Integrator)
+VISITED = 15, 30, 60, 120  # control steps after which a quarter of the states is taken
+INTEGRATORS = "semi_implicit", "implicit 0", "implicit 0.5", "extrapolated"  # with theta
 
 
-def integration(integrator: Integrator, substeps: int) -> Integration:
+def integration(integrator: str, substeps: int) -> Integration:
     name, _, theta = integrator.partition(" ")
     return Integration(integrator=name, theta=float(theta or 0), substeps=substeps)
 
 
-def label(setting: Integration) -> str:
-    return setting.integrator if setting.integrator != "implicit" else f"implicit {setting.theta:g}"
-
-
-@dataclass
-class PolicyFlags(CommonFlags):
-    checkpoint: Path | None = None  # of any script, whose policy acts (default: the one that comes with the package)
-    states: Count = 32  # start states, which the policy visits
-
-    def policy(self, name: TaskName) -> tuple[nn.Module, str]:
-        """Observations -> actions in float64, and what to call it."""
-        if self.checkpoint and len(self.env) != 1:
-            fail("--checkpoint is of one task: name it with --env")
-        saved = load_policy(path := self.checkpoint or Path(str(POLICIES / f"{name}.pt")))
-        if saved.args["env"] != name:
-            fail(f"{path} was trained on {saved.args['env']}, not {name}")
-        return saved.network.double(), f"{path.name}, iteration {saved.iteration}"
+def shipped(name: TaskName) -> nn.Module:
+    """The policy of a task that comes with the package, as a map from observations to actions."""
+    return load_policy(Path(str(POLICIES / f"{name}.pt"))).network
 
 
 class Case:
-    """A task (float64), its scene, and a policy with the states that it visits."""
+    """A task (float64), its scene, and the policy that comes with the package, with the states that it visits."""
 
-    def __init__(self, args: PolicyFlags, name: TaskName) -> None:
-        self.task, self.n = diffsim.TASKS[name](dtype=torch.float64), args.states
-        self.scene = diffsim.make(name, num_envs=1).scene
-        self.policy, called = args.policy(name)
-        self.qpos, self.qvel = visited_states(name, self.policy, args.states)
-        print(f"{name}: states of {called}", flush=True)
+    def __init__(self, name: TaskName, states: int) -> None:
+        env, self.n = diffsim.make(name, states, seed=0), states
+        self.task, self.scene, self.policy = in_double(env), env.scene, shipped(name)
+        self.qpos, self.qvel = visited_states(env, self.policy)
 
-    @torch.no_grad()
     def actions_in(self, sim: Simulator) -> Tensor:
-        """The policy's actions (120, N, nu) of 2 s, rounded to float32 so that every precision replays the same."""
-        actions, qpos, qvel = [torch.zeros(self.n, sim.nu, dtype=torch.float64)], self.qpos, self.qvel
-        for _ in range(120):
-            actions.append(self.policy(self.task.observe(qpos, qvel, actions[-1])).clamp(-1, 1).float().double())
-            qpos, qvel = sim.step(qpos, qvel, actions[-1])
-        return torch.stack(actions[1:])
+        """The policy's actions (120, N, nu) of 2 s, in float32 so that every precision replays the same."""
+        nothing = torch.zeros(self.n, sim.nu).double()
+        start = State(self.qpos, self.qvel, nothing, nothing[:, :0])
+        return torch.stack([step.state.action for step in rollout(Here(sim), self.task, self.policy, start, 120)])
 
 
-@torch.no_grad()
-def visited_states(name: str, policy: nn.Module, count: int) -> tuple[Tensor, Tensor]:
-    """(count, nq), (count, nv) in float64: a quarter each after 0.25, 0.5, 1 and 2 s of episodes under the policy."""
-    env = diffsim.make(name, num_envs=count, seed=0)
-    obs, _ = env.reset(seed=0)
-    qpos, qvel = env.qpos.double(), env.qvel.double()
-    for first, steps in enumerate((15, 15, 30, 60)):
-        for _ in range(steps):
-            obs = env.step(policy(obs.double()).float())[0]
-        qpos[first::4], qvel[first::4] = env.qpos[first::4].double(), env.qvel[first::4].double()
-    return qpos, qvel
+def visited_states(env: DiffEnv, policy: nn.Module) -> tuple[Tensor, Tensor]:
+    """(N, nq), (N, nv) in float64: a quarter each after 0.25, 0.5, 1 and 2 s under the policy."""
+    path = [step.state for step in rollout(Here(env.sim), env.task, policy, starts(env, seed=0), max(VISITED))]
+    quarters = [path[steps - 1] for steps in VISITED]
+    qpos = torch.cat([state.qpos[k::4] for k, state in enumerate(quarters)])
+    return qpos.double(), torch.cat([state.qvel[k::4] for k, state in enumerate(quarters)]).double()
 
 
 @torch.no_grad()

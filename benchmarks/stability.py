@@ -1,7 +1,7 @@
 """Where the simulator breaks: the largest stable step, and what it does at extremes of constants, states and actions.
 
     python benchmarks/stability.py                         every task and integrator, a quarter of an hour
-    python benchmarks/stability.py --parts long --steps 100_000
+    python benchmarks/stability.py --parts long
 
 Writes stability_*.csv, stability.png and, with --update-results, the tables of docs/stability.md, which explains them.
 All is float32, from states that a trained policy visits. "step" seeks the fewest substeps that stay finite and below
@@ -24,17 +24,20 @@ import motions
 import mujoco
 import numpy as np
 import torch
-from common import Line, Panel, Part, TaskName, lines, measured, plot, run
+from common import CommonFlags, Line, Panel, Part, TaskName, lines, measured, plot, run
 from groups import grouped, numbers, pivot
-from motions import CONTROL_DT, INTEGRATORS, Array, PolicyFlags, integration, mechanics, replay
+from motions import INTEGRATORS, integration, mechanics, replay
 from tables import Row
 from torch import Tensor
+from worlds import Array
 
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.training import Count, gait
 
 PartName = Literal["step", "sweeps", "horizon", "long", "energy"]
+STATES, CHAINS = 8, 16
+CONTROL_DT = 1 / 60
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 HORIZONS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 SHOWN = (1, 32, 128, 1000)  # of them in the page
@@ -53,29 +56,24 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 }
 NEEDS_GROUND = list(SWEEPS)[:5]
 CONSTANTS = {"contact stiffness x": ("k_n", None), "contact damping x": ("k_d", None), "friction": ("mu", 1.0)}
-SWEEP_KEY, ENERGY_KEY = ("task", "integrator", "sweep", "value"), ("links", "substeps", "integrator")
-CHAINS, CHAIN_SUBSTEPS = (1, 5, 20), (16, 32, 64)  # links; substeps
+LINKS, CHAIN_SUBSTEPS = (1, 5, 20), (16, 32, 64)
 
 
 @dataclass
-class Args(PolicyFlags):
+class Args(CommonFlags):
     parts: tuple[PartName, ...] = ("step", "sweeps", "horizon", "long")  # tables to measure
-    states: Count = 8  # start states
     steps: Count = 1_000_000  # control steps of the table "long", over all of its 64 environments
 
 
 class Case(motions.Case):
     """A motion with MuJoCo's model for its energies, and a reference so fine that it is stable."""
 
-    def __init__(self, args: Args, name: TaskName) -> None:
-        super().__init__(args, name)
+    def __init__(self, name: TaskName) -> None:
+        super().__init__(name, STATES)
         self.model = mujoco.MjModel.from_xml_path(self.scene.path)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-
-    @cached_property
-    def reference(self) -> Simulator:
         finest = integration("semi_implicit", 64 * self.task.substeps)
-        return Simulator(self.scene, self.n, finest, dtype=torch.float64)
+        self.reference = Simulator(self.scene, self.n, finest, dtype=torch.float64)
 
     @cached_property
     def actions(self) -> Tensor:
@@ -88,35 +86,20 @@ class Case(motions.Case):
 
 
 def measure_step(args: Args, name: TaskName) -> Iterator[Row]:
-    case = Case(args, name)
+    case, default = Case(name), diffsim.TASKS[name].substeps
     limit = case.kinetic(case.reference, case.actions)[0]
-    default = case.task.substeps
     for integrator in INTEGRATORS:
         stable: dict[int, bool] = {}
         for count in (c for c in COUNTS if c <= 4 * default and (integrator != "extrapolated" or c % 2 == 0)):
-            sim = Simulator(case.scene, case.n, integration(integrator, count))
-            energy, bad = case.kinetic(sim, case.actions)
+            energy, bad = case.kinetic(Simulator(case.scene, case.n, integration(integrator, count)), case.actions)
             stable[count] = bad == 0 and energy < 2 * limit
         counts = list(stable)
-        fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), None)
-        row = {"task": name, "integrator": integrator, "fewest substeps": fewest or f"over {counts[-1]}"}
-        yield row | {"largest stable step (ms)": 1e3 * CONTROL_DT / fewest if fewest else "", "default": default}
+        fewest = next((c for k, c in enumerate(counts) if all(stable[d] for d in counts[k:])), f"over {counts[-1]}")
+        yield {"task": name, "integrator": integrator, "fewest substeps": fewest, "default": default}
 
 
 def fewest_substeps(rows: list[dict[str, str]]) -> Sequence[Row]:
     return pivot(rows, ("task", "default"), "integrator", "fewest substeps")
-
-
-def gradient_norm(sim: Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> tuple[float, int]:
-    """Largest over environments of |d sum(qpos after 8 control steps) / d qvel|, and number of adjoints not finite."""
-    before, leaf = int(sim.nonfinite_gradients.sum()), qvel.to(sim.dtype).requires_grad_()
-    q, v = qpos.to(sim.dtype), leaf
-    sim.rewind()
-    for action in actions[:8].to(sim.dtype):
-        q, v = sim.step(q, v, action)
-    (gradient,) = torch.autograd.grad(q.sum(), leaf)
-    assert gradient.isfinite().all()
-    return gradient.norm(dim=1).max().item(), int(sim.nonfinite_gradients.sum()) - before
 
 
 def stored(scene: Scene, qpos: Tensor) -> Array:
@@ -131,7 +114,7 @@ def stored(scene: Scene, qpos: Tensor) -> Array:
 def bounded(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> bool:
     """Whether the energy along qpos (T, N, nq), qvel (T, N, nv) stays that of the start, springs included, to 10 %."""
     start = mechanics(model, qpos[0], qvel[0])[1] + stored(scene, qpos[0])
-    path = np.array([mechanics(model, q, v)[:2] for q, v in zip(qpos, qvel, strict=True)])
+    path = np.array([mechanics(model, q, v) for q, v in zip(qpos, qvel, strict=True)])
     floor = (path[:, 1] - path[:, 0]).min(0)  # potential energy has no zero: its least value is taken off
     return bool((path[:, 1] - floor <= 1.1 * (start - floor) + 1e-3).all())
 
@@ -177,24 +160,22 @@ def setup(case: Case, sweep: str, value: float) -> tuple[Scene, mujoco.MjModel, 
 
 
 def measure_sweeps(args: Args, name: TaskName) -> Iterator[Row]:
-    case = Case(args, name)
+    case = Case(name)
     for sweep, value in ((sweep, value) for sweep, values in SWEEPS.items() for value in values):
         if sweep in NEEDS_GROUND and not case.scene.ncontact:
             continue
         scene, model, qpos, qvel, actions = setup(case, sweep, value)
         limit = case.kinetic(case.reference, actions)[0] if "action" in sweep else 0.0
         for integrator in INTEGRATORS:
-            sim = Simulator(scene, case.n, integration(integrator, case.task.substeps), horizon=8)
+            sim = Simulator(scene, case.n, integration(integrator, case.task.substeps))
             if "action" in sweep:
                 energy, bad = case.kinetic(sim, actions)
                 within = energy < 2 * limit
             else:
                 *path, bad = replay(sim, qpos, qvel, actions)
                 within = bounded(scene, model, *path)
-            norm, lost = gradient_norm(sim, qpos, qvel, actions)
             row: Row = {"task": name, "integrator": integrator, "sweep": sweep, "value": float(value)}
-            row = {**row, "finite": bad == 0, "contained": bad, "energy bounded": within}
-            yield {**row, "gradient": norm, "gradients not finite": lost}
+            yield {**row, "finite": bad == 0, "contained": bad, "energy bounded": within}
 
 
 def summary(rows: list[dict[str, str]]) -> list[Row]:
@@ -211,73 +192,66 @@ def summary(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
+def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
+    """The norm of the gradient of the mean reward with respect to the policy's weights."""
+    case, task = Case(name), diffsim.TASKS[name]()
+    weights = list(case.policy.parameters())  # of which the noise's standard deviation plays no part
+    for integrator in INTEGRATORS:
+        sim = Simulator(case.scene, case.n, integration(integrator, task.substeps), horizon=HORIZONS[-1])
+        for horizon in HORIZONS:
+            q, v, total = case.qpos.float(), case.qvel.float(), torch.zeros(())
+            action = torch.zeros(case.n, case.scene.nu)
+            sim.rewind()
+            for _ in range(horizon):
+                action = case.policy(task.observe(q, v, action)).clamp(-1, 1)
+                q, v = sim.step(q, v, action)
+                total = total + task.reward(task.observe(q, v, action), action).mean() / horizon
+            found = [g.flatten() for g in torch.autograd.grad(total, weights, allow_unused=True) if g is not None]
+            norm = torch.cat(found).norm().item()
+            yield {"task": name, "integrator": integrator, "horizon": horizon, "gradient": norm}
+
+
 def growth(rows: list[dict[str, str]]) -> Sequence[Row]:
     """Explicitly integrated: the gradient's norm over some horizons."""
     explicit = (row for row in rows if row["integrator"] == "semi_implicit" and int(row["horizon"]) in SHOWN)
     return pivot(explicit, ("task", "integrator"), "horizon", "gradient")
 
 
-def measure_horizon(args: Args, name: TaskName) -> Iterator[Row]:
-    case, task = Case(args, name), diffsim.TASKS[name]()
-    policy = copy.deepcopy(case.policy).float()
-    weights = list(policy.parameters())  # of which the noise's standard deviation plays no part
-    for integrator in INTEGRATORS:
-        sim = Simulator(case.scene, case.n, integration(integrator, task.substeps), horizon=HORIZONS[-1])
-        for horizon in HORIZONS:
-            before, bad = int(sim.nonfinite_gradients.sum()), 0
-            q, v, total = case.qpos.float(), case.qvel.float(), torch.zeros(())
-            action = torch.zeros(case.n, case.scene.nu)
-            sim.rewind()
-            for _ in range(horizon):
-                action = policy(task.observe(q, v, action)).clamp(-1, 1)
-                q, v = sim.step(q, v, action)
-                bad += int(sim.nonfinite.sum())
-                total = total + task.reward(task.observe(q, v, action), action).mean() / horizon
-            found = [g.flatten() for g in torch.autograd.grad(total, weights, allow_unused=True) if g is not None]
-            row: Row = {"task": name, "integrator": integrator, "horizon": horizon}
-            row = {**row, "gradient": torch.cat(found).norm().item()}
-            yield {**row, "gradients not finite": int(sim.nonfinite_gradients.sum()) - before, "contained": bad}
-
-
 @torch.no_grad()
 def measure_long(args: Args, name: TaskName) -> Iterator[Row]:
-    env = diffsim.make(name, num_envs=64, seed=0)
-    policy, returns = args.policy(name)[0].float(), list[float]()
-    obs, _ = env.reset(seed=0)
-    bad, fastest = torch.zeros((), dtype=torch.long), torch.zeros(())
-    for _ in range(math.ceil(args.steps / 64)):
+    env, steps = diffsim.make(name, num_envs=64, seed=0), math.ceil(args.steps / 64)
+    policy, (obs, _) = motions.shipped(name), env.reset(seed=0)
+    bad, fastest, episodes = (torch.zeros(()) for _ in range(3))
+    for _ in range(steps):
         obs, _, _, _, info = env.step(policy(obs))
         bad += info["nonfinite"].sum()
+        episodes += info["_episode"].sum()
         fastest = torch.maximum(fastest, env.qvel.abs().max())
-        returns += info["episode"]["r"][info["_episode"]].tolist()
-    row: Row = {"task": name, "control steps": 64 * math.ceil(args.steps / 64), "contained": int(bad)}
-    row = {**row, "largest velocity": fastest.item(), "episodes": len(returns)}
-    yield {**row, "median return": float(np.median(returns)) if returns else math.nan}
+    row = {"task": name, "control steps": 64 * steps, "contained": int(bad), "largest velocity": fastest.item()}
+    yield row | {"episodes": int(episodes)}
 
 
 def chain(links: int) -> Scene:
     """A fixed chain of capsules of 0.2 m on parallel hinges, without damping and contact."""
     link = '<joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.04" contype="0" conaffinity="0"/>'
     bodies = "".join(f'<body pos="{0.2 * (k > 0)} 0 0">{link}' for k in range(links)) + links * "</body>"
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-    return diffsim.load_scene(model)
+    return diffsim.load_scene(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"))
 
 
 def measure_energy(args: Args, links: int) -> Iterator[Row]:
     """Chains fall from about horizontal at rest: how far the energy leaves that of the start, relative to the fall."""
     scene, generator = chain(links), torch.Generator().manual_seed(0)
-    qpos = 0.1 * torch.randn((args.states, links), generator=generator, dtype=torch.float64)
-    down = torch.zeros(1, links, dtype=torch.float64)
-    down[0, 0] = math.pi / 2
+    qpos = 0.1 * torch.randn((CHAINS, links), generator=generator, dtype=torch.float64)
+    down = torch.eye(links).double()[:1] * math.pi / 2
     least = mechanics(scene.mj_model, down, torch.zeros_like(down))[1]
     for substeps in CHAIN_SUBSTEPS:
         for integrator in ("semi_implicit", "extrapolated"):
-            sim = Simulator(scene, args.states, integration(integrator, substeps))
-            q, v, bad = replay(sim, qpos, torch.zeros_like(qpos), torch.zeros(600, args.states, 0))
+            sim = Simulator(scene, CHAINS, integration(integrator, substeps))
+            q, v, bad = replay(sim, qpos, torch.zeros_like(qpos), torch.zeros(600, CHAINS, 0))
             energy = np.array([mechanics(scene.mj_model, a, b)[1] for a, b in zip(q, v, strict=True)]) - least
-            drift = np.median(abs(energy / energy[0] - 1).max(0))
-            row = {"links": links, "substeps": substeps, "integrator": integrator, "energy drift": float(drift)}
-            yield row | {"chains": args.states, "not finite": bad}
+            drift = float(np.median(abs(energy / energy[0] - 1).max(0)))
+            row = {"links": links, "substeps": substeps, "integrator": integrator, "energy drift": drift}
+            yield row | {"chains": CHAINS, "not finite": bad}
 
 
 def energies(rows: list[dict[str, str]]) -> Sequence[Row]:
@@ -300,16 +274,18 @@ def draw(args: Args, rows: list[dict[str, str]]) -> None:
 PAGE = "stability.md"
 PARTS: dict[PartName, Part] = {
     "step": Part("stability_step", measure_step, ("task", "integrator"), "step", PAGE, fewest_substeps),
-    "sweeps": Part("stability_sweeps", measure_sweeps, SWEEP_KEY, "sweeps", PAGE, summary),
+    "sweeps": Part(
+        "stability_sweeps", measure_sweeps, ("task", "integrator", "sweep", "value"), "sweeps", PAGE, summary
+    ),
     "horizon": Part("stability_horizon", measure_horizon, ("task", "integrator", "horizon"), "horizon", PAGE, growth),
     "long": Part("stability_long", measure_long, ("task",)),
-    "energy": Part("stability_energy", measure_energy, ENERGY_KEY, "energy", PAGE, energies),
+    "energy": Part("stability_energy", measure_energy, ("links", "substeps", "integrator"), "energy", PAGE, energies),
 }
 
 
 def main(args: Args) -> None:
     for part in args.parts:
-        changes: dict[str, Any] = {"env": CHAINS} if part == "energy" else {}
+        changes: dict[str, Any] = {"env": LINKS} if part == "energy" else {}
         rows = measured(dataclasses.replace(args, **changes), PARTS[part])
         if part == "horizon" and rows:
             draw(args, rows)
