@@ -39,13 +39,13 @@ COLUMNS = ("hidden", "model_hidden", "rollout_lengths", "num_envs", "actor_lr", 
 PER_TASK = {
     "cartpole":     ((64, 64),             (128, 128),           (1, 5),  16, 1e-3, 1e-3,   600),
     "hopper":       ((256, 128, 64),       (200, 200, 200, 200), (1, 15), 64, 5e-4, 5e-4, 2_000),
-    "half_cheetah": ((256, 128, 64),       (200, 200, 200, 200), (1, 1),  64, 5e-4, 5e-4, 2_000),
     "ant":          ((256, 128, 64),       (200, 200, 200, 200), (1, 25), 64, 5e-4, 5e-4, 2_000),
     "humanoid":     ((512, 256),           (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
     "humanoid_mtu": ((512, 512, 512, 256), (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
-    "humanoid_imitation": ((512, 256),           (400, 400, 400, 400), (1, 25), 64, 3e-4, 2e-4, 2_000),
 }
+PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
 # fmt: on
+MAX_GRAD_NORM = 100.0  # gradients of large values reach it
 LOG_STD = (-5.0, 2.0)  # bounds of the policy's log standard deviation
 LOG_VAR = (-10.0, 0.5)  # where the bounds of the models' log variance begin, in normalized units
 BOUND_WEIGHT = 0.01  # of the pull that closes them
@@ -55,14 +55,10 @@ HELD_OUT_BATCH = 1024
 
 @dataclass
 class Args(ParallelFlags):
-    """The algorithm. Defaults: of a task that is not in the table."""
+    """The algorithm. Defaults: of half_cheetah, and of a task that is not in the table."""
 
     MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "steps", "updates", "batch_size", "real_ratio", "gamma", "tau")
 
-    iterations: Count = 2_000
-    """learning iterations (per task)"""
-    num_envs: Count = 64
-    """parallel environments N, one in ten of which is held out (per task)"""
     steps: Count = 16
     """control steps of an iteration (1/60 s each)"""
     seed_steps: Natural = 64
@@ -96,49 +92,38 @@ class Args(ParallelFlags):
     batch_size: Count = 256
     """samples of such an update"""
     real_ratio: Fraction = 0.05
-    """share of them that are real"""
+    """share of them that are real transitions; the others are imagined"""
     hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
     actor_lr: Positive = 5e-4
     """learning rate of actor and critics (per task)"""
     temperature_lr: Positive = 5e-4
     """learning rate of the temperature's logarithm (per task)"""
-    initial_temperature: Positive = 1.0
-    """initial weight of the entropy"""
     gamma: Fraction = 0.99
     """discount factor"""
     tau: Fraction = 0.005
     """target critics <- (1 - tau) target critics + tau critics, after each update"""
-    max_grad_norm: Positive = 100.0
-    """gradients are clipped to this norm, which those of large values reach"""
-    save_every: Natural = 500
-    """save the checkpoint, which holds the buffers, every this many iterations (0: only at the end)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        return dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        own = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
+        return own | {"save_every": 500}  # a checkpoint holds the buffers
 
     def check(self) -> None:
         super().check()
         first, last = self.rollout_lengths
         rows, past = self.num_envs * (1 + self.sample_enhance), find_task(self.env).num_memory
         jacobians = "--sample-enhance takes Jacobians of"
-        for wrong, message in (
-            (distributed.size() > 1, "one process alone: a replay buffer is not shared among ranks"),
-            (self.num_envs < 2, "--num-envs must be at least 2: one environment is held out"),
-            (self.elites > self.models, f"--elites {self.elites} are more than --models {self.models}"),
-            (first > last, f"--rollout-lengths {first} {last} are the wrong way round"),
-            (
-                self.buffer_size < rows,
-                f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step",
-            ),
-            (
-                self.sample_enhance and past,
-                f"{jacobians} states that do not hold the past, on which {self.env} depends",
-            ),
-            (self.sample_enhance and self.randomise, f"{jacobians} one robot: leave out --randomise"),
-        ):
-            if wrong:
-                fail(message)
+        wrong = {
+            "one process alone: a replay buffer is not shared among ranks": distributed.size() > 1,
+            "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
+            f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
+            f"--rollout-lengths {first} {last} are the wrong way round": first > last,
+            f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step": self.buffer_size < rows,
+            f"{jacobians} states that do not hold the past, on which {self.env} depends": self.sample_enhance and past,
+            f"{jacobians} one robot: leave out --randomise": self.sample_enhance and self.randomise,
+        }
+        for message in (message for message, found in wrong.items() if found):
+            fail(message)
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -180,9 +165,6 @@ class Actor(nn.Module):
 class Models(nn.Module):
     """p(s' - s, r | s, a): Gaussians of E networks, in units in which changes and rewards have variance 1."""
 
-    elites: Tensor
-    fits: Tensor
-
     def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
         super().__init__()
         size = obs_dim + 1
@@ -190,8 +172,8 @@ class Models(nn.Module):
         self.ensemble = Ensemble(networks)
         self.least, self.most = (nn.Parameter(torch.full((size,), bound)) for bound in LOG_VAR)
         self.target = ObsNormalizer(size)
-        self.register_buffer("elites", torch.arange(args.elites))
-        self.register_buffer("fits", torch.zeros(()))  # iterations in which they learnt
+        self.elites: Tensor = nn.Buffer(torch.arange(args.elites))
+        self.fits: Tensor = nn.Buffer(torch.zeros(()))  # iterations in which they learnt
 
     def forward(self, obs: Tensor, action: Tensor, which: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Of normalized observations and actions (E, B, ...): mean and log variance (E, B, obs_dim + 1).
@@ -211,6 +193,11 @@ class Models(nn.Module):
         mean, log_var = (x.flatten(0, 1) for x in self(*parts, self.elites))
         drawn = self.target.inverse(mean + (0.5 * log_var).exp() * torch.randn_like(mean))
         return drawn[:, :-1], drawn[:, -1]
+
+
+def changes(batch: Transition) -> Tensor:
+    """What the models predict (B, obs_dim + 1)."""
+    return torch.cat((batch.next_obs - batch.obs, batch.reward.unsqueeze(1)), 1)
 
 
 def gaussian_nll(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
@@ -235,20 +222,17 @@ class MBPO:
         critics = [mlp(obs_dim + action_dim, args.hidden, 1, nn.ReLU) for _ in range(2)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        log = torch.full((), math.log(args.initial_temperature))
-        self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
+        self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)  # the entropy's weight
         self.models = Models(args, obs_dim, action_dim).to(env.device)
         self.policy = self.actor.deterministic()
-        self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.actor_lr)
-        self.critic_optimizer = ClippedAdam(self.critics, args.max_grad_norm, lr=args.actor_lr)
-        self.temperature_optimizer = ClippedAdam(self.temperature, args.max_grad_norm, lr=args.temperature_lr)
-        self.model_optimizer = ClippedAdam(self.models, args.max_grad_norm, lr=args.model_lr)
+        self.actor_optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.actor_lr)
+        self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.actor_lr)
+        self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
+        self.model_optimizer = ClippedAdam(self.models, MAX_GRAD_NORM, lr=args.model_lr)
         imagined = args.retain * args.elites * args.branches * args.rollout_lengths[1]
         held_out = max(args.steps * self.held_out, args.buffer_size // HELD_OUT)
-        sizes = (args.buffer_size, held_out, imagined)
-        self.real, self.unseen, self.imagined = (
-            ReplayBuffer(size, obs_dim, action_dim).to(env.device) for size in sizes
-        )
+        buffers = (ReplayBuffer(size, obs_dim, action_dim) for size in (args.buffer_size, held_out, imagined))
+        self.real, self.unseen, self.imagined = (buffer.to(env.device) for buffer in buffers)
         if args.sample_enhance:
             integration, threads = env.sim.integration, args.threads or None
             self.dynamics = Dynamics(env.scene, integration, env.control_dt, env.device, threads)
@@ -257,15 +241,11 @@ class MBPO:
 
     def explore(self) -> dict[str, Tensor]:
         """Control steps with uniformly random actions."""
-        return self.act(random=True)
-
-    def collect(self) -> dict[str, Tensor]:
-        """Control steps with the policy."""
-        return self.act(random=False)
+        return self.collect(random=True)
 
     @torch.no_grad()
-    def act(self, random: bool) -> dict[str, Tensor]:
-        """Control steps of all environments into the buffers."""
+    def collect(self, random: bool = False) -> dict[str, Tensor]:
+        """Control steps of all environments, with the policy if not at random, into the buffers."""
         env = self.env
         obs = env.detach()
         for _ in range(self.args.steps):
@@ -282,7 +262,7 @@ class MBPO:
             if state is not None:
                 self.real.add(enhance(self, self.dynamics, state[self.held_out :], seen))
             self.actor.normalizer.update(obs)
-            self.models.target.update(self.changes(seen))
+            self.models.target.update(changes(seen))
             obs = next_obs
         optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer, self.model_optimizer
         return {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
@@ -293,16 +273,12 @@ class MBPO:
 
     # Models ----------------------------------------------------------------------------------------------------------
 
-    def changes(self, batch: Transition) -> Tensor:
-        """What the models predict (B, obs_dim + 1)."""
-        return torch.cat((batch.next_obs - batch.obs, batch.reward.unsqueeze(1)), 1)
-
     def fit(self) -> dict[str, Tensor]:
         """Descend each model's negative log likelihood, on samples of its own; then choose the elites."""
         args, models, losses = self.args, self.models, []
         for _ in range(args.model_updates):
             batch = self.real.sample(args.models * args.model_batch_size)
-            target = models.target(self.changes(batch))
+            target = models.target(changes(batch))
             each = (self.actor.normalizer(batch.obs), batch.action, target)
             obs, action, target = (x.unflatten(0, (args.models, -1)) for x in each)
             mean, log_var = models(obs, action)
@@ -314,7 +290,7 @@ class MBPO:
             batch = self.unseen.sample(HELD_OUT_BATCH)
             obs, action = self.actor.normalizer(batch.obs), batch.action
             mean, _ = models(*(x.expand(args.models, *x.shape) for x in (obs, action)))
-            error = (mean - models.target(self.changes(batch))).square().mean(1)  # (models, obs_dim + 1)
+            error = (mean - models.target(changes(batch))).square().mean(1)  # (models, obs_dim + 1)
             models.elites.copy_(error.mean(1).topk(args.elites, largest=False).indices)
             models.fits += 1
             chosen = error[models.elites].mean(0)
@@ -347,28 +323,23 @@ class MBPO:
 
     def update(self) -> dict[str, Tensor]:
         """SAC on a mixture of imagined and real transitions."""
-        metrics = []
+        metrics, real = [], round(self.args.real_ratio * self.args.batch_size)
         for _ in range(self.args.updates):
-            batch = self.mixture()
+            parts = self.real.sample(real), self.imagined.sample(self.args.batch_size - real)
+            batch = Transition(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
             obs, next_obs = (self.actor.normalizer(x) for x in (batch.obs, batch.next_obs))
             metrics.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
         found = {name: torch.stack([row[name] for row in metrics]).mean() for name in metrics[0]}
         return found | {"charts/temperature": self.temperature["log"].detach().exp()}
-
-    def mixture(self) -> Transition:
-        size = self.args.batch_size
-        real = round(self.args.real_ratio * size)
-        parts = self.real.sample(real), self.imagined.sample(size - real)
-        return Transition(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
 
     def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
         """Descend the soft Bellman residual, and let the target critics follow."""
         args = self.args
         with torch.no_grad():
             action, density = self.actor(next_obs)
-            value = self.values(self.targets, next_obs, action).amin(0) - self.temperature["log"].exp() * density
-            target = soft_bellman(batch.reward, value, batch.terminated, args.gamma)
-        values = self.values(self.critics, obs, batch.action)
+            value = q_values(self.targets, next_obs, action).amin(0) - self.temperature["log"].exp() * density
+            target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
+        values = q_values(self.critics, obs, batch.action)
         loss = (values - target).square().mean(1).sum()
         norm = self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -378,22 +349,18 @@ class MBPO:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         action, density = self.actor(obs)
-        value = self.values(self.critics, obs, action).amin(0)
+        value = q_values(self.critics, obs, action).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = action.shape[1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
 
-    def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-        """Each critic's Q(s, a) (2, B)."""
-        inputs = torch.cat((obs, action), -1)
-        return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
-
-def soft_bellman(reward: Tensor, next_soft_value: Tensor, terminated: Tensor, gamma: float) -> Tensor:
-    """r + gamma V(s'), without a value after a failure; where time ran out the episode could have gone on."""
-    return reward + gamma * (1 - terminated) * next_soft_value
+def q_values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
+    """Each critic's Q(s, a) (2, B)."""
+    inputs = torch.cat((obs, action), -1)
+    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
 
 # SE-MBPO --------------------------------------------------------------------------------------------------------------
@@ -443,15 +410,10 @@ def train(args: Args) -> None:
     env = run.make_env(args.num_envs, args.steps)
     mbpo = run.restore(MBPO(args, env))
     explore, collect = run.capture(mbpo.explore, env), run.capture(mbpo.collect, env)
-    learn = [run.capture(part) for part in (mbpo.fit, mbpo.imagine, mbpo.update)]
+    fit, imagine, update = (run.capture(part) for part in (mbpo.fit, mbpo.imagine, mbpo.update))
     for iteration in run:
-        if iteration * args.steps <= args.seed_steps:
-            run.log(explore())
-        else:
-            metrics = collect()
-            for part in learn:
-                metrics |= part()
-            run.log(metrics)
+        seeding = iteration * args.steps <= args.seed_steps
+        run.log(explore() if seeding else collect() | fit() | imagine() | update())
         if run.evaluation_due:
             run.log_evaluation(evaluate(run.eval_env, mbpo.policy))
 

@@ -27,7 +27,7 @@ from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Decay, Fraction, Natural, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of sac_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
@@ -50,29 +50,19 @@ MAX_GRAD_NORM = 100.0  # sac_baseline.py's
 class Args(ParallelFlags):
     """The policy, and SAC. Defaults: the humanoid's."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "critic_lr", "temperature_lr")
+    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "temperature_lr")
 
     policy: Literal["pfpn", "gaussian"] = "pfpn"
     """particles, or one Gaussian"""
     particles: Several = 35
     """particles of each action"""
-    resampling: Literal["weighted", "uniform", "none"] = "weighted"
-    """where dead particles go: to living ones in proportion to their mean weight, to any of them, or nowhere"""
     resampling_interval: Count = 20
     """iterations between resamplings"""
     resampling_noise: NonNegative = 0.1
     """a particle lands within this many standard deviations of the one that it copies"""
     dead: Decay = 0.05
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
-    estimator: Literal["straight-through", "implicit"] = "straight-through"
-    """gradient of a sampled action in the weights; straight-through is biased (docs/pfpn.md)"""
-    density_floor: NonNegative = 0.01
-    """the implicit gradient divides by the action's density, at least by this; 0: no bias, no bound either"""
 
-    iterations: Count = 20_000
-    """learning iterations, a window of all environments and its updates each (per task)"""
-    num_envs: Count = 64
-    """parallel environments N (per task)"""
     horizon: Count = 32
     """control steps of a window (1/60 s each)"""
     hidden: SomeWidths = (512, 256)
@@ -80,9 +70,7 @@ class Args(ParallelFlags):
     critic_hidden: SomeWidths = (512, 256)
     """units of the critics' hidden layers (per task)"""
     lr: Positive = 3e-4
-    """learning rate of the policy (per task)"""
-    critic_lr: Positive = 3e-4
-    """learning rate of the critics (per task)"""
+    """learning rate of policy and critics (per task)"""
     temperature_lr: Positive = 2e-4
     """learning rate of the logarithm of the entropy's weight (per task)"""
     gamma: Fraction = 0.99
@@ -95,14 +83,11 @@ class Args(ParallelFlags):
     """target critics <- (1 - rate) target critics + rate critics, after each update"""
     buffer_size: Count = 1_000_000
     """transitions in the replay buffer, over all environments"""
-    eval_every: Natural = 500
-    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
-    save_every: Natural = 500
-    """save the checkpoint, which holds the replay buffer, every this many iterations (0: only at the end)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, PER_TASK["humanoid"]), strict=True))
-        return values | {"critic_hidden": values["hidden"], "critic_lr": values["lr"]}
+        rare = {"eval_every": 500, "save_every": 500}  # a checkpoint holds the replay buffer
+        return values | rare | {"critic_hidden": values["hidden"]}
 
     def check(self) -> None:
         super().check()
@@ -137,15 +122,12 @@ class Mixture:
         loc, scale = (x.expand_as(self.logits).gather(-1, index).squeeze(-1) for x in pair)
         return loc + scale * noise
 
-    def log_density(self, u: Tensor) -> Tensor:
-        """Of each u by itself (..., m)."""
-        rate = (-self.log_std).exp() * math.sqrt(0.5)
-        z = torch.addcmul(-self.loc * rate, u.unsqueeze(-1), rate)
-        return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
-
     def log_prob(self, u: Tensor) -> Tensor:
         """log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
-        return (self.log_density(u) - log_slope(u)).sum(-1)
+        rate = (-self.log_std).exp() * math.sqrt(0.5)
+        z = torch.addcmul(-self.loc * rate, u.unsqueeze(-1), rate)
+        density = logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
+        return (density - log_slope(u)).sum(-1)
 
 
 def log_slope(u: Tensor) -> Tensor:
@@ -173,7 +155,9 @@ class Head(nn.Module):
             self.linear, self.scale = nn.Linear(inputs, actions), nn.Linear(inputs, actions)
         else:
             loc, log_std = spread(*self.shape)
-            self.linear, self.likeliest = almost_constant(inputs, loc.numel()), Likeliest(*self.shape)
+            self.linear, self.likeliest = nn.Linear(inputs, loc.numel()), Likeliest(*self.shape)
+            nn.init.trunc_normal_(self.linear.weight, std=0.01, a=-0.02, b=0.02)  # almost constant
+            nn.init.zeros_(self.linear.bias)
             self.loc.data.copy_(loc)
             self.log_std = nn.Parameter(log_std)
 
@@ -196,14 +180,6 @@ def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
     gap = loc.diff()
     widest = torch.maximum(F.pad(gap, (1, 0)), F.pad(gap, (0, 1)))
     return loc.float().repeat(actions, 1), widest.log().float().repeat(actions, 1)
-
-
-def almost_constant(inputs: int, outputs: int) -> nn.Linear:
-    """A layer that begins with small weights around zero."""
-    layer = nn.Linear(inputs, outputs)
-    nn.init.trunc_normal_(layer.weight, std=0.01, a=-0.02, b=0.02)
-    nn.init.zeros_(layer.bias)
-    return layer
 
 
 def mlp(inputs: int, hidden: SomeWidths, outputs: int | None = None) -> nn.Sequential:
@@ -234,9 +210,6 @@ class Actor(nn.Module):
         return nn.Sequential(self.normalizer, *self.body, self.head.linear, *likeliest, nn.Tanh())
 
 
-# Estimators: how the gradient of a sampled action reaches the weights -------------------------------------------------
-
-
 def straight_through(mixture: Mixture) -> Tensor:
     """A sample whose gradient in the weights is Eq. 25's: as if the action were linear in the relaxed choice x."""
     noise = torch.randn_like(mixture.logits[..., 0])
@@ -247,15 +220,6 @@ def straight_through(mixture: Mixture) -> Tensor:
     gap = torch.tanh(each) - torch.tanh(u.detach()).unsqueeze(-1)
     gap = gap / log_slope(u.detach()).exp().clamp(min=1e-3).unsqueeze(-1)  # of u, for the same gap of actions
     return u + (gap * (x - x.detach())).sum(-1)
-
-
-def implicit(mixture: Mixture, u: Tensor, floor: float) -> Tensor:
-    """u with its implicit gradient: its cumulative probability F(u) stays, so du = -dF / p(u) (Figurnov 2018)."""
-    z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()
-    cumulative = (mixture.logits.softmax(-1) * torch.special.ndtr(z)).sum(-1)
-    least = floor * log_slope(u).exp()  # the floor is of the action's density
-    density = torch.maximum(mixture.log_density(u).detach().exp(), least)
-    return u - (cumulative - cumulative.detach()) / density
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
@@ -289,9 +253,7 @@ class Resampling(nn.Module):
         weight = self.seen[0] / self.seen[0].sum(-1, keepdim=True)  # where nothing was recorded not a number
         least, largest = self.args.dead / head.shape[1], torch.maximum(weight, self.seen[1])
         dead = weight < least
-        if self.args.resampling != "none":
-            chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
-            self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))
+        self.move(head, optimizer, dead & due, weight.masked_fill(dead, 0.0))
         self.seen *= ~due
         return {
             "particles/dead_mean": dead.to(weight.dtype).mean(),
@@ -341,7 +303,7 @@ class SAC:
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)  # the entropy's weight
         self.optimizer = ClippedAdam(self.actor, MAX_GRAD_NORM, lr=args.lr)
-        self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.critic_lr)
+        self.critic_optimizer = ClippedAdam(self.critics, MAX_GRAD_NORM, lr=args.lr)
         self.temperature_optimizer = ClippedAdam(self.temperature, MAX_GRAD_NORM, lr=args.temperature_lr)
         self.buffer = ReplayBuffer(args.buffer_size, obs_dim, action_dim).to(env.device)
 
@@ -394,7 +356,7 @@ class SAC:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         mixture = self.actor(obs)
-        u = self.differentiable(mixture)
+        u = mixture.sample() if self.args.policy == "gaussian" else straight_through(mixture)
         density = mixture.log_prob(u)
         value = values(self.critics, obs, torch.tanh(u)).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
@@ -402,14 +364,6 @@ class SAC:
         surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
-
-    def differentiable(self, mixture: Mixture) -> Tensor:
-        """A sample with the estimator's gradient."""
-        if self.args.policy == "gaussian":
-            return mixture.sample()
-        if self.args.estimator == "straight-through":
-            return straight_through(mixture)
-        return implicit(mixture, mixture.sample().detach(), self.args.density_floor)
 
 
 def values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:

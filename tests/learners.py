@@ -36,6 +36,15 @@ def run(script: ModuleType, directory: Path, *arguments: object) -> dict[str, An
     return torch.load(directory / "checkpoint.pt", weights_only=True)
 
 
+def assert_resumes(script: ModuleType, directory: Path, flags: str, stop_after: int) -> dict[str, Any]:
+    """A training that stops and goes on ends bitwise as one that does not; returns the checkpoint of `whole`."""
+    whole = run(script, directory / "whole", *flags.split())
+    run(script, directory / "part", *flags.split(), "--stop-after", stop_after)
+    again = "--resume", directory / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet"
+    assert_same(run(script, directory / "part", *again)["modules"], whole["modules"])
+    return whole
+
+
 def read_progress(directory: Path) -> list[dict[str, str]]:
     with (directory / "progress.csv").open(newline="") as file:
         return list(csv.DictReader(file))

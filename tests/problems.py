@@ -1,4 +1,4 @@
-"""A bandit and a linear-quadratic system without simulator, whose soft optima are known."""
+"""SAC's equations, and problems without simulator whose soft optima are known: a bandit, a linear-quadratic system."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.distributions import Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
+
+from diffsim.training import Transition
 
 
 class Problem:
@@ -55,3 +59,53 @@ def assert_system_controlled(policy: Callable[[Tensor], Tensor]) -> None:
     x = torch.linspace(-0.6, 0.6, 13).unsqueeze(1)
     slope = ((x * policy(x).detach()).sum() / x.square().sum()).item()
     assert slope == pytest.approx(-gain, rel=0.2)
+
+
+def assert_squashed_gaussian(actor: Any) -> None:
+    """Of the ant: the density of what it draws is torch's, and its deterministic policy draws without noise."""
+    torch.manual_seed(0)
+    obs = torch.randn(50, 37, dtype=torch.float64)
+    action, density = actor.double()(obs)
+    features = actor.body(obs)
+    log_std = actor.log_std(features).clamp(-5.0, 2.0)
+    expected = TransformedDistribution(Normal(actor.mean(features), log_std.exp()), TanhTransform())
+    torch.testing.assert_close(density, expected.log_prob(action).sum(-1))
+    assert action.std(0).min() > 0.1
+    torch.testing.assert_close(actor.deterministic()(obs), torch.tanh(actor.mean(features)))
+
+
+def assert_soft_updates(learner: Any, monkeypatch: pytest.MonkeyPatch, subset: int | None = None) -> None:
+    """Of the ant, at a temperature of 0.3: the soft Bellman backup, where a failure ends the value, the losses, and the
+    targets. With a subset of the critics (REDQ) the backup takes the least of so many, and the actor the mean of all.
+    """
+    torch.manual_seed(0)
+    learner.temperature["log"].data.fill_(math.log(0.3))
+    obs, next_obs, failed = torch.randn(32, 37), torch.randn(32, 37), (torch.rand(32) < 0.3).float()
+    batch = Transition(obs, torch.rand(32, 8), torch.randn(32), next_obs, failed)
+    critics = len(learner.critics.layers[0].bias)
+
+    def values(networks: Any, obs: Tensor, action: Tensor) -> Tensor:
+        return torch.stack([networks[k](torch.cat((obs, action), 1)).squeeze(1) for k in range(critics)])
+
+    state = torch.get_rng_state()
+    action, density = learner.actor(next_obs)
+    chosen = torch.rand(critics).argsort()[:subset] if subset else slice(None)
+    soft = values(learner.targets, next_obs, action)[chosen].amin(0) - 0.3 * density
+    target = (batch.reward + 0.99 * (1 - failed) * soft).detach()
+    loss = (values(learner.critics, obs, batch.action) - target).square().mean()
+    before = [p.clone() for p in learner.targets.parameters()]
+    torch.set_rng_state(state)
+    torch.testing.assert_close(learner.update_critics(batch, obs, next_obs)["losses/critic"], loss)
+    for old, slow, fast in zip(before, learner.targets.parameters(), learner.critics.parameters(), strict=True):
+        torch.testing.assert_close(slow, old + 0.005 * (fast - old))
+
+    losses: list[Tensor] = []
+    for optimizer in (learner.actor_optimizer, learner.temperature_optimizer):
+        monkeypatch.setattr(optimizer, "step", losses.append)
+    state = torch.get_rng_state()
+    learner.update_actor(obs)
+    torch.set_rng_state(state)
+    action, density = learner.actor(obs)
+    value = values(learner.critics, obs, action)
+    torch.testing.assert_close(losses[0], (0.3 * density - (value.mean(0) if subset else value.amin(0))).mean())
+    torch.testing.assert_close(losses[1], 0.3 * (8 - density.mean().detach()))

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import assert_same, read_progress, refusal, run
+from learners import assert_resumes, read_progress, refusal, run
 from torch import Tensor
 from torch.distributions import Categorical, MixtureSameFamily, Normal
 
@@ -110,19 +110,6 @@ def test_entropy_is_of_the_weights_or_of_the_gaussian() -> None:
 # Gradients of samples -------------------------------------------------------------------------------------------------
 
 
-def test_implicit_gradient_keeps_the_cumulative_probability() -> None:
-    """By definition; so it is that of the quantile, and unbiased. dF/du is the density, so the rest is determined."""
-    inputs = parameters()
-    torch.manual_seed(3)
-    mixture = pfpn_sac.Mixture(*inputs)
-    u = pfpn_sac.implicit(mixture, mixture.sample().detach(), 0.0)
-    logits, loc, log_std = inputs
-    cumulative = (logits.softmax(-1) * torch.special.ndtr((u.unsqueeze(-1) - loc) / log_std.exp())).sum()
-    for total, own in zip(torch.autograd.grad(cumulative, inputs, retain_graph=True), inputs, strict=True):
-        assert total.abs().max() < 1e-12
-        assert torch.autograd.grad(u.sum(), own, retain_graph=True)[0].abs().max() > 0.01
-
-
 def test_straight_through_gradient() -> None:
     """Eq. 25: of locations and scales that of the chosen one; of logits the gaps times the gradient of the choice."""
     inputs = parameters()
@@ -141,32 +128,6 @@ def test_straight_through_gradient() -> None:
     slope = (1 - action.square()).unsqueeze(-1) * hot
     torch.testing.assert_close(gradients[1:], (slope, slope * inputs[2].exp() * noise))
     torch.testing.assert_close(gradients[0].sum(-1), torch.zeros(M, dtype=torch.float64))
-
-
-def test_straight_through_weights_are_biased() -> None:
-    """Of actions -1 and 1 E[a^2] does not depend on the weights; the estimate has mean 4 E[x1 x2 sign(a)]."""
-    count, p = 100_000, 0.8
-    log_odds = math.log(p / (1 - p))
-    logits = torch.tensor([0.0, log_odds], dtype=torch.float64).expand(count, 1, 2).clone().requires_grad_()
-    loc = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
-    torch.manual_seed(0)
-    u = pfpn_sac.straight_through(pfpn_sac.Mixture(logits, loc, torch.full_like(loc, -20)))
-    (gradient,) = torch.autograd.grad((torch.tanh(u) / math.tanh(1)).square().sum(), logits)
-    y = torch.linspace(-40, 40, 400_001, dtype=torch.float64)
-    both = y.sigmoid() * (-y).sigmoid()  # x1 x2 where the logistic noise puts their log odds at y
-    expected = 4 * torch.trapezoid(both * y.sign() * (y - log_odds).sigmoid() * (log_odds - y).sigmoid(), y).item()
-    mean, error = gradient[:, 0, 1].mean().item(), gradient[:, 0, 1].std().item() / math.sqrt(count)
-    assert abs(mean - expected) < 4 * error and expected > 50 * error
-
-
-def test_the_density_floor_bounds_the_implicit_gradient() -> None:
-    """Between two far peaks, where the density is almost zero."""
-    logits = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
-    u, slopes = torch.zeros(1, dtype=torch.float64), []
-    for floor in (0.0, 0.01):
-        mixture = pfpn_sac.Mixture(logits, torch.tensor([[-1.0, 1.0]]), torch.full((1, 2), -2.0))
-        slopes += torch.autograd.grad(torch.tanh(pfpn_sac.implicit(mixture, u, floor)), logits)
-    assert slopes[0].abs().max() > 1e6 and slopes[1].abs().max() == pytest.approx(0.25 / 0.01, rel=1e-3)
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
@@ -197,11 +158,12 @@ def kill(own: Any, places: list[tuple[int, int]], bias: float = -1e4) -> None:
 DEAD = [(0, 1), (0, 2), (0, 3), (0, 4), (2, 0), (2, 5)]
 
 
-@each_script
-@pytest.mark.parametrize("resampling", ["weighted", "uniform"])
-def test_resampling_leaves_the_policy_as_it_is(resampling: str, script: Any) -> None:
+@pytest.mark.parametrize(
+    ("script", "flags"), [(pfpn, ""), (pfpn, "--resampling uniform"), (pfpn_sac, "")], ids=["ppo", "uniform", "sac"]
+)
+def test_resampling_leaves_the_policy_as_it_is(script: Any, flags: str) -> None:
     """The theorem (Eq. 10), with several dead particles on one target; what is not involved stays bitwise."""
-    own, moving, optimizer, features = head("--resampling", resampling, script=script)
+    own, moving, optimizer, features = head(*flags.split(), script=script)
     kill(own, DEAD)
     u = 2 * torch.randn(50, M, dtype=torch.float64)
     before = own(features)
@@ -271,16 +233,17 @@ def test_targets_are_drawn_by_weight_and_copies_land_around_them(script: Any) ->
 
 
 @pytest.mark.parametrize(
-    ("case", "flags", "dead"),
+    ("script", "case", "flags", "dead"),
     [
-        ("not due", "--resampling-interval 3", 6),
-        ("nothing recorded", "", 0),
-        ("none dead", "", 0),
-        ("switched off", "--resampling none", 6),
+        (pfpn, "not due", "--resampling-interval 3", 6),
+        (pfpn, "nothing recorded", "", 0),
+        (pfpn, "none dead", "", 0),
+        (pfpn, "switched off", "--resampling none", 6),
+        (pfpn_sac, "not due", "--resampling-interval 3", 6),
+        (pfpn_sac, "nothing recorded", "", 0),
     ],
 )
-@each_script
-def test_nothing_is_moved(case: str, flags: str, dead: int, script: Any) -> None:
+def test_nothing_is_moved(script: Any, case: str, flags: str, dead: int) -> None:
     own, moving, optimizer, features = head(*flags.split(), script=script)
     if case != "none dead":
         kill(own, DEAD)
@@ -389,11 +352,10 @@ def test_ppo_bandit_stays_on_both_peaks_with_entropy() -> None:
     assert min(masses(learner.actor)) > 0.2 and learner.resampling.moved > 0
 
 
-@pytest.mark.parametrize("estimator", ["implicit", "straight-through"])
-def test_sac_bandit_has_its_soft_optimum(estimator: str) -> None:
+def test_sac_bandit_has_its_soft_optimum() -> None:
     """The policy proportional to exp(r / alpha), which has two peaks of unequal height."""
-    flags = f"--estimator {estimator} --horizon 8 --num-envs 16 --minibatch-size 128 --critic-hidden 64 --particles 15"
-    flags += " --lr 4e-3 --critic-lr 4e-3 --temperature-lr 1e-9 --target-rate 0.05 --buffer-size 5000"
+    flags = "--horizon 8 --num-envs 16 --minibatch-size 128 --critic-hidden 64 --particles 15"
+    flags += " --lr 4e-3 --temperature-lr 1e-9 --target-rate 0.05 --buffer-size 5000"
 
     def reward(_: Tensor, action: Tensor) -> Tensor:
         return 2 * (action + 0.6).square() - 2 * torch.cos(5 * (action + 0.6))
@@ -452,17 +414,14 @@ SMALL += " --hidden 8 --eval-episodes 1 --resampling-interval 1 --dead 0.999 --l
 def test_a_run_resumes_bitwise_with_its_particles(script: Any, tmp_path: Path) -> None:
     """Of a threshold so high that particles are moved on the way. Its deterministic policy stands alone."""
     own = "--log-particles 0" if script is pfpn else "--buffer-size 100"
-    flags = f"{SMALL} {own} --particles 8 --iterations 6".split()
-    whole = run(script, tmp_path / "whole", *flags)
-    run(script, tmp_path / "part", *flags, "--stop-after", 3)
-    again = "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet"
-    assert_same(run(script, tmp_path / "part", *again)["modules"], whole["modules"])
+    flags = f"{SMALL} {own} --particles 8 --iterations 6"
+    whole = assert_resumes(script, tmp_path, flags, 3)
     last = {name: float(value or "nan") for name, value in read_progress(tmp_path / "whole")[-1].items()}
     assert last["particles_moved"] == whole["modules"]["resampling"]["moved"] > 0
     if script is pfpn:
         assert sum(last[f"particles_weight_0_{i}"] for i in range(8)) == pytest.approx(1, abs=1e-4)
 
-    actor = script.Actor(parse(script.Args, flags), 5, 1)
+    actor = script.Actor(parse(script.Args, flags.split()), 5, 1)
     actor.load_state_dict(whole["modules"]["actor"])
     obs = torch.randn(20, 5)
     mixture = actor(actor.normalizer(obs))

@@ -7,15 +7,18 @@ from typing import Any
 
 import pytest
 import torch
-from learners import assert_same, refusal, run
-from problems import Problem, assert_bandit_learnt, assert_system_controlled
-from torch import Tensor
-from torch.distributions import Normal, TransformedDistribution
-from torch.distributions.transforms import TanhTransform
+from learners import assert_resumes, refusal
+from problems import (
+    Problem,
+    assert_bandit_learnt,
+    assert_soft_updates,
+    assert_squashed_gaussian,
+    assert_system_controlled,
+)
 
 import diffsim
 import sac_baseline as sac
-from diffsim.training import Transition, parse
+from diffsim.training import parse
 
 FLAGS = "--env ant --device cpu --hidden 16 --num-envs 3 --steps 4 --batch-size 32 --seed-steps 0"
 
@@ -26,24 +29,7 @@ def build(*arguments: str, env: Any = None) -> sac.SAC:
 
 
 def test_density_is_that_of_the_squashed_gaussian() -> None:
-    torch.manual_seed(0)
-    actor = build().actor.double()
-    obs = torch.randn(50, 37, dtype=torch.float64)
-    action, density = actor(obs)
-    features = actor.body(obs)
-    log_std = actor.log_std(features).clamp(*sac.LOG_STD)
-    expected = TransformedDistribution(Normal(actor.mean(features), log_std.exp()), TanhTransform())
-    torch.testing.assert_close(density, expected.log_prob(action).sum(-1))
-    assert action.std(0).min() > 0.1
-    torch.testing.assert_close(actor.deterministic()(obs), torch.tanh(actor.mean(features)))
-
-
-def test_soft_bellman_backup() -> None:
-    """A failure ends the value; where time ran out the episode could have gone on."""
-    reward, value = torch.tensor([1.0, 2.0]), torch.tensor([10.0, 10.0])
-    torch.testing.assert_close(
-        sac.soft_bellman(reward, value, torch.tensor([0.0, 1.0]), 0.9), torch.tensor([10.0, 2.0])
-    )
+    assert_squashed_gaussian(build().actor)
 
 
 def test_time_limits_are_bootstrapped_and_failures_are_not() -> None:
@@ -61,41 +47,9 @@ def test_time_limits_are_bootstrapped_and_failures_are_not() -> None:
     assert (rows.next_obs[:2] != next_obs[:2]).any(1).all() and torch.equal(rows.next_obs[2], next_obs[2])
 
 
-@pytest.mark.parametrize("redq", [False, True])
-def test_targets_and_losses(redq: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch.manual_seed(0)
-    learner = build(*("--critics 4 --critic-subset 2" if redq else "").split(), "--initial-temperature", "0.3")
-    batch = Transition(
-        torch.randn(32, 37), torch.rand(32, 8), torch.randn(32), torch.randn(32, 37), (torch.rand(32) < 0.3).float()
-    )
-    state = torch.get_rng_state()
-    action, density = learner.actor(batch.next_obs)
-    order = torch.rand(4).argsort()[:2] if redq else torch.arange(2)
-    values = torch.stack(
-        [learner.targets[k](torch.cat((batch.next_obs, action), 1)).squeeze(1) for k in range(learner.args.critics)]
-    )
-    target = batch.reward + 0.99 * (1 - batch.terminated) * (values[order].amin(0) - 0.3 * density)
-    own = torch.stack(
-        [learner.critics[k](torch.cat((batch.obs, batch.action), 1)).squeeze(1) for k in range(learner.args.critics)]
-    )
-    before = [p.clone() for p in learner.targets.parameters()]
-    torch.set_rng_state(state)
-    metrics = learner.update_critics(batch, batch.obs, batch.next_obs)
-    torch.testing.assert_close(metrics["losses/critic"], (own - target.detach()).square().mean())
-    for old, slow, fast in zip(before, learner.targets.parameters(), learner.critics.parameters(), strict=True):
-        torch.testing.assert_close(slow, old + 0.005 * (fast - old))
-
-    losses: list[Tensor] = []
-    monkeypatch.setattr(learner.actor_optimizer, "step", losses.append)
-    monkeypatch.setattr(learner.temperature_optimizer, "step", losses.append)
-    state = torch.get_rng_state()
-    learner.update_actor(batch.obs)
-    torch.set_rng_state(state)
-    action, density = learner.actor(batch.obs)
-    values = learner.values(learner.critics, batch.obs, action)
-    value = values.mean(0) if redq else values.amin(0)
-    torch.testing.assert_close(losses[0], (0.3 * density - value).mean())
-    torch.testing.assert_close(losses[1], 0.3 * (8 - density.mean().detach()))
+@pytest.mark.parametrize("flags, subset", [("", None), ("--critics 4 --critic-subset 2", 2)], ids=["sac", "redq"])
+def test_targets_and_losses(flags: str, subset: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_soft_updates(build(*flags.split()), monkeypatch, subset)
 
 
 def learnt(bandit: bool, temperature: float, iterations: int) -> sac.SAC:
@@ -128,10 +82,7 @@ def test_skipped_updates_of_every_optimizer_are_counted(monkeypatch: pytest.Monk
 def test_a_run_resumes_bitwise_with_its_buffer(tmp_path: Path) -> None:
     flags = "--env cartpole --num-envs 4 --steps 8 --seed-steps 16 --batch-size 16 --hidden 16 --iterations 8 --quiet"
     flags += " --eval-episodes 2 --device cpu --threads 1 --buffer-size 100"
-    whole = run(sac, tmp_path / "whole", *flags.split())
-    run(sac, tmp_path / "part", *flags.split(), "--stop-after", 5)
-    part = run(sac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
-    assert_same(part["modules"], whole["modules"])
+    whole = assert_resumes(sac, tmp_path, flags, 5)
     assert whole["modules"]["buffer"]["_extra_state"].shape[0] == 100
 
 
