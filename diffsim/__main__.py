@@ -7,7 +7,7 @@ import platform
 import runpy
 import shutil
 import sys
-import warnings
+import threading
 from collections.abc import Callable, Sequence
 from importlib.metadata import distributions, version
 from importlib.resources import files
@@ -19,9 +19,10 @@ import warp as wp
 from tyro.conf import Positional
 
 from diffsim import TASKS, SceneError, load_scene, startup
+from diffsim.robot.constraint import check_soft, constrained
 from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
-from diffsim.tasks import find_task
+from diffsim.tasks import Contact, find_task
 from diffsim.training import command, evaluate, export_onnx, export_policy, fail, load_policy, make_policy_env
 from diffsim.view import render
 
@@ -113,15 +114,32 @@ def view() -> None:
     """Show a run as video, page, window or plot: diffsim view runs/<run> --web ant.html, and --help for its flags."""
 
 
-def check(robot: Positional[Path]) -> None:
-    """Say what of an MJCF file is used, approximated and refused; exit code 1 if it is refused."""
+def check(robot: Positional[Path], contact: Contact = "mujoco", seconds: float = 20.0) -> None:
+    """Say what of an MJCF file is used, approximated and refused; exit code 1 if it is refused.
+
+    Args:
+        robot: the file.
+        contact: that of your task; soft contact needs constants that the file names.
+        seconds: how long to read it at most: a file of few lines may hold millions of bodies.
+    """
+    alarm = threading.Timer(seconds, _give_up, (robot, seconds))
+    alarm.daemon = True
+    alarm.start()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the report has them all
-            print(report_robot(load_scene(robot)))
+        scene = load_scene(robot)
+        check_soft(scene) if contact == "soft" else constrained(scene, 1e-3)
+        print(report_robot(scene, contact))
     except SceneError as error:
         print(f"Cannot be simulated.\n\n{error}")
         sys.exit(1)
+    finally:
+        alarm.cancel()
+
+
+def _give_up(robot: Path, seconds: float) -> None:
+    """MuJoCo's compiler heeds no signal."""
+    print(f"Cannot be simulated.\n\n{robot}: it is not read in {seconds:g} s; --seconds allows more", flush=True)
+    os._exit(1)
 
 
 def export(checkpoint: Positional[Path], output: Positional[Path]) -> None:

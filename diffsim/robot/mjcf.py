@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import os
-import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +15,12 @@ from numpy.typing import NDArray
 from diffsim.robot.contact import contact_points, ground_pairs
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, numeric, servos
 from diffsim.robot.refuse import beyond, obstacles
-from diffsim.robot.report import approximations, slowness
+from diffsim.robot.report import approximations
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
 
 
 def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) -> Scene:
-    """Read an MJCF file or copy a model; a warning tells of a robot that is slow.
+    """Read an MJCF file or copy a model.
 
     Raises:
         SceneError: the file is missing or broken, or holds elements that are not simulated (the message names all).
@@ -33,7 +32,7 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     elif (file := Path(path)).is_file():
         try:
             model = mujoco.MjModel.from_xml_path(str(file))
-        except ValueError as error:
+        except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             raise SceneError(f"robot file {str(path)!r} is not a valid MJCF: {' '.join(str(error).split())}") from error
     else:
         raise SceneError(f"robot file {str(path)!r} does not exist")
@@ -41,8 +40,6 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     _refuse(file, obstacles(model))
     scene = _Reader(model, file).scene()
     _refuse(file, beyond(scene))
-    for sentence in slowness(scene):
-        warnings.warn(f"{file.name}: {sentence}", stacklevel=2)
     return dataclasses.replace(scene, approximations=approximations(scene))
 
 

@@ -8,11 +8,10 @@ import mujoco
 import numpy as np
 
 from diffsim.robot.contact import HULL_POINTS, base_geoms, ground_pairs, pair_law, self_pairs
-from diffsim.robot.elements import label, listed, motors
+from diffsim.robot.elements import label, listed, motors, servos
 from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
 
 Kind = mujoco.mjtObj
-MANY_POINTS = 1000
 
 # How a geom's points stand for it, by its type
 ROUGH_SHAPES = {
@@ -22,38 +21,34 @@ ROUGH_SHAPES = {
 }
 
 
-def report(scene: Scene) -> str:
-    """A page of text about a scene."""
+def report(scene: Scene, contact: str) -> str:
+    """A page of text about a scene on "soft" or "mujoco" contact."""
     sections = [
         (f"{scene.name}: can be simulated", list(_parts(scene))),
-        ("constants of soft contact and limits", list(_constants(scene))),
+        ("constants of soft contact and limits", list(_constants(scene)) if contact == "soft" else []),
         ("approximated", [f"- {sentence}" for sentence in scene.approximations]),
+        ("perhaps a mistake", [f"- {sentence}" for sentence in _mistakes(scene)]),
     ]
     return "\n\n".join("\n  ".join([title, *lines]) for title, lines in sections if lines)
 
 
 def _parts(scene: Scene) -> Iterator[str]:
     m = scene.mj_model
-    moving = sorted(
-        f"{np.count_nonzero(m.jnt_type == kind)} {name.removeprefix('mjJNT_').lower()}"
-        for name, kind in mujoco.mjtJoint.__members__.items()
-        if (m.jnt_type == kind).any()
-    )
-    limited = np.count_nonzero(np.isfinite(scene.upper))
+    kinds = sorted((name.removeprefix("mjJNT_").lower(), kind) for name, kind in mujoco.mjtJoint.__members__.items())
+    counts = [f"{n} {name}" for name, kind in kinds if (n := np.count_nonzero(m.jnt_type == kind))]
     muscles = len(np.unique(scene.segment_muscle))
-    shares = {"motors": scene.nu - muscles, "muscles": muscles}
+    ground = f"ground at z = {scene.ground_height:g} m" if scene.ncontact else "no ground that it may touch"
     yield f"links      {scene.nlink - 1} of one degree of freedom, base {'floating' if scene.floating else 'fixed'}"
-    yield f"joints     {', '.join(moving)}; {limited} limited"
+    yield f"joints     {', '.join(counts)}; {np.count_nonzero(np.isfinite(scene.upper))} limited"
     yield f"state      nq {scene.nq}, nv {scene.nv}"
     yield f"mass       {scene.mass.sum():.4g} kg"
-    yield f"controls   {', '.join(f'{n} {what}' for what, n in shares.items() if n) or 'none'}"
-    ground = f"ground at z = {scene.ground_height:g} m" if scene.ncontact else "no ground that it may touch"
+    yield f"controls   {scene.nu - muscles} motors, {muscles} muscles"
     yield f"contact    {scene.ncontact} points, {ground}"
     yield f"features   {', '.join(sorted(scene.features))}"
 
 
 def _constants(scene: Scene) -> Iterator[str]:
-    """Those that the file names."""
+    """Those that soft contact needs."""
     for name, unit in PENALTY_CONSTANTS.items():
         value = np.max(getattr(scene, name))
         if not np.isnan(value) and (scene.ncontact or name.endswith("_limit")):
@@ -62,13 +57,7 @@ def _constants(scene: Scene) -> Iterator[str]:
 
 def approximations(scene: Scene) -> tuple[str, ...]:
     """What is simulated only roughly, a sentence for each."""
-    return tuple(sentence for check in (slowness, _self_contact, _ground, _actuators) for sentence in check(scene))
-
-
-def slowness(scene: Scene) -> Iterator[str]:
-    """What a user should hear at once."""
-    if scene.ncontact > MANY_POINTS:
-        yield f"{scene.ncontact} contact points are slow: each takes part in every substep."
+    return tuple(sentence for check in (_self_contact, _ground, _actuators) for sentence in check(scene))
 
 
 def _self_contact(scene: Scene) -> Iterator[str]:
@@ -78,10 +67,11 @@ def _self_contact(scene: Scene) -> Iterator[str]:
     names = " and ".join(label(m, Kind.mjOBJ_GEOM, int(geom)) for geom in (pairs[0][0], pairs[0][1][0]))
     number = sum(len(others) for _, others in pairs)
     count = f"{number} pairs of geoms, such as" if number > 1 else "the geoms"
-    base = any(base_geoms(m)[[a, *others]].any() for a, others in pairs)
+    base = base_geoms(m)
+    own = any(base[[a, *others]].any() for a, others in pairs)
     yield (
         f"The robot's parts pass through each other: {count} {names}, would collide in MuJoCo."
-        + " Geoms of its fixed base are among them." * base
+        + " Geoms of its fixed base are among them." * own
     )
 
 
@@ -102,3 +92,19 @@ def _actuators(scene: Scene) -> Iterator[str]:
     if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         yield "A control sets the activation of a <muscle> at once."
         yield "A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves."
+
+
+def _mistakes(scene: Scene) -> Iterator[str]:
+    """Of position servos, whose targets MuJoCo's compiler does not convert from degrees."""
+    m, joints = scene.mj_model, scene.mj_model.actuator_trnid[:, 0]
+    holds = servos(m) & (m.actuator_ctrllimited != 0) & (m.actuator_biasprm[:, 1] < 0) & (m.actuator_gear[:, 0] != 0)
+    for a in np.flatnonzero(holds & (m.jnt_limited[joints] != 0)).tolist():
+        low, high = m.jnt_range[joints[a]]
+        scale = -m.actuator_gainprm[a, 0] / (m.actuator_biasprm[a, 1] * m.actuator_gear[a, 0])
+        targets = m.actuator_ctrlrange[a] * scale
+        if np.abs(targets - targets.clip(low, high)).max() > high - low:
+            name, least, most = label(m, Kind.mjOBJ_ACTUATOR, a), *sorted(targets)
+            yield (
+                f"Actuator {name} has targets of {least:.4g} to {most:.4g}, far outside its joint's range of {low:.4g} "
+                f"to {high:.4g}; a ctrlrange is in radians or metres."
+            )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -17,36 +20,68 @@ ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
 def test_report_of_a_robot():
-    text = report(load_scene(ASSETS / "hopper.xml"))
+    text = report(load_scene(ASSETS / "hopper.xml"), "mujoco")
     for line in (
         "hopper: can be simulated",
         "  links      6 of one degree of freedom, base fixed",
-        "  joints     2 slide, 4 hinge; 3 limited",
-        "  controls   3 motors",
+        "  joints     4 hinge, 2 slide; 3 limited",
+        "  controls   3 motors, 0 muscles",
         "  contact    6 points, ground at z = 0 m",
         "  - The robot's parts pass through each other: 3 pairs of geoms, such as 'torso_geom' and 'leg_geom'",
     ):
         assert line in text
-    assert "constants" not in text and "no ground that it may touch" in report(parse(pendulum(world="")))
-
-
-def test_the_constants_of_the_file_are_told():
-    text = report(task_scene("ant"))
-    assert [line.split()[:2] for line in text.split("limits\n")[1].splitlines()[:6]] == [
+    assert "no ground that it may touch" in report(parse(pendulum(world="")), "mujoco")
+    assert "constants" not in report(task_scene("ant"), "mujoco")
+    lines = report(task_scene("ant"), "soft").split("limits\n")[1].splitlines()
+    assert [line.split()[:2] for line in lines] == [
         *(["k_n", "4e+04"], ["k_d", "1e+04"], ["k_t", "3000"], ["mu", "0.75"], ["k_limit", "1000"], ["d_limit", "0"])
     ]
 
 
 def test_command(tmp_path, capsys):
-    good, bad = ASSETS / "ant.xml", tmp_path / "bad.xml"
-    bad.write_text(pendulum('damping="-1"'))
-    for path, code in ((good, 0), (tmp_path / "nowhere.xml", 1), (bad, 1)):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) if code else nullcontext() as exit:
-            main(["check", str(path)])
-        printed = capsys.readouterr().out
-        assert (exit.value.code if exit else 0) == code and ("ant: can be simulated" in printed) == (path == good)
-    assert printed.startswith("Cannot be simulated.") and "joint 'hinge': damping must" in printed
+    """On the contact of an own robot, MuJoCo's, unless the other one is asked for."""
+    (tmp_path / "bad.xml").write_text(pendulum('damping="-1"'))
+    (tmp_path / "loss.xml").write_text(pendulum('frictionloss="1"'))
+    for words, answer in (
+        (f"{ASSETS / 'ant.xml'}", "ant: can be simulated"),
+        (f"{tmp_path / 'loss.xml'}", "loss: can be simulated"),
+        (f"{tmp_path / 'loss.xml'} --contact soft", "Cannot be simulated.\n\nloss: soft contact has no frictionloss"),
+        (f"{tmp_path / 'bad.xml'}", "Cannot be simulated.\n\nbad.xml: joint 'hinge': damping must not be negative"),
+        (f"{tmp_path / 'nowhere.xml'}", "Cannot be simulated.\n\nrobot file "),
+    ):
+        refused = answer.startswith("Cannot")
+        with pytest.raises(SystemExit, match="1") if refused else nullcontext():
+            main(["check", *words.split()])
+        assert capsys.readouterr().out.startswith(answer)
+
+
+def test_a_file_that_takes_forever_is_given_up(tmp_path):
+    """A pipe in a mesh's place; MuJoCo's compiler heeds no signal while it waits."""
+    os.mkfifo(tmp_path / "pipe.stl")
+    file = tmp_path / "robot.xml"
+    file.write_text(
+        robot(
+            '<body><freejoint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="pipe.stl"/></asset>'
+        )
+    )
+    words = [sys.executable, "-m", "diffsim", "check", str(file), "--seconds", "0.1"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and done.stderr == ""
+    assert done.stdout == f"Cannot be simulated.\n\n{file}: it is not read in 0.1 s; --seconds allows more\n"
+
+
+def test_targets_in_degrees_are_perhaps_a_mistake():
+    """The compiler converts the joint's range and not the servo's; what it gears is the target."""
+    for numbers, told in (
+        ('ctrlrange="-60 60"', True),
+        ('ctrlrange="-1.5 1"', False),
+        ('ctrlrange="-60 60" gear="50"', False),
+        ('ctrlrange="-1 1" gear="-0.02"', True),
+        ("", False),
+    ):
+        act = f'<actuator><position name="m" joint="hinge" kp="5" {numbers}/></actuator>'
+        assert ("Actuator 'm' has targets of" in report(parse(pendulum('range="-1 1"', rest=act)), "mujoco")) == told
+        assert "perhaps a mistake" not in report(parse(pendulum(rest=act)), "mujoco")
 
 
 @pytest.mark.parametrize(
