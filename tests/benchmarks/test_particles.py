@@ -31,16 +31,3 @@ def test_each_policy_is_a_line_of_the_table(tmp_path: Path, monkeypatch: pytest.
 def test_the_page_has_the_table_of_the_csv_file() -> None:
     rows = read_csv(RESULTS / "cpu" / "bandit.csv")
     assert markdown(particles.table(rows)) in (DOCS / "pfpn.md").read_text()
-
-
-def test_resampling_changes_a_policy_by_little_more_than_the_weight_that_was_dead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without noise by at most the dead weight, n thresholds; a large noise shows."""
-    monkeypatch.setattr(particles, "CASES", {"0": (150,)})
-    monkeypatch.setattr(particles, "NOISES", (0.0, 3.0))
-    particles.main(particles.Args(output=tmp_path, seeds=(1,), parts=("noise",)))
-    still, noisy = read_csv(tmp_path / "resampling_noise.csv")
-    assert int(still["moved"]) == int(noisy["moved"]) > 0
-    change = float(still["total variation"])
-    assert 0 < change <= int(still["moved"]) * 0.05 / 35 and float(noisy["total variation"]) > 2 * change
