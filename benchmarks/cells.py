@@ -11,7 +11,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, pstdev
@@ -21,12 +21,10 @@ import common
 import fingerprints
 import numpy as np
 import tables
-from common import Line, Panel, plot
 from groups import Cells
 from tables import ROOT, read_csv
 
 import diffsim
-from diffsim.sim.launcher import available_cores
 from diffsim.training import checkpoint, fail
 from diffsim.training.evaluation import FINER
 
@@ -78,13 +76,9 @@ class Case(NamedTuple):
 
 
 class Runner:
-    def __init__(self, args: ScriptFlags, jobs: int = 1) -> None:
-        self.args, self.jobs = args, jobs
+    def __init__(self, args: ScriptFlags) -> None:
+        self.args = args
         self.stop_at = math.inf if args.time_limit is None else time.monotonic() + args.time_limit
-
-    @property
-    def time_is_up(self) -> bool:
-        return time.monotonic() >= self.stop_at
 
     def train(self, case: Case, until: int = 0) -> bool:
         """From where it stands to an iteration, 0: the last; whether it got there."""
@@ -111,16 +105,15 @@ class Runner:
 
     def _call(self, case: Case, *arguments: object) -> bool:
         """Whether the script came to its end. It is stopped, and saves, when the time is up."""
-        if self.time_is_up:
+        left = self.stop_at - time.monotonic()
+        if left <= 0:
             return False
         command = [sys.executable, str(ROOT / f"{case.script}.py"), *map(str, arguments), "--device", self.args.device]
-        if self.jobs > 1:
-            command += ["--threads", str(max(1, available_cores() // self.jobs))]
         case.folder.mkdir(parents=True, exist_ok=True)
         with (case.folder / "output.txt").open("a") as output:
             process = subprocess.Popen(command, stdout=output, stderr=output)
             try:
-                process.wait(None if self.stop_at == math.inf else self.stop_at - time.monotonic())
+                process.wait(None if left == math.inf else left)
             except subprocess.TimeoutExpired:
                 process.terminate()
                 process.wait()
@@ -142,14 +135,10 @@ class Cell(NamedTuple):
 
     @property
     def groups(self) -> list[Group]:
-        return [
-            group
-            for group in GROUPS.values()
-            if self.machine == group.machine
-            and self.learner in group.learners
-            and self.task in group.tasks
-            and self.seed <= group.seeds
-        ]
+        every = (
+            group for group in GROUPS.values() if (group.machine, True) == (self.machine, self.seed <= group.seeds)
+        )
+        return [group for group in every if self.learner in group.learners and self.task in group.tasks]
 
     @property
     def timed(self) -> bool:
@@ -213,15 +202,10 @@ def curve(rows: Sequence[Mapping[str, str]]) -> Curve:
     return {name: np.array([float(row.get(name) or "nan") for row in rows]) for name in COLUMNS}
 
 
-def passing(runs: Sequence[Curve], target: float, x: str) -> list[float]:
-    """Where on x, of each run, the return of training first passes the target; inf where it does not."""
-    first = (np.flatnonzero(run["return"] >= target)[:1] for run in runs)
-    return [float(run[x][at[0]]) if len(at) else math.inf for run, at in zip(runs, first, strict=True)]
-
-
-def timed(runs: Sequence[Curve]) -> list[Curve]:
-    """The runs that had the machine to themselves. The csv files have no seconds of the others."""
-    return [run for run in runs if not np.isnan(run["seconds"]).any()]
+def passing(run: Curve, target: float, x: str) -> float:
+    """Where on x the return of training first passes the target; inf where it does not."""
+    at = np.flatnonzero(run["return"] >= target)
+    return float(run[x][at[0]]) if len(at) else math.inf
 
 
 def spread(values: Sequence[float]) -> str:
@@ -242,21 +226,20 @@ def counts(row: Cells, timed: bool) -> bool:
 
 
 class Pace(NamedTuple):
-    """Of a training that has its machine alone."""
+    """Of a training that has its machine alone [s]."""
 
-    start: float  # s, what the first iterations take longer than the others
-    iteration: float  # s
+    start: float  # what the first iterations take longer than the others
+    iteration: float
 
-    def seconds(self, iterations: float) -> float:
+    def __call__(self, iterations: float) -> float:
         return self.start + self.iteration * iterations
 
 
 def paces(directory: Path) -> dict[tuple[str, str], Pace]:
     """By learner and task."""
-    rows = (
-        row for row in read_csv(directory / "pace.csv") if same_numbers(row["revision"], row["learner"], row["task"])
-    )
-    return {(row["learner"], row["task"]): Pace(*(float(row[f"{x} (s)"]) for x in Pace._fields)) for row in rows}
+    keys = {(row["learner"], row["task"]): row for row in read_csv(directory / "pace.csv")}
+    own = {key: row for key, row in keys.items() if same_numbers(row["revision"], *key)}
+    return {key: Pace(*(float(row[f"{name} (s)"]) for name in Pace._fields)) for key, row in own.items()}
 
 
 def read_cells(directory: Path) -> list[Cells]:
@@ -264,44 +247,13 @@ def read_cells(directory: Path) -> list[Cells]:
     rows, known = read_csv(directory / "cells.csv"), paces(directory)
     for row in rows:
         if (pace := known.get((row["learner"], row["task"]))) and not row["training (s)"]:
-            row["training (s)"] = str(pace.seconds(float(row["iterations"])))
+            row["training (s)"] = str(pace(float(row["iterations"])))
             each = float(row["control steps"]) / float(row["iterations"])
             for name in [name for name in row if name.startswith("control_steps to") and row[name]]:
-                passed = pace.seconds(float(row[name]) / each)
-                row[name.replace("control_steps", "seconds")] = str(passed)
+                row[name.replace("control_steps", "seconds")] = str(pace(float(row[name]) / each))
     return rows
 
 
 def done(rows: Sequence[Cells], cell: Cell) -> bool:
     own = [row for row in rows if (row["learner"], row["task"], row["seed"]) == (*cell[1:3], str(cell.seed))]
     return any(counts(row, cell.timed) for row in own)
-
-
-def draw(path: Path, learners: Sequence[str], tasks: Sequence[str], of: Callable[[str, str], list[Curve]]) -> None:
-    """Each seed (thin) and the median (bold) against control steps and seconds, on log axes if ends lie far apart.
-
-    Args:
-        of: the curves of a learner on a task.
-    """
-    grid = list[list[Panel]]()
-    for x, text in (("control_steps", "control steps"), ("seconds", "seconds of training")):
-        panels = list[Panel]()
-        for env in tasks:
-            lines, begins, ends, published = list[Line](), list[float](), list[float](), RETURNS[env].published
-            for k, learner in enumerate(learners):
-                runs = of(learner, env)
-                if runs := timed(runs) if x == "seconds" else runs:
-                    shared = np.geomspace(max(run[x][0] for run in runs), min(run[x][-1] for run in runs), 400)
-                    middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
-                    lines += [Line(run[x], run["return"], f"C{k}-", width=0.5) for run in runs]
-                    lines.append(Line(shared, middle, f"C{k}-", learner, width=2))
-                    begins.append(shared[0])
-                    ends.append(shared[-1])
-            for learner in (learner for learner in learners if ends and learner in published):
-                value, style = [published[learner]] * 2, f"C{learners.index(learner)}--"
-                lines.append(Line((min(begins), max(ends)), value, style, f"{learner}, published", 0.8))
-            log = "x" if ends and max(ends) > 10 * min(ends) else ""
-            panels.append(Panel(lines, env, text, "" if panels else "return of training episodes", log))
-        if any(panel.lines for panel in panels):  # not where all runs shared their machine, and have no seconds
-            grid.append(panels)
-    plot(path, grid, (3.4, 2.9) if len(tasks) > 1 else (6.0, 3.8))

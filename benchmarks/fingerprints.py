@@ -72,12 +72,10 @@ def depends(command: str) -> set[str]:
     """The fingerprints on which a training's numbers depend; its learner's, its task's, and those of its flags."""
     script, *flags = command.split()
     task = flags[flags.index("--env") + 1] if "--env" in flags else ""
-    found = {
-        script,
-        f"{script}_{task}",
-        {"hopper": "shac", "go1": "joystick", "go2": "joystick", "g1": "joystick"}.get(task, task),
+    physics = {"hopper": "shac"} | dict.fromkeys(("go1", "go2", "g1"), "joystick")
+    return {script, f"{script}_{task}", physics.get(task, task), *({"mujoco", "fast", "accurate"} & {*flags})} & {
+        *CASES
     }
-    return found & {*CASES} | {name for name in ("mujoco", "fast", "accurate") if name in flags}
 
 
 def fingerprint(checkout: Path, name: str, device: str = "cpu") -> str:
@@ -134,30 +132,15 @@ def links() -> list[dict[str, str]]:
 
 
 @functools.cache
-def files(revision: str) -> Mapping[str, str]:
-    """What trainings of a revision depend on, and git's name of the contents; nothing of one that is not in history."""
-    call = ["git", "ls-tree", "-r", revision]
-    done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True)
-    listed = (line.split("\t") for line in done.stdout.splitlines())
-    return {name: about.split()[2] for about, name in listed if matters(name)}
-
-
-def matters(name: str) -> bool:
-    package = name.startswith("diffsim/") and not name.startswith("diffsim/view/")
-    return name.endswith(".py") and (package or "/" not in name) or name.startswith("diffsim/assets/")
-
-
 def same_files(revision: str, other: str, script: str = "") -> bool:
-    """Whether what a script's trainings depend on is byte for byte the same in both; without a script, of every one."""
+    """Whether what a script's trainings depend on is byte for byte the same in both; without a script, of every one.
 
-    def own(revision: str) -> dict[str, str]:
-        return {
-            name: contents
-            for name, contents in files(revision).items()
-            if "/" in name or name == f"{script}.py" or not script and name != "view.py"
-        }
-
-    return bool(files(revision)) and own(revision) == own(other)
+    A revision that is not in history is the same as none.
+    """
+    scripts = (f"{script}.py",) if script else (":(glob)*.py", ":!view.py")
+    paths = ":(glob)diffsim/**/*.py", "diffsim/assets", ":!diffsim/view", *scripts
+    call = ["git", "diff", "--quiet", revision, other, "--", *paths]
+    return subprocess.run(call, cwd=ROOT, stderr=subprocess.DEVNULL).returncode == 0
 
 
 def keeps(link: Mapping[str, str], name: str) -> bool:

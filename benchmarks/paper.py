@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
@@ -36,6 +36,7 @@ from cells import (
     RETURNS,
     Cell,
     Curve,
+    Group,
     Runner,
     ScriptFlags,
     begin,
@@ -43,7 +44,6 @@ from cells import (
     counts,
     curve,
     done,
-    draw,
     evaluation,
     finer,
     paces,
@@ -52,7 +52,7 @@ from cells import (
     spread,
     train,
 )
-from common import LEARNT, TASKS, Tasks, check_names, load_case, run
+from common import LEARNT, TASKS, Line, Panel, Tasks, check_names, load_case, plot, run
 from groups import Cells, grouped, middle, numbers
 from tables import ROOT, Row, markdown, read_csv
 
@@ -134,23 +134,18 @@ def measure(args: Args, runner: Runner, cell: Cell) -> Row:
     how, begun = state["args"], json.loads((case.folder / "cell.json").read_text())
     if state["iteration"] < how["iterations"] or not runner.evaluate(case):
         return {}
-    own, finest, reference = (
-        evaluation(folder) for folder in (case.folder, *(finer(case.folder, n) for n in checked(cell.task, how)))
-    )
+    folders = case.folder, *(finer(case.folder, n) for n in checked(cell.task, how))
+    own, finest, reference = map(evaluation, folders)
     progress, returns = read_csv(case.folder / "progress.csv"), RETURNS[cell.task]
-    curves = [curve(progress)]
     row: dict[str, object] = dict(zip(KEY, cell[1:], strict=True)) | begun
     row |= {"iterations": state["iteration"], "control steps": float(progress[-1]["control_steps"])}
-    row |= {
-        "training (s)": float(progress[-1]["seconds"]),
-        "return": own["return"],
-        "speed": "" if own["speed"] is None else own["speed"],
-    }
+    row |= {"training (s)": float(progress[-1]["seconds"]), "return": own["return"]}
+    row |= {"speed": "" if own["speed"] is None else own["speed"]}
     row |= {"falls": mean(length < diffsim.TASKS[cell.task].episode_length for length in own["lengths"])}
     row |= {"kept": kept(own["return"], finest["return"]), "in the reference": reference["return"]}
     for target in returns.timed or (returns.target,):
         for x in ("control_steps", "seconds"):
-            row[f"{x} to {target}"] = passing(curves, target, x)[0]
+            row[f"{x} to {target}"] = passing(curve(progress), target, x)
     found = transfer.in_mujoco(load_case(path, len(own["lengths"]), "cpu"))
     row |= {f"{name} in MuJoCo": found[name] for name in ("return", "speed") if found}
     if not args.alone(cell):
@@ -175,7 +170,7 @@ def curves(args: Args, name: str) -> dict[tuple[str, str], list[Curve]]:
     for row in rows:
         pace = known.get((row["learner"], row["task"]))
         if pace and not row["seconds"]:
-            row["seconds"] = str(pace.seconds(float(row["iteration"])))
+            row["seconds"] = str(pace(float(row["iteration"])))
         row["seconds"] = row["seconds"] if group.timed else ""
     found = dict[tuple[str, str], list[Curve]]()
     for (learner, task, seed), own in grouped(rows, *KEY).items():
@@ -184,12 +179,38 @@ def curves(args: Args, name: str) -> dict[tuple[str, str], list[Curve]]:
     return {key: runs for key, runs in found.items() if len(runs) == group.seeds}
 
 
+def panel(group: Group, found: Mapping[tuple[str, str], list[Curve]], task: str, x: str) -> Panel:
+    """Each seed (thin) and the median (bold) against control steps or seconds, on a log axis if ends lie far apart."""
+    lines, begins, ends = list[Line](), list[float](), list[float]()
+    for k, learner in enumerate(group.learners):
+        runs = [run for run in found.get((learner, task), []) if not np.isnan(run[x]).any()]
+        if not runs:  # or none that had its machine alone, and has seconds
+            continue
+        begins.append(max(run[x][0] for run in runs))
+        ends.append(min(run[x][-1] for run in runs))
+        shared = np.geomspace(begins[-1], ends[-1], 400)
+        middle = np.median([np.interp(shared, run[x], run["return"]) for run in runs], axis=0)
+        lines += [Line(run[x], run["return"], f"C{k}-", width=0.5) for run in runs]
+        lines.append(Line(shared, middle, f"C{k}-", learner, width=2))
+    for learner, value in RETURNS[task].published.items():
+        if ends and learner in group.learners:
+            style = f"C{group.learners.index(learner)}--"
+            lines.append(Line((min(begins), max(ends)), [value] * 2, style, f"{learner}, published", 0.8))
+    log = "x" if ends and max(ends) > 10 * min(ends) else ""
+    text = {"control_steps": "control steps", "seconds": "seconds of training"}[x]
+    return Panel(lines, task, text, "return of training episodes" if task == group.tasks[0] else "", log)
+
+
 def pictured(args: Args, name: str) -> None:
     """Draw the curves of learners whose seeds are all there, of tasks that have any."""
     group, found = GROUPS[name], curves(args, name)
-    args = replace(args, machine=group.machine)
-    if there := [task for task in group.tasks if any((learner, task) in found for learner in group.learners)]:
-        draw(args.picture(name), group.learners, there, lambda learner, task: found.get((learner, task), []))
+    tasks = [task for task in group.tasks if any((learner, task) in found for learner in group.learners)]
+    group = group._replace(tasks=tasks)
+    grid = [[panel(group, found, task, x) for task in tasks] for x in ("control_steps", "seconds")]
+    grid = [panels for panels in grid if any(panel.lines for panel in panels)]
+    if grid:
+        size = (3.4, 2.9) if len(tasks) > 1 else (6.0, 3.8)
+        plot(replace(args, machine=group.machine).picture(name), grid, size)
 
 
 def ratios(args: Args, name: str) -> list[Row]:

@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 import cells
-import common
 import numpy as np
 import paper
 import pytest
@@ -41,19 +40,16 @@ def test_policies_are_compared_within_the_control_steps_that_all_made(
 def test_curves_begin_with_the_first_episode_and_tell_where_they_pass() -> None:
     rows = [{"iteration": f"{k}", "control_steps": f"{8 * k}", "seconds": f"{k}", "return": f"{k}"} for k in range(9)]
     one = cells.curve([rows[0] | {"return": ""}, *rows[1:]])
-    assert len(one["return"]) == 8 and cells.passing([one], 5.0, "control_steps") == [40.0]
-    assert cells.passing([one, one], 50.0, "seconds") == [np.inf, np.inf]
-    shared = cells.curve([row | {"seconds": ""} for row in rows])
-    assert cells.timed([one, shared]) == [one]
+    assert len(one["return"]) == 8 and cells.passing(one, 5.0, "control_steps") == 40.0
+    assert cells.passing(one, 50.0, "seconds") == np.inf
 
 
-def test_a_picture_has_steps_for_all_and_seconds_for_those_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = list[list[list[common.Panel]]]()
-    monkeypatch.setattr(cells, "plot", lambda path, grid, size: drawn.append(grid))
+def test_a_picture_has_steps_for_all_and_seconds_for_those_alone() -> None:
     rows = [{"control_steps": f"{8 * k}", "seconds": f"{k}", "return": f"{k}"} for k in range(1, 9)]
-    runs = {"shac": [cells.curve(rows)] * 2, "sapo": [cells.curve([row | {"seconds": ""} for row in rows])]}
-    cells.draw(Path(), ("shac", "sapo"), ("hopper",), lambda learner, task: runs[learner])
-    (((steps,), (seconds,)),) = drawn
+    found = {("shac", "hopper"): [cells.curve(rows)] * 2}
+    found["sapo", "hopper"] = [cells.curve([row | {"seconds": ""} for row in rows])]
+    group = cells.Group("cpu", ("shac", "sapo"), ("hopper",), 2)
+    steps, seconds = (paper.panel(group, found, "hopper", x) for x in ("control_steps", "seconds"))
     assert [line.label for line in steps.lines] == ["", "", "shac", "", "sapo", "shac, published"]
     assert [line.label for line in seconds.lines] == ["", "", "shac", "shac, published"]
 
