@@ -151,18 +151,3 @@ class Dynamics:
             result[rows, :, nd:] = g_ctrl.view(count, nd, -1) * (1.0 - parts[2].square()).unsqueeze(1)
             self.steps += count * nd
         return result
-
-    def check_jacobians(self, x: Tensor, u: Tensor, eps: float = 1e-6) -> Tensor:
-        """(n,) relative error (Frobenius norm) of `jacobians` at x (n, nx), u (n, nu) against central differences."""
-        n, nz = len(x), self.nd + self.nu
-        following = self.rollout(x, 1, lambda _, __: u)[0][:, 1]
-        at, action, origin = (tensor.repeat_interleave(nz, 0) for tensor in (x, u, following))
-
-        def step(d: Tensor) -> Tensor:
-            ends = self.rollout(self.retract(at, d[:, : self.nd]), 1, lambda _, __: action + d[:, self.nd :])[0]
-            return self.difference(ends[:, 1], origin)
-
-        d = eps * torch.eye(nz, dtype=REAL, device=self.device).repeat(n, 1)
-        differences = ((step(d) - step(-d)) / (2 * eps)).view(n, nz, self.nd).mT
-        error = torch.linalg.matrix_norm(self.jacobians(x, u, following) - differences)
-        return error / torch.linalg.matrix_norm(differences)

@@ -84,7 +84,6 @@ class Plan(NamedTuple):
     x: Tensor  # (R, T + 1, nx)
     u: Tensor  # (R, T, nu)
     cost: Tensor  # (R,)
-    note: list[str]  # why each ended
 
 
 def follow(system: Dynamics, x: Tensor, u: Tensor, gains: Gains, alphas: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -148,7 +147,7 @@ def ilqr(
     """
     total = cost.value(x.unsqueeze(1), u.unsqueeze(1)).sum(-1).squeeze(1)
     mus, delta = torch.full_like(total, mu), torch.ones_like(total)
-    moving, note, fresh = torch.ones_like(total, dtype=torch.bool), ["iterations"] * len(x), True
+    moving, fresh = torch.ones_like(total, dtype=torch.bool), True
     for iteration in range(iterations):
         if fresh:
             f_z = step_jacobian(system, x, u)
@@ -162,18 +161,11 @@ def ilqr(
         x, u, total, step = line_search(system, cost, x, u, total, gains, moving)
         mus, delta = change_mu(mus, delta, step <= 0.01, step > 0.01)
         scale = 1 + total.abs()
-        ends = {
-            "gradient": gains.d1.abs() < 1e-7 * scale,
-            "cost": (step > 0) & (before - total < 1e-6 * scale) & (mus < 1e-4),
-            "regularisation": mus > 1e10,
-        }
-        for name, mask in ends.items():
-            for r in (mask & moving).nonzero().flatten().tolist():
-                note[r] = name
-            moving = moving & ~mask
+        level, flat = gains.d1.abs() < 1e-7 * scale, (step > 0) & (before - total < 1e-6 * scale) & (mus < 1e-4)
+        moving = moving & ~(level | flat | (mus > 1e10))
         if show:
             show(iteration, total)
         fresh = bool((step > 0).any())
         if not bool(moving.any()):
             break
-    return Plan(x, u, total, note)
+    return Plan(x, u, total)

@@ -82,6 +82,22 @@ def random_states(system: System, rng: np.random.Generator, count: int = 6) -> t
     return torch.tensor(np.concatenate((qpos, qvel), 1)), torch.tensor(ctrl)
 
 
+def jacobian_errors(system: System, x: Tensor, u: Tensor, eps: float = 1e-6) -> Tensor:
+    """(n,) relative error (Frobenius norm) of the Jacobians at x (n, nx), u (n, nu) against central differences."""
+    n, nz = len(x), system.nd + system.nu
+    following = one_step(system, x, u)
+    at, action, origin = (tensor.repeat_interleave(nz, 0) for tensor in (x, u, following))
+
+    def step(d: Tensor) -> Tensor:
+        ends = one_step(system, system.retract(at, d[:, : system.nd]), action + d[:, system.nd :])
+        return system.difference(ends, origin)
+
+    d = eps * torch.eye(nz, dtype=torch.float64).repeat(n, 1)
+    differences = ((step(d) - step(-d)) / (2 * eps)).view(n, nz, system.nd).mT
+    error = torch.linalg.matrix_norm(system.jacobians(x, u, following) - differences)
+    return error / torch.linalg.matrix_norm(differences)
+
+
 def one_step(system: System, x: Tensor, u: Tensor) -> Tensor:
     """(n, nx) after one step of x (n, nx), u (n, nu)."""
     return system.rollout(x, 1, lambda t, _: u)[0][:, 1]

@@ -55,6 +55,5 @@ def test_an_indefinite_cost_raises_mu_and_ends_without_an_exception(rng: np.rand
     shown = []
     plan = ilqr(system, hill, x, u, 60, show=lambda iteration, costs: shown.append(costs))
     assert (plan.cost < 0.5 * hill.value(x, u).sum(-1)).all()
-    assert all(note in ("cost", "gradient", "iterations") for note in plan.note)
     torch.testing.assert_close(hill.value(plan.x, plan.u).sum(-1), plan.cost)
     assert (torch.stack(shown).diff(dim=0) <= 0).all() and torch.equal(shown[-1], plan.cost)
