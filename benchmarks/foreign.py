@@ -9,7 +9,6 @@ The robots fly: contact, limits and dry friction are constraints in MuJoCo, and 
 from __future__ import annotations
 
 import copy
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,22 +30,9 @@ STEP = 2.0**-10  # s: no acceleration reaches the speed at which a simulator con
 class Args(CommonFlags):
     folder: tyro.conf.Positional[Path] = Path()  # where the files are
     pattern: str = "*/scene*.xml"  # which of its files
-    name: str = ""  # of the collection (default: the folder's)
     states: int = 200  # random states of each robot whose accelerations are compared; 0 for none
     env: tyro.conf.Suppress[Tasks] = TASKS
     draw_only: tyro.conf.Suppress[bool] = False  # there is nothing to draw
-
-
-def load(path: Path) -> tuple[Scene | None, str]:
-    """The scene, or the first reason why there is none: the kind of element, and what about it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return load_scene(path), ""
-        except SceneError as error:
-            lines = str(error).removeprefix(f"{path.name}: ").splitlines()
-    about, _, why = lines[min(1, len(lines) - 1)].strip().rpartition(": ")
-    return None, f"{about.split(' ')[0]}: {why.partition(';')[0]}"
 
 
 def random_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -81,17 +67,18 @@ def difference(scene: Scene, count: int) -> float:
 
 
 def main(args: Args) -> None:
-    name, folder = args.name or args.folder.name, args.folder.resolve()  # meshes may lie beside the folder
-    scenes = {path: load(path) for path in sorted(folder.glob(args.pattern))}
-    if not scenes:
-        fail(f"{folder} has no {args.pattern}")
-    for path, (scene, why) in sorted(scenes.items(), key=lambda item: not (item[1][0] and item[1][0].floating)):
-        row: dict[str, object] = {"collection": name, "file": path.relative_to(folder).as_posix(), "refused": why}
-        if scene:
-            row |= {"nq": scene.nq, "nv": scene.nv, "nu": scene.nu, "contact points": scene.ncontact}
+    folder, found = args.folder.resolve(), list[bool]()  # meshes may lie beside the folder
+    for path in sorted(folder.glob(args.pattern)) or fail(f"{folder} has no {args.pattern}"):
+        row: dict[str, object] = {"collection": folder.name, "file": path.relative_to(folder).as_posix()}
+        try:
+            scene = load_scene(path)
+            row |= {"refused": "", "nq": scene.nq, "nv": scene.nv, "nu": scene.nu, "contact points": scene.ncontact}
             row["relative error of qacc"] = difference(scene, args.states) if args.states else ""
+        except SceneError as error:
+            row["refused"] = " ".join(str(error).removeprefix(f"{path.name}: ").split("\n")[:2])
+        found.append(not row["refused"])
         args.keep("foreign", row, ("collection", "file"))
-    print(f"{sum(scene is not None for scene, _ in scenes.values())} of {len(scenes)} load: {args.csv('foreign')}")
+    print(f"{sum(found)} of {len(found)} load: {args.csv('foreign')}")
 
 
 if __name__ == "__main__":

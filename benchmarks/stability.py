@@ -107,8 +107,10 @@ def stored(scene: Scene, qpos: Tensor) -> Array:
     links = np.flatnonzero(np.isfinite(scene.upper))
     joints = qpos[:, scene.qpos_adr[links]].numpy()
     beyond = np.maximum(scene.lower[links] - joints, 0) + np.maximum(joints - scene.upper[links], 0)
-    ground = (np.maximum(gait.trace(scene, qpos.numpy())[0], 0) ** 2).sum(1)
-    return 0.5 * (scene.k_limit[links] * beyond**2).sum(1) + 0.5 * scene.k_n * ground
+    limits = 0.5 * (scene.k_limit[links] * beyond**2).sum(1)
+    if not scene.ncontact:
+        return limits
+    return limits + 0.5 * scene.k_n * (np.maximum(gait.trace(scene, qpos.numpy())[0], 0) ** 2).sum(1)
 
 
 def bounded(scene: Scene, model: mujoco.MjModel, qpos: Tensor, qvel: Tensor) -> bool:

@@ -17,11 +17,12 @@ def test_a_folder_becomes_a_table(tmp_path, capsys):
     for name, mjcf in robots.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.xml").write_text(mjcf)
-    flags = ["--name", "mine", "--states", "8", "--output", str(tmp_path / "out")]
+    flags = ["--states", "8", "--output", str(tmp_path / "out")]
     foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
     assert "2 of 3 load" in capsys.readouterr().out
     rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
-    assert rows["bad/scene.xml"]["refused"] == "actuator: stiffness and damping of a servo must not be negative"
+    bad = "actuator number 0: stiffness and damping of a servo must not be negative"
+    assert rows["bad/scene.xml"]["refused"] == bad
     for name in ("servos", "rubbed"):
         assert rows[f"{name}/scene.xml"]["refused"] == ""
         assert float(rows[f"{name}/scene.xml"]["relative error of qacc"]) < 1e-9

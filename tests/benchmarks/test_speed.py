@@ -65,6 +65,8 @@ def test_energy_along_a_fall(faster: float, bounded: bool) -> None:
     qvel[:, 0, 1] = -9.81 * t
     qvel[-1] *= faster
     assert stability.bounded(env.scene, env.scene.mj_model, qpos, qvel) == bounded
+    scene = diffsim.make("cartpole", 1).scene  # which has no ground
+    assert (stability.stored(scene, torch.zeros(2, scene.nq)) == 0).all()
 
 
 def test_a_sweep_s_line_names_the_first_value_that_fails() -> None:
