@@ -69,10 +69,6 @@ class Args(ParallelFlags):
     log_particles: tuple[Natural, ...] = ()
     """actions, counted from 0, whose particles' locations and mean weights are logged"""
 
-    iterations: Count = 5000
-    """learning iterations, a window of all environments and its updates each (per task)"""
-    num_envs: Count = 1024
-    """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
     horizon: Count = 32
     """control steps of a window (1/60 s each) (per task)"""
     hidden: SomeWidths = (256, 128, 64)
@@ -91,16 +87,12 @@ class Args(ParallelFlags):
     """samples of an update (per task; on a CPU at most 2048)"""
     entropy_coef: NonNegative = 0.0
     """weight of the entropy, of a mixture's weights or of a Gaussian (per task)"""
-    eval_every: Natural = 500
-    """evaluate the deterministic policy every this many iterations (0: only at the end)"""
-    save_every: Natural = 500
-    """save the checkpoint every this many iterations (0: only at the end)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, PER_TASK["humanoid"]), strict=True))
         if self.device == "cpu":
             values |= {name: min(values[name], most) for name, most in CPU.items()}
-        return values
+        return values | {"eval_every": 500, "save_every": 500}
 
     def check(self) -> None:
         super().check()
