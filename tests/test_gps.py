@@ -22,7 +22,7 @@ from diffsim.planning import LinearGaussian, load_demonstration
 from diffsim.training import evaluate, load_policy, make_policy_env, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
-from gps import log_mixture, log_weights, phi, sparse
+from gps import log_mixture, phi, sparse
 
 SMALL = (
     "--env cartpole --horizon 30 --restarts 3 --screening 4 --ilqr-iterations 20 --pretraining 40 --hidden 8 "
@@ -100,46 +100,6 @@ def test_mixture_is_of_prefixes() -> None:
     per_step = torch.tensor([[[0.0, -20.0, 0.0], [-20.0, 0.0, -20.0]]], dtype=torch.float64)
     expected = [[math.log((math.exp(a) + math.exp(b)) / 2) for a, b in ((0, -20), (-20, -20), (-20, -40))]]
     torch.testing.assert_close(log_mixture(per_step.cumsum(2)), torch.tensor(expected, dtype=torch.float64))
-
-
-def scalar_rollouts(rng: np.random.Generator, m: int, gains: tuple[float, ...], std: float, T: int) -> list[Tensor]:
-    """x' = 0.9 x + 0.5 u from x = 1 under u ~ N(-gain x, std^2), as many of each gain: states, actions, rewards."""
-    gain = np.repeat(gains, m // len(gains))
-    x, states, actions, rewards = np.ones(m), [], [], []
-    for _ in range(T):
-        u = -gain * x + std * rng.normal(size=m)
-        states.append(x)
-        actions.append(u)
-        x = 0.9 * x + 0.5 * u
-        rewards.append(-(x**2) - 0.1 * u**2)
-    return [torch.tensor(np.stack(column, 1)) for column in (states, actions, rewards)]
-
-
-def scalar_log_prob(x: Tensor, u: Tensor, gain: float, std: float) -> Tensor:
-    return -0.5 * ((u + gain * x) / std).square() - math.log(std) - 0.5 * math.log(2 * math.pi)
-
-
-def test_estimate_is_unbiased_and_its_error_falls(rng: np.random.Generator) -> None:
-    """E_pi of the return of a linear-Gaussian system, in closed form, from two other controllers' samples."""
-    gain, std, T = 0.6, 0.3, 5
-    mean, variance, expected = 1.0, 0.0, 0.0
-    for _ in range(T):
-        u_mean, u_variance = -gain * mean, gain**2 * variance + std**2
-        mean, variance = (0.9 - 0.5 * gain) * mean, (0.9 - 0.5 * gain) ** 2 * variance + 0.25 * std**2
-        expected -= mean**2 + variance + 0.1 * (u_mean**2 + u_variance)
-
-    def estimate(m: int) -> tuple[float, Tensor]:
-        x, u, reward = scalar_rollouts(rng, m, (0.3, 0.9), 0.4, T)
-        log_q = torch.stack([scalar_log_prob(x, u, g, 0.4).cumsum(1) for g in (0.3, 0.9)], 1)
-        log_pi, mixture = scalar_log_prob(x, u, gain, std), log_mixture(log_q)
-        return phi(log_pi, mixture, reward, 0.0).item(), log_weights(log_pi, mixture).exp()
-
-    few, many = (np.array([estimate(m)[0] for _ in range(200)]) for m in (200, 1800))
-    for values in (few, many):
-        assert abs(values.mean() - expected) < 3 * values.std() / np.sqrt(len(values)) + 2e-3
-    assert few.std() / many.std() == pytest.approx(3.0, rel=0.25)
-    z = estimate(200_000)[1]
-    assert ((z.mean(0) - 1).abs() < 3 * z.std(0) / math.sqrt(len(z))).all()
 
 
 # The search

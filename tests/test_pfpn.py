@@ -190,29 +190,6 @@ def test_resampling_leaves_the_policy_as_it_is(script: Any, flags: str) -> None:
     assert not moving.seen.any()
 
 
-def test_weights_below_the_threshold_bound_the_change() -> None:
-    """Of particles that are almost dead the policy changes, in total variation, by no more than their weight.
-
-    Their mean weight counts: in some state each has more than the threshold.
-    """
-    own, moving, optimizer, features = head()
-    kill(own, [(0, 1), (1, 2), (1, 3)], bias=-3.3)
-    before = own(features)
-    moving.record(before)
-    lost = before.log_weight.exp()[:, [0, 1, 1], [1, 2, 3]]
-    assert lost.mean(0).max() < 0.05 / 6 < lost.amax(0).min()
-    x = torch.linspace(-12, 12, 20_001, dtype=torch.float64)
-    densities = []
-    for _ in range(2):
-        mixture = own(features[:10].unsqueeze(0))
-        densities.append(mixture.log_density(x.reshape(-1, 1, 1).expand(-1, 10, M)).exp())
-        moving.end_iteration(own, optimizer)
-    assert moving.moved == 3
-    variation = torch.trapezoid((densities[0] - densities[1]).abs() / 2, x, dim=0)
-    bound = torch.stack((lost[:10, 0], lost[:10, 1] + lost[:10, 2], torch.zeros(10)), -1)
-    assert (variation <= bound + 1e-9).all() and variation.max() > 1e-6
-
-
 @each_script
 def test_targets_are_drawn_by_weight_and_copies_land_around_them(script: Any) -> None:
     own, moving, optimizer, features = head("--particles", "400", "--resampling-noise", "0.5", script=script)

@@ -45,58 +45,43 @@ def test_gae_is_the_weighted_sum_of_all_its_n_step_advantages(
     np.testing.assert_allclose(ppo.gae(*tensors, gamma, lam), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_values_after_a_rollout_are_of_the_last_states_before_any_reset() -> None:
-    """Of three ants that run out of time, fall, and do neither, the values and rewards that GAE gets."""
+def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three ants that run out of time, fall, and do neither. Advantages are of values in the rewards' units: of the
+    last states before any reset, zero after a termination; both are normalized for the update.
+    """
     torch.manual_seed(0)
-    env = diffsim.make("ant", num_envs=3, seed=0, horizon=8)
     args = parse(ppo.Args, "--env ant --device cpu --horizon 8 --hidden 16".split())
-    policy = ppo.PPO(args, env).actor_critic
+    env = diffsim.make("ant", num_envs=3, seed=0, horizon=8)
+    learner = ppo.PPO(args, env)
+    policy = learner.actor_critic
+    learner.return_normalizer.update(5.0 + 3.0 * torch.randn(50))
+    policy.normalizer.update(torch.randn(50, 37))
+    normalizer, returns = copy.deepcopy(policy.normalizer), copy.deepcopy(learner.return_normalizer)
     env.episode_step[1] = env.episode_length - 4
     qpos, qvel = env.qpos.clone(), env.qvel.clone()
     qpos[2, 2], qvel[2, 2] = 0.3, -6.0
     env.set_state(qpos, qvel)
-    noise = torch.randn(8, 3, 8)
-    rollout = ppo.collect(env, policy, noise)
+    made, collect = list[tuple[ppo.Rollout, torch.Tensor]](), ppo.collect
+
+    def recorded(env: Any, policy: Any, noise: torch.Tensor) -> ppo.Rollout:
+        made.append((collect(env, policy, noise), noise))
+        return made[-1][0]
+
+    monkeypatch.setattr(ppo, "collect", recorded)
+    learner.collect()
+    ((rollout, noise),) = made
     truncated = rollout.done & ~rollout.terminated
     assert truncated.nonzero().tolist() == [[3, 1]] and rollout.terminated.any(0).tolist() == [False, False, True]
     assert not any(tensor.requires_grad for tensor in rollout)
     same = rollout.next_obs[:-1] == rollout.obs[1:]
     torch.testing.assert_close(same.all(-1), ~rollout.done[:-1])
-    mean, value = policy(policy.normalizer(rollout.obs))
+    with torch.no_grad():
+        (mean, value), (_, next_value) = (policy(normalizer(obs)) for obs in (rollout.obs, rollout.next_obs))
     torch.testing.assert_close(rollout.mean, mean)
     torch.testing.assert_close(rollout.value, value)
     torch.testing.assert_close(rollout.action, mean + policy.log_std.exp() * noise)
-    torch.testing.assert_close(policy.deterministic()(rollout.obs), mean)
 
-
-def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Advantages of values in the rewards' units, zero after a termination; both are normalized for the update."""
-    torch.manual_seed(0)
-    args = parse(ppo.Args, "--env ant --device cpu --horizon 8 --hidden 16".split())
-    env = diffsim.make("ant", num_envs=3, seed=0, horizon=8)
-    learner = ppo.PPO(args, env)
-    learner.return_normalizer.update(5.0 + 3.0 * torch.randn(50))
-    learner.actor_critic.normalizer.update(torch.randn(50, 37))
-    normalizer, returns = (
-        copy.deepcopy(module) for module in (learner.actor_critic.normalizer, learner.return_normalizer)
-    )
-    qpos, qvel = env.qpos.clone(), env.qvel.clone()
-    qpos[2, 2], qvel[2, 2] = 0.3, -6.0
-    env.set_state(qpos, qvel)
-    rollouts, collect = [], ppo.collect
-
-    def recorded(*arguments: Any) -> ppo.Rollout:
-        rollouts.append(collect(*arguments))
-        return rollouts[-1]
-
-    monkeypatch.setattr(ppo, "collect", recorded)
-    learner.collect()
-    (rollout,) = rollouts
-    assert rollout.terminated.any()
-    with torch.no_grad():
-        value = returns.inverse(learner.actor_critic(normalizer(rollout.obs))[1])
-        next_value = returns.inverse(learner.actor_critic(normalizer(rollout.next_obs))[1])
-    next_value = torch.where(rollout.terminated, 0.0, next_value)
+    value, next_value = returns.inverse(value), returns.inverse(next_value).masked_fill(rollout.terminated, 0.0)
     advantage = ppo.gae(rollout.reward, value, next_value, rollout.done, args.gamma, args.gae_lambda)
     returns.update(value + advantage)
     batch = learner.batch
@@ -104,7 +89,8 @@ def test_samples_of_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.testing.assert_close(batch.target, returns((value + advantage).flatten()), rtol=1e-4, atol=1e-5)
     flat = advantage.flatten()
     torch.testing.assert_close(batch.advantage, (flat - flat.mean()) / flat.std(correction=0), rtol=1e-4, atol=1e-5)
-    assert learner.actor_critic.normalizer.count == 50 + 24 and learner.return_normalizer.count == 50 + 24
+    assert policy.normalizer.count == 50 + 24 and learner.return_normalizer.count == 50 + 24
+    torch.testing.assert_close(policy.deterministic()(rollout.obs), policy(policy.normalizer(rollout.obs))[0])
 
 
 def gaussians(count: int = 40) -> tuple[ppo.Batch, torch.Tensor, torch.Tensor, torch.Tensor]:
