@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from scenes import BALL, HINGE, OSCILLATOR, SOFT, acting_states, leg_scene, parse, run, task_scene, without
+from scenes import BALL, DISTINCT, HINGE, OSCILLATOR, acting_states, leg_scene, parse, run, task_scene, without
 from warp._src.context import ModuleBuilder
 
 import diffsim
@@ -33,19 +33,17 @@ SETTINGS = [  # and the order of each
 # Presets
 
 
-@pytest.mark.parametrize("name", SHAC_TASKS)
-def test_presets_of_every_task_are_used(name):
-    task = TASKS[name]
-    assert task.integration("default") == Integration("semi_implicit", task.substeps)
-    works = {}
-    for accuracy in ("fast", "default", "accurate"):
-        preset = task.integration(accuracy)
-        sim = diffsim.make(name, num_envs=1, horizon=1, accuracy=accuracy).sim
-        assert sim.integration == preset
-        works[accuracy] = preset.substeps * (1.5 if preset.integrator == "extrapolated" else 1)
-    assert works["fast"] <= works["default"] / 2 and works["default"] < works["accurate"]
-    default = diffsim.make(name, num_envs=1, horizon=1).sim
-    assert default.integration == task.integration("default")
+def test_presets_of_every_task():
+    for name in SHAC_TASKS:
+        task = TASKS[name]
+        fast, default, accurate = (task.integration(accuracy) for accuracy in ("fast", "default", "accurate"))
+        assert default == Integration("semi_implicit", task.substeps)
+        works = [
+            each.substeps * (1.5 if each.integrator == "extrapolated" else 1) for each in (fast, default, accurate)
+        ]
+        assert works[0] <= works[1] / 2 and works[1] < works[2]
+        for accuracy, substeps in (("fast", 4), ("default", 4), ("accurate", 16)):
+            assert task.integration(accuracy, "mujoco") == Integration("mujoco", substeps), name
 
 
 HEAVY = "half_cheetah", "humanoid_mtu"  # whose kernels no other test needs
@@ -73,41 +71,20 @@ def test_arguments_override_the_preset():
         return diffsim.make("humanoid", 1, horizon=1, accuracy="fast", **given).sim.integration
 
     fast = TASKS["humanoid"].fast
-    assert integration(substeps=7) == Integration(fast.integrator, 7)
+    assert integration() == fast and integration(substeps=7) == Integration(fast.integrator, 7)
     assert integration(integrator="implicit", theta=0.25) == Integration("implicit", fast.substeps, 0.25)
     assert integration(integrator="semi_implicit") == Integration("semi_implicit", fast.substeps)
-
-
-def test_presets_that_are_not_there_are_named(monkeypatch):
-    with pytest.raises(ValueError, match="'faster'.*fast, default, accurate"):
-        diffsim.make("hopper", accuracy="faster")
-
-    class Bare(diffsim.tasks.Task):
-        name, substeps, contact = "bare", 8, "soft"
-
-    assert Bare.integration("default") == Integration("semi_implicit", 8)
-    with pytest.raises(ValueError, match="'bare' has no preset 'fast'"):
-        Bare.integration("fast")
-
-
-def test_contact_decides_the_integration():
-    for name in SOFT:
-        task = TASKS[name]
-        for accuracy, substeps in (("fast", 4), ("default", 4), ("accurate", 16)):
-            assert task.integration(accuracy, "mujoco") == Integration("mujoco", substeps), name
-    with pytest.raises(ValueError, match="unknown contact 'hard'; choose from soft, mujoco"):
-        diffsim.make("hopper", contact="hard")
-
-
-def test_penalty_constants_replace_the_files():
-    soft = diffsim.make("hopper", 1, penalty={"k_n": 1e5, "k_d": 1e4}).scene
-    file = task_scene("hopper")
+    soft, file = diffsim.make("hopper", 1, penalty={"k_n": 1e5, "k_d": 1e4}).scene, task_scene("hopper")
     assert (soft.k_n, soft.k_d, soft.k_t, soft.mu) == (1e5, 1e4, file.k_t, file.mu)
-    with pytest.raises(ValueError, match="'kn'.*k_n, k_d, k_t, mu, k_limit, d_limit"):
-        diffsim.make("hopper", 1, penalty={"kn": 1e5})
-    for bad in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="k_n is"):
-            diffsim.make("hopper", 1, penalty={"k_n": bad})
+    wrong = {"'kn'.*k_n, k_d, k_t, mu, k_limit, d_limit": dict(penalty={"kn": 1e5})}
+    wrong |= {f"k_n is {bad}, must be": dict(penalty={"k_n": bad}) for bad in (-1.0, float("nan"), float("inf"))}
+    wrong |= {"'faster'.*fast, default, accurate": dict(accuracy="faster")}
+    wrong |= {"unknown contact 'hard'; choose from soft, mujoco": dict(contact="hard")}
+    for message, arguments in wrong.items():
+        with pytest.raises(ValueError, match=message):
+            diffsim.make("hopper", 1, **arguments)
+    with pytest.raises(ValueError, match="task 'walker' has no preset 'fast'; choose default"):
+        TASKS["walker"].integration("fast")
 
 
 # Order of convergence
@@ -338,24 +315,16 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
 }
 
 
-@pytest.mark.parametrize("name", [*TASKS, "leg"])
+@pytest.mark.parametrize("name", [*DISTINCT, "cartpole", "go2", "bare", "leg"])
 def test_kernels_hold_the_code_of_the_features_and_no_other(name):
-    scene = task_scene(name) if name in TASKS else leg_scene(grounded=True)
+    scenes = {"leg": leg_scene(grounded=True), "bare": without(task_scene("hopper"), "contact", "limit", "damping")}
+    scene = scenes[name] if name in scenes else task_scene(name)
     text = source(scene)
     for feature, pattern in CODE.items():
         assert bool(re.search(pattern, text)) == (feature in scene.features), feature
 
 
-def test_kernels_without_features_hold_nothing_of_them():
-    text = source(without(task_scene("hopper"), "contact", "limit", "damping"))
-    assert not re.search(
-        "|".join(CODE[f] for f in ("contact", "limit", "stiffness", "damping", "muscle", "floating")), text
-    )
-    assert re.search(CODE["slide"], text) and len(text) < 0.9 * len(source(task_scene("hopper")))
-
-
-@pytest.mark.parametrize("integrator", ["semi_implicit", "extrapolated"])  # implicit ones: swimmer, ball joint
-def test_a_feature_that_is_left_out_changes_nothing_where_it_did_nothing(integrator, rng):
+def test_a_feature_that_is_left_out_changes_nothing_where_it_did_nothing(rng):
     """A hopper in the air, within its limits, undamped: the smaller kernels give the same values and gradients."""
     full = dataclasses.replace(task_scene("hopper"), damping=1e-300 * task_scene("hopper").damping)
     bare = without(full, "contact", "limit", "damping")
@@ -363,7 +332,7 @@ def test_a_feature_that_is_left_out_changes_nothing_where_it_did_nothing(integra
     qpos[:, 1], qpos[:, 3:] = 100.0, (full.lower[4:] + full.upper[4:]) / 2
     results = []
     for scene in (full, bare):
-        sim = Simulator(scene, 4, Integration(integrator), dtype=torch.float64)
+        sim = Simulator(scene, 4, dtype=torch.float64)
         leaves = [torch.tensor(x, requires_grad=True) for x in (qpos, 0.1 * qvel, 0.01 * ctrl)]
         q, v = sim.step(*leaves)
         results.append([q.detach(), v.detach(), *torch.autograd.grad(q.sum() + v.square().sum(), leaves)])

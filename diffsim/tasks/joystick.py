@@ -104,6 +104,19 @@ class Joystick(Task):
     touchdown: ClassVar[bool] = True
     alive: ClassVar[float] = 4.0  # reward of a perfect step
 
+    def __init_subclass__(cls) -> None:
+        """Its sizes: those of what `begin`, `remember` and `observe_with` say, in their order."""
+        if "robot" not in vars(cls):
+            return
+        n = len(cls.robot.joints)
+        body = ("velocity", 3), ("angular_velocity", 3), ("gravity", 3)
+        sensed = *body, ("joints_from_home", n), ("joint_rates_x0.1", n)
+        seen = *sensed, ("last_action", n), ("command", 3), ("clock_sin", 1), ("clock_cos", 1)
+        private = *((f"true_{name}", size) for name, size in sensed), ("height", 1), ("action_change", n)
+        cls.obs_parts = *seen, *private, ("joints_from_reference", n)
+        cls.actor_dim, cls.obs_dim = (sum(size for _, size in parts) for parts in (seen, cls.obs_parts))
+        cls.num_memory, cls.num_noise, cls.num_random = 13 + 4 * n, 17 + 2 * n, 21 + 2 * n
+
     @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
         """See Task. Newton's method takes longer with dry friction in every joint."""
@@ -217,29 +230,16 @@ class Joystick(Task):
         return (private[..., 8] > -0.5) | (private[..., 9 + 2 * self._n] < 0.6 * self.robot.height)
 
 
-def sizes(robot: Robot) -> tuple[int, int, int, int, int, tuple[tuple[str, int], ...]]:
-    """actor_dim, obs_dim, num_memory, num_noise, num_random, obs_parts: what `observe_with` says, in its order"""
-    n = len(robot.joints)
-    body = ("velocity", 3), ("angular_velocity", 3), ("gravity", 3)
-    sensed = *body, ("joints_from_home", n), ("joint_rates_x0.1", n)
-    seen = *sensed, ("last_action", n), ("command", 3), ("clock_sin", 1), ("clock_cos", 1)
-    private = *((f"true_{name}", size) for name, size in sensed), ("height", 1), ("action_change", n)
-    parts = *seen, *private, ("joints_from_reference", n)
-    return 14 + 3 * n, 24 + 7 * n, 13 + 4 * n, 17 + 2 * n, 21 + 2 * n, parts
-
-
 class Go1(Joystick):
     """12 joints; action: targets of the servos."""
 
     name, asset, robot = "go1", "go1.xml", quadruped(("FR", "FL", "RR", "RL"))
-    actor_dim, obs_dim, num_memory, num_noise, num_random, obs_parts = sizes(robot)
 
 
 class Go2(Joystick):
     """12 joints; action: targets of servos on the motors."""
 
     name, asset, robot = "go2", "go2.xml", quadruped(("FL", "FR", "RL", "RR"))
-    actor_dim, obs_dim, num_memory, num_noise, num_random, obs_parts = sizes(robot)
 
 
 class G1(Joystick):
@@ -248,4 +248,3 @@ class G1(Joystick):
     name, asset, robot = "g1", "g1.xml", humanoid()
     alive = 2.5
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise
-    actor_dim, obs_dim, num_memory, num_noise, num_random, obs_parts = sizes(robot)

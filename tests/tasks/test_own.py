@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -315,18 +314,18 @@ def test_own_tasks_have_mujocos_contact_and_the_shipped_ones_the_papers() -> Non
     class Soft(Own):
         contact = "soft"
 
-    find: Callable[..., diffsim.Integration] = lambda kind, *words: kind.integration(*words)  # noqa: E731
+    hard, soft = (lambda n, kind=kind: diffsim.Integration(kind, n) for kind in ("mujoco", "semi_implicit"))
     assert {name for name, task in TASKS.items() if task.contact == "mujoco"} == {"go1", "go2", "g1"}
-    assert Bare.contact == "mujoco"
-    assert find(Bare, "default") == find(TASKS["ant"], "default", "mujoco") == diffsim.Integration("mujoco", 4)
-    assert find(Bare, "accurate") == diffsim.Integration("mujoco", 16)
-    assert find(Slow, "default") == diffsim.Integration("mujoco", 12)
-    assert find(Own, "default") == find(Own, "fast") == diffsim.Integration("mujoco", 7)
-    assert find(Bare, "default", "soft") == find(Own, "default", "soft") == diffsim.Integration("semi_implicit", 16)
-    assert find(Soft, "default") == diffsim.Integration("semi_implicit", 7)
-    assert find(Soft, "default", "mujoco") == diffsim.Integration("mujoco", 4)
-    assert TASKS["ant"].integration("default") == diffsim.Integration("semi_implicit", 16)
-    env = diffsim.DiffEnv(Bare(), scene_of(SLED), 1)
-    assert env.sim.integration == diffsim.Integration("mujoco", 4)
-    with pytest.raises(ValueError, match="unknown contact 'hard'"):
-        Bare.integration("default", "hard")
+    for kind, words, expected in (
+        (Bare, ["default"], hard(4)),
+        (Bare, ["accurate"], hard(16)),
+        (Bare, ["default", "soft"], soft(16)),
+        (Slow, ["default"], hard(12)),
+        (Own, ["default"], hard(7)),
+        (Own, ["fast"], hard(7)),
+        (Own, ["default", "soft"], soft(16)),
+        (Soft, ["default"], soft(7)),
+        (Soft, ["default", "mujoco"], hard(4)),
+    ):
+        assert kind.integration(*words) == expected
+    assert diffsim.DiffEnv(Bare(), scene_of(SLED), 1).sim.integration == hard(4)
