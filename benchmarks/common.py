@@ -63,9 +63,6 @@ class CommonFlags:
     def read(self, name: str) -> list[dict[str, str]]:
         return tables.read_csv(self.csv(name))
 
-    def write(self, name: str, rows: Sequence[Row]) -> None:
-        tables.write_csv(self.csv(name), rows, self.device)
-
     def replace(self, name: str, rows: Sequence[Row], key: Sequence[str]) -> list[dict[str, str]]:
         return tables.replace_csv(self.csv(name), rows, key, self.device)
 
@@ -74,11 +71,6 @@ class CommonFlags:
         shown = (f"{k} {tables.digits(v)}" for k, v in row.items() if k == "task" or k not in ABOUT)
         print("  " + ", ".join(shown), flush=True)
         self.replace(name, [row], key)
-
-    def machines(self, name: str) -> dict[str, Path]:
-        """The csv files of a name by their machines: all of the tree of results, or the one of --output."""
-        paths = [self.csv(name)] if self.output else sorted(self.directory.parent.glob(f"*/{name}.csv"))
-        return {path.parent.name: path for path in paths if path.is_file()}
 
     def picture(self, name: str) -> Path:
         default = DOCS / "figures" / self.directory.name.replace("cpu", "")
@@ -206,7 +198,6 @@ class Part(NamedTuple):
     table: str = ""  # its name in a page
     page: str = ""
     shown: Callable[[list[dict[str, str]]], Sequence[Row]] = list  # what the page shows of the rows
-    everywhere: bool = False  # one table for all machines
 
 
 def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
@@ -216,7 +207,7 @@ def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
             args.keep(part.csv, row, part.key)
     order: dict[str, int] = {name: place for place, name in enumerate(LEARNT)}
     rows = sorted(args.read(part.csv), key=lambda row: order.get(row.get("task", "").partition(" ")[0], 0))
-    args.publish(part.table, tables.markdown(part.shown(rows)), part.page, part.everywhere)
+    args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
     return rows
 
 
@@ -247,7 +238,6 @@ class Panel(NamedTuple):
     x: str = ""
     y: str = ""
     log: str = ""  # the logarithmic axes: x, y or xy
-    zero: bool = False  # the y axis begins there
 
 
 @functools.cache
@@ -278,8 +268,6 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
         axis.set(xlabel=panel.x, ylabel=panel.y)
         axis.set(xscale="log" if "x" in panel.log else "linear", yscale="log" if "y" in panel.log else "linear")
         axis.set_title(panel.title, fontsize=10)
-        if panel.zero:
-            axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     columns = max(1, round(len(grid[0]) * size[0] / 1.8))

@@ -128,8 +128,8 @@ def measure(args: Args, runner: Runner, task: TaskName) -> None:
         learner = shac.SHAC(settings, diffsim.make(task, 1, args.device))
         checkpoint.restore(learner, state)
         looks.append(Look(args, task, learner))
-    args.write(f"landscape_{task}_gradients", list(map(sizes, args.iterations, looks)))
-    args.write(f"landscape_{task}_weight", along_a_weight(looks[-1], args.points))
+    args.replace(f"landscape_{task}_gradients", list(map(sizes, args.iterations, looks)), ("iteration",))
+    args.replace(f"landscape_{task}_weight", along_a_weight(looks[-1], args.points), ("step",))
 
 
 def draw(args: Args, task: TaskName) -> None:

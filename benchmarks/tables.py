@@ -14,7 +14,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -77,37 +77,26 @@ def read_csv(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if not line.startswith("# ")))
 
 
-def write_csv(path: Path, rows: Sequence[Row], device: str = "cpu", older: Iterable[str] = ()) -> None:
-    """Write rows that were measured on a device, some of them by other processes, of the older origins."""
-    if not rows:
-        return
-    lines = [*older, origin(device)]  # before the file, which git would call a change, is touched
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        file.writelines(lines)
-        columns = dict.fromkeys(name for row in rows for name in row)
-        writer = csv.DictWriter(file, list(columns), restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def replace_csv(path: Path, rows: Sequence[Row], key: Sequence[str], device: str = "cpu") -> list[dict[str, str]]:
-    """Write rows in place of all that agree with one of them in all of `key`; returns all rows of the file.
+    """Write rows, measured on a device, in place of all that agree with one of them in all of `key`.
 
-    Whole rows go, so that no cell which an older benchmark measured stays beside new ones.
+    Whole rows go, so that no cell which an older benchmark measured stays beside new ones. The lines that say where
+    rows come from stay, except one of the same command. Returns all rows of the file.
     """
     new = [{name: digits(value) for name, value in row.items()} for row in rows]
     groups = grouped(read_csv(path), *key) | grouped(new, *key)
     merged = [row for group in groups.values() for row in group]
     if rows:
-        write_over(path, merged, device)
+        own = origin(device)  # before the file, which git would call a change, is touched
+        older = [line for line in origins(path) if line.rpartition("; ")[2] != own.rpartition("; ")[2]]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="") as file:
+            file.writelines([*older, own])
+            columns = dict.fromkeys(name for row in merged for name in row)
+            writer = csv.DictWriter(file, list(columns), restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(merged)
     return merged
-
-
-def write_over(path: Path, rows: Sequence[Row], device: str) -> None:
-    """Write a file anew; the lines that say where its rows come from stay, but for one of the same command."""
-    command = origin(device).rpartition("; ")[2]
-    write_csv(path, rows, device, [line for line in origins(path) if line.rpartition("; ")[2] != command])
 
 
 def markdown(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:

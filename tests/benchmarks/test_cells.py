@@ -31,7 +31,7 @@ def test_policies_are_compared_within_the_control_steps_that_all_made(
     rows = [*points("a", 1, 1.0, 50), *points("a", 2, 2.0, 50), *points("b", 1, 0.5, 50), *points("b", 2, 1.0, 31)]
     rows += [*points("a", 1, 9.0, 50, "hopper"), *points("a", 2, 9.0, 50, "hopper"), *points("b", 1, 9.0, 50, "hopper")]
     rows += points("a", 3, 9.0, 10)  # a third seed is not of the group
-    tables.write_csv(tmp_path / "h200" / "curves.csv", rows)
+    tables.replace_csv(tmp_path / "h200" / "curves.csv", rows, paper.KEY)
     args = paper.Args(output=tmp_path / "cpu")
     (row,) = paper.ratios(args, "both")  # on the hopper a seed is missing
     assert row == {"task": "ant", "control steps": "0.003 M", "a": "45 ± 15", "b": "22 ± 8", "ratio": "2.00"}

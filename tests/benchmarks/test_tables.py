@@ -72,7 +72,7 @@ def test_the_repository_is_changed_on_demand_alone(
     page.write_text("<!-- a -->\n<!-- /a -->\n")
     for flags, tree in (([], "OUTPUT"), (["--update-results"], "RESULTS")):
         args = common.parse(common.CommonFlags, None, flags)
-        args.write("a", [{"task": "ant"}])
+        args.replace("a", [{"task": "ant"}], ("task",))
         args.publish("a", "table\n", "page.md")
         assert list(tmp_path.glob("*/cpu/a.csv")) == [tmp_path / tree / "cpu" / "a.csv"]
         assert (
