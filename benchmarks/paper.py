@@ -25,33 +25,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
 
+import cells
 import common
 import fingerprints
 import numpy as np
 import tables
 import transfer
-from cells import (
-    GROUPS,
-    LEARNERS,
-    RETURNS,
-    Cell,
-    Curve,
-    Group,
-    Runner,
-    ScriptFlags,
-    begin,
-    checked,
-    counts,
-    curve,
-    done,
-    evaluation,
-    finer,
-    paces,
-    passing,
-    read_cells,
-    spread,
-    train,
-)
+from cells import GROUPS, LEARNERS, RETURNS, Cell, Curve, Group, Runner, ScriptFlags, curve, evaluation, read_cells
 from common import LEARNT, TASKS, Line, Panel, Tasks, check_names, load_case, plot, run
 from groups import Cells, grouped, middle, numbers
 from tables import ROOT, Row, markdown, read_csv
@@ -96,7 +76,7 @@ class Args(ScriptFlags):
         return self.output or (common.RESULTS if self.update_results else common.OUTPUT) / self.place
 
 
-def cells(args: Args) -> Iterator[Cell]:
+def wanted(args: Args) -> Iterator[Cell]:
     """Each once, those of seed 1 of all groups first."""
     found = {
         (seed, Cell(group.machine, learner, task, seed)): None
@@ -113,7 +93,7 @@ def measure_pace(args: Args, runner: Runner, cell: Cell) -> Row:
     """Of the second half of --pace iterations; empty if they are not there."""
     case = cell.case(args.runs / "pace")
     if not args.evaluate_only:
-        begin(runner, cell, case)
+        cells.begin(runner, cell, case)
         runner.train(case, args.pace)
     seconds = [float(row["seconds"]) for row in read_csv(case.folder / "progress.csv")]
     if len(seconds) < 2:
@@ -134,7 +114,7 @@ def measure(args: Args, runner: Runner, cell: Cell) -> Row:
     how, begun = state["args"], json.loads((case.folder / "cell.json").read_text())
     if state["iteration"] < how["iterations"] or not runner.evaluate(case):
         return {}
-    folders = case.folder, *(finer(case.folder, n) for n in checked(cell.task, how))
+    folders = case.folder, *(cells.finer(case.folder, n) for n in cells.checked(cell.task, how))
     own, finest, reference = map(evaluation, folders)
     progress, returns = read_csv(case.folder / "progress.csv"), RETURNS[cell.task]
     row: dict[str, object] = dict(zip(KEY, cell[1:], strict=True)) | begun
@@ -145,7 +125,7 @@ def measure(args: Args, runner: Runner, cell: Cell) -> Row:
     row |= {"kept": kept(own["return"], finest["return"]), "in the reference": reference["return"]}
     for target in returns.timed or (returns.target,):
         for x in ("control_steps", "seconds"):
-            row[f"{x} to {target}"] = passing(curve(progress), target, x)
+            row[f"{x} to {target}"] = cells.passing(curve(progress), target, x)
     found = transfer.in_mujoco(load_case(path, len(own["lengths"]), "cpu"))
     row |= {f"{name} in MuJoCo": found[name] for name in ("return", "speed") if found}
     if not args.alone(cell):
@@ -166,7 +146,7 @@ def curves(args: Args, name: str) -> dict[tuple[str, str], list[Curve]]:
     """By learner and task, of a group's seeds, where all of them are there; with seconds if the group is timed."""
     group = GROUPS[name]
     directory = args.directory.parent / group.machine
-    rows, known = read_csv(directory / "curves.csv"), paces(directory)
+    rows, known = read_csv(directory / "curves.csv"), cells.paces(directory)
     for row in rows:
         pace = known.get((row["learner"], row["task"]))
         if pace and not row["seconds"]:
@@ -222,7 +202,7 @@ def ratios(args: Args, name: str) -> list[Row]:
             end = min(run["control_steps"][-1] for runs in both for run in runs)
             best = [[float(np.nanmax(run["return"][run["control_steps"] <= end])) for run in runs] for runs in both]
             row: dict[str, object] = {"task": task, "control steps": f"{end / 1e6:.3g} M"}
-            row |= {learner: spread(values) for learner, values in zip((first, second), best, strict=True)}
+            row |= {learner: cells.spread(values) for learner, values in zip((first, second), best, strict=True)}
             rows.append(row | {"ratio": f"{mean(best[0]) / mean(best[1]):.2f}"})
     return rows
 
@@ -254,7 +234,7 @@ def table(args: Args, name: str) -> list[Row]:
         for learner in group.learners:
             wanted = {str(seed) for seed in range(1, group.seeds + 1)}
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
-            own = [row for row in own if counts(row, group.timed)]
+            own = [row for row in own if cells.counts(row, group.timed)]
             if len(own) == group.seeds and len({row["trained on"] for row in own}) == 1:
                 lines.append(line(own))
     return lines
@@ -273,9 +253,9 @@ def check(args: Args) -> str:
     """What is missing, a line for each learner and task; then csv files whose origin is unknown, or not in history."""
     lines, missing, count = list[str](), dict[tuple[str, str, str], list[Cell]](), 0
     known = {name: read_cells(common.RESULTS / name) for name in {GROUPS[g].machine for g in args.only}}
-    for cell in cells(args):
+    for cell in wanted(args):
         count += 1
-        if not done(known[cell.machine], cell):
+        if not cells.done(known[cell.machine], cell):
             missing.setdefault(cell[:3], []).append(cell)
     for each in missing.values():
         seeds = " ".join(str(cell.seed) for cell in each)
@@ -303,14 +283,14 @@ def measure_sentinels(args: Args, runner: Runner) -> None:
     """Train sentinels at this revision, and say in the newest link whether medians are within the published range."""
     link, verdicts = fingerprints.links()[-1], list[str]()
     for learner, task in sentinels(args, {*link["differ"].split()}):
-        cells = [Cell(args.place, learner, task, seed) for seed in range(1, SENTINELS + 1)]
-        cases = [cell.case(args.runs / "sentinels" / link["revision"]) for cell in cells]
-        for cell, case in zip(cells, cases, strict=True):
-            begin(runner, cell, case)
+        own = [Cell(args.place, learner, task, seed) for seed in range(1, SENTINELS + 1)]
+        cases = [cell.case(args.runs / "sentinels" / link["revision"]) for cell in own]
+        for cell, case in zip(own, cases, strict=True):
+            cells.begin(runner, cell, case)
             if not (runner.train(case) and runner.evaluate(case)):
                 return
-        own = (row for row in read_csv(common.RESULTS / args.place / "cells.csv") if row["task"] == task)
-        known = numbers((row for row in own if row["learner"] == learner), "return")
+        rows = (row for row in read_csv(common.RESULTS / args.place / "cells.csv") if row["task"] == task)
+        known = numbers((row for row in rows if row["learner"] == learner), "return")
         found = median(evaluation(case.folder)["return"] for case in cases)
         verdict = fingerprints.KEEPS if min(known) <= found <= max(known) else fingerprints.BREAKS
         told = f"{verdict}: {found:.0f} in {min(known):.0f} to {max(known):.0f}"
@@ -334,16 +314,16 @@ def main(args: Args) -> None:
     if args.sentinels:
         measure_sentinels(args, runner)
         return
-    for cell in () if args.draw_only else cells(args):
+    for cell in () if args.draw_only else wanted(args):
         if cell.machine != args.place:
             continue
         if args.pace:
             if cell.seed == 1 and (row := measure_pace(args, runner, cell)):
                 args.keep("pace", row, KEY[:2])
             continue
-        if done(read_cells(args.directory), cell):
+        if cells.done(read_cells(args.directory), cell):
             continue
-        if not args.evaluate_only and not train(runner, cell):
+        if not args.evaluate_only and not cells.train(runner, cell):
             continue
         if not args.train_only and (row := measure(args, runner, cell)):
             args.keep("cells", row, KEY)

@@ -46,7 +46,7 @@ def test_a_training_depends_on_its_learner_its_task_and_its_flags() -> None:
         "shac --accuracy accurate --env cartpole": {"shac", "cartpole", "accurate"},
     }.items():
         assert fingerprints.depends(command) == names
-    for cell in paper.cells(paper.Args()):  # none is without a fingerprint of its learner and of its task
+    for cell in paper.wanted(paper.Args()):  # none is without a fingerprint of its learner and of its task
         script, *_ = paper.LEARNERS[cell.learner].split()
         names = fingerprints.depends(f"{paper.LEARNERS[cell.learner]} --env {cell.task}")
         assert script in names and (cell.task == "hopper" or cell.task in names)
@@ -132,7 +132,7 @@ def test_a_sentinel_beyond_the_published_range_breaks_the_chain(
         for value in ("4", "6")
     ]
     monkeypatch.setattr(paper, "read_csv", lambda path: rows)
-    monkeypatch.setattr(paper, "begin", lambda *_: {})
+    monkeypatch.setattr("cells.begin", lambda *_: {})
     monkeypatch.setattr(paper, "evaluation", lambda folder: {"return": returns[folder.name.partition("__")[0]]})
     monkeypatch.setattr("tables.replace_csv", lambda path, rows, *_: written.extend(rows))
     monkeypatch.setattr("cells.Runner.train", lambda *_: True)

@@ -41,16 +41,16 @@ def history() -> bool:
 
 
 def test_every_cell_is_there_once_the_first_seeds_first() -> None:
-    found = list(paper.cells(paper.Args()))
+    found = list(paper.wanted(paper.Args()))
     assert len(found) == len({*found}) and [cell.seed for cell in found] == sorted(cell.seed for cell in found)
     for group in (group for group in paper.GROUPS.values() if not group.older):
         assert group.machine in ("cpu", "h200") and group.seeds >= 3
         for learner in group.learners:
             assert paper.Cell(group.machine, learner, group.tasks[-1], group.seeds) in found
-    (one,) = paper.cells(paper.Args(only=("headline",), learners=("sapo",), env=("hopper",), seeds=(4,)))
+    (one,) = paper.wanted(paper.Args(only=("headline",), learners=("sapo",), env=("hopper",), seeds=(4,)))
     assert one == paper.Cell("h200", "sapo", "hopper", 4) and one.timed
     assert not paper.Cell("cpu", "shac_fast", "cartpole", 1).timed and paper.Cell("cpu", "shac", "cartpole", 1).timed
-    some = list(paper.cells(paper.Args(only=("headline", "large_batch"), env=("humanoid_mtu",), seeds=(2, 4))))
+    some = list(paper.wanted(paper.Args(only=("headline", "large_batch"), env=("humanoid_mtu",), seeds=(2, 4))))
     assert {(cell.learner, cell.seed) for cell in some} == {
         *((learner, seed) for learner in ("shac", "sapo", "ppo_4096") for seed in (2, 4)),
         ("sac_large", 2),
@@ -194,7 +194,7 @@ def test_mistakes_are_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: 
     cell = paper.Cell("cpu", "shac", "cartpole", 1)
 
     def begin() -> None:
-        paper.train(Runner(paper.Args(runs=Path("nowhere"))), cell)
+        paper.cells.train(Runner(paper.Args(runs=Path("nowhere"))), cell)
 
     assert refusal(begin, capsys).endswith("a cell is of a commit, not of 1234567-dirty")
     monkeypatch.setattr(tables, "revision", lambda: "1234567")
