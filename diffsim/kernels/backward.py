@@ -39,8 +39,10 @@ from diffsim.robot.scene import FACTORS
 @cache
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
-    T, vec2, vec3, vec6, quat = t.T, t.vec2, t.vec3, t.vec6, t.quat
-    Model, Link, law_of, solve_with_factor = t.Model, t.Link, environment_law(spec), factor_solve(spec)
+    T, vec2, vec3, vec6, quat, Model, Law, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Law, t.Lane
+    Link, Node, Adjoint, Base = t.Link, t.Node, t.Adjoint, t.Base
+    Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.array
+    law_of, solve_with_factor = environment_law(spec), factor_solve(spec)
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint = muscle_law(spec), constraint_law(spec)
@@ -53,20 +55,344 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     read, write, pick = block.read, block.write, block.pick
     VADR, NBALL, BALL_SPRING = spec.dof0 - 1, spec.nball, spec.nball > 0 and "stiffness" in spec.features
-    NFACTORS, NBODY = len(FACTORS), spec.forced
-    SOME_FACTORS = NFACTORS if VARIED else 1  # nobody reads or writes it where none vary
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
+    # Local arrays have at least one element, also where nobody reads them.
+    NFACTORS, PULLS, BODIES = (len(FACTORS) if VARIED else 1), (NU if MUSCLE else 1), max(spec.forced, 1)
 
     @wp.func
-    def next_rate(ck_v: t.array3, ck_a: t.array3, row: int, k: int, e: int, h: T):
-        """Three rates in a row at the end of the substep."""
-        v = vec3(load(ck_v, row, k, e), load(ck_v, row, k + 1, e), load(ck_v, row, k + 2, e))
-        return v + h * vec3(load(ck_a, row, k, e), load(ck_a, row, k + 1, e), load(ck_a, row, k + 2, e))
+    def rates(a: t.array3, here: Lane, k: int):
+        """Three rates of a checkpoint's row."""
+        return vec3(load(a, here.row, k, here.e), load(a, here.row, k + 1, here.e), load(a, here.row, k + 2, here.e))
+
+    @wp.func
+    def next_rates(ck: Ck, here: Lane, k: int, h: T):
+        """Three rates at the end of the substep."""
+        return rates(ck.v, here, k) + h * rates(ck.a, here, k)
+
+    @wp.func
+    def end_of(m: Model, here: Lane, ck: Ck, h: T, g_qpos: t.array2, g_qvel: t.array2, nodes: Nodes):
+        """Into nodes the gradient of the state after the substep here.row; returns the base's."""
+        e = here.e
+        for i in range(1, here.n):
+            nodes[i].gq = read(g_qpos, e, qpos_adr(m, here.at + i))
+            nodes[i].gqd = read(g_qvel, e, VADR + link_of(m, here.at + i))
+        if wp.static(NBALL > 0):
+            for b in range(m.ball_count[here.lane]):
+                i = m.ball_slot[here.lane * NBALL + b]
+                adr = qpos_adr(m, here.at + i)
+                wb = next_rates(ck, here, VADR + link_of(m, here.at + i), h)
+                rot_b = wp.normalize(kin.load_quat_row(ck.q, here.row, adr, e) * sp.exp_quat(h * wb))
+                gb = sp.to_tangent(rot_b, kin.load_quat(g_qpos, e, adr))
+                for k in range(3):
+                    nodes[i + k].gq = gb[k]
+        base = Base()
+        if wp.static(FLOATING):
+            w = next_rates(ck, here, 3, h)
+            rot = wp.normalize(kin.load_quat_row(ck.q, here.row, 3, e) * sp.exp_quat(h * w))
+            base.gp = vec3(read(g_qpos, e, 0), read(g_qpos, e, 1), read(g_qpos, e, 2))
+            base.gr = sp.to_tangent(rot, kin.load_quat(g_qpos, e, 3))
+            base.gv = vec3(read(g_qvel, e, 0), read(g_qvel, e, 1), read(g_qvel, e, 2))
+            base.gw = vec3(read(g_qvel, e, 3), read(g_qvel, e, 4), read(g_qvel, e, 5))
+        return base
+
+    @wp.func
+    def balls_state(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes):
+        """Into links the turns of the ball joints, into nodes the adjoint of their integrator."""
+        turn = wp.zeros(shape=wp.static(max(NBALL, 1)), dtype=quat)
+        for b in range(m.ball_count[here.lane]):
+            i = m.ball_slot[here.lane * NBALL + b]
+            turn[b] = kin.load_quat_row(ck.q, here.row, qpos_adr(m, here.at + i), here.e)
+            gb = vec3(nodes[i].gq, nodes[i + 1].gq, nodes[i + 2].gq)
+            rate = next_rates(ck, here, VADR + link_of(m, here.at + i), law.h)
+            gb_turn, gb_start = sp.exp_adjoint(law.h * rate, gb)
+            for k in range(3):
+                nodes[i + k].gqd = nodes[i + k].gqd + law.h * (gb_turn[k] - gb[k])
+                nodes[i + k].gq = gb_start[k]
+        kin.place_balls(m, here, turn, links)
+
+    @wp.func
+    def base_state(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
+        """The floating base's motion into links[0] and nodes[0]; returns it with the adjoint of its integrator."""
+        rot = kin.load_quat_row(ck.q, here.row, 3, here.e)
+        v = rates(ck.v, here, 0)
+        w = rates(ck.v, here, 3)
+        vdot = rates(ck.a, here, 0) - vec3(m.gravity)
+        wdot = rates(ck.a, here, 3)
+        g_turn, gr_start = sp.exp_adjoint(law.h * (w + law.h * wdot), base.gr)
+        base.gv = base.gv + law.h * base.gp
+        base.gw = base.gw + law.h * g_turn
+        base.gr = gr_start
+        R = wp.quat_to_matrix(rot)
+        links[0].R = R
+        links[0].V = join(R * w, v)
+        if wp.static(DAMPED):
+            nodes[0].D = join(R * wdot, vdot)
+        if wp.static(CONSTRAINED):
+            vdot = rates(ck.a, here, NV) - vec3(m.gravity)
+            wdot = rates(ck.a, here, NV + 3)
+        if wp.static(DAMPED):
+            nodes[0].D = nodes[0].D - join(R * wdot, vdot)
+        nodes[0].A = join(R * wdot, vdot - wp.cross(R * w, v))
+        if wp.static(CONSTRAINED):
+            nodes[0].B = join(R * wdot, vdot + vec3(m.gravity))
+        base.v = v
+        base.vdot = vdot
+        return base
+
+    @wp.func
+    def joints_state(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes):
+        """How the links move, into nodes."""
+        for i in range(1, here.n):
+            k = here.at + i
+            p = m.parent[k]
+            own = links[i]  # X
+            turning = i
+            if wp.static(NBALL > 0):
+                turning = m.inboard[k]
+            adr = VADR + link_of(m, k)
+            qdd = load(ck.a, here.row, int(CONSTRAINED) * NV + adr, here.e)
+            nodes[i].A = nodes[p].A + own.S * qdd + wp.spatial_cross(links[turning].V, own.S * own.qd)
+            if wp.static(CONSTRAINED):
+                nodes[i].rate = qdd
+                nodes[i].B = nodes[p].B + own.S * qdd
+            if wp.static(DAMPED):
+                nodes[i].D = nodes[p].D + own.S * (load(ck.a, here.row, adr, here.e) - qdd)
+            if wp.static(CLAMP):
+                ahead = own.q
+                if wp.static(IMPLICIT):
+                    ahead = ahead + law.theta * law.h * own.qd
+                nodes[i].free = joint.actuation_free(m, k, nodes[i].driven, ahead, own.qd)
+
+    @wp.func
+    def solve(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
+        """lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
+        first, and g + h b lambda1 reaches the acceleration before it."""
+        g_base = vec6()
+        if wp.static(FLOATING):
+            g_base = join(links[0].R * base.gw, base.gv)
+        for s in range(SOLVES):
+            for i in range(here.n):
+                nodes[i].g = nodes[i].gqd
+                if wp.static(DAMPED):
+                    nodes[i].W1 = nodes[i].W
+                    within = T(1.0)
+                    if wp.static(CLAMP):
+                        within = nodes[i].free
+                    nodes[i].g = nodes[i].gqd + T(s) * joint.damping(m, here.at + i, within) * nodes[i].lam
+            solve_with_factor(m, law, here, ck, SOLVES * here.row + s, links, nodes, g_base)
+
+    @wp.func
+    def partials(
+        m: Model, law: Law, here: Lane, links: Links, nodes: Nodes, place: t.Place, adj: Adjoints, adj_factors: Array
+    ):
+        """Into adj the partial derivatives of phi, link by link."""
+        for i in range(1, INERT + 1):
+            adj[i] = Adjoint()
+        for i in range(FIRST, here.n):
+            k = here.at + i
+            own = link.link_adjoint(m, law, k, links[i], nodes[i], place, adj_factors)
+            if wp.static(CONSTRAINED and CONTACT):
+                own = constraint.add_contacts_adjoint(m, law, k, links[i], nodes[i], place, own, adj_factors)
+            if wp.static(DAMPED):
+                own = link.add_damping_adjoint(m, law, k, links[i], nodes[i], own, adj_factors)
+            adj[i] = own
+
+    @wp.func
+    def joint_gain(m: Model, law: Law, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
+        """Derivatives of the joint's force with respect to q and qd."""
+        k = here.at + i
+        qi = link.q
+        end_rate = link.qd
+        if wp.static(IMPLICIT):
+            qi = qi + law.theta * law.h * link.qd
+            if wp.static(LIMIT):
+                end_rate = end_rate + law.h * load(ck.a, here.row, VADR + link_of(m, k), here.e)
+        within = T(1.0)
+        if wp.static(CLAMP):
+            within = own.free
+        gain = joint.gain(m, law, k, qi, link.qd, end_rate, within)
+        if wp.static(VARIED and LIMIT):
+            if m.carried[k] == 1:  # of the lanes that have the joint
+                by = joint.limit_constants_gain(m, law, k, qi, link.qd, end_rate, law.theta * law.h)
+                adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * by[0]
+                adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - own.lam * by[1]
+        if wp.static(CONSTRAINED):
+            of_held = constraint.joint_gain(m, law, k, link.q, link.qd, own.rate)
+            gain = gain + vec2(of_held[0], of_held[1])
+            if wp.static(VARIED):
+                if m.carried[k] == 1:
+                    adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * of_held[2]
+        if wp.static(IMPLICIT):
+            gain[1] = gain[1] + law.theta * law.h * gain[0]
+        return gain
+
+    @wp.func
+    def inward(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints, adj_factors: Array):
+        """Sums adj over subtrees and projects it on the joints."""
+        slots = int(SLOTS)
+        if wp.static(SHARERS > 1):
+            sums.sharers.add_adjoints(adj)
+        for j in range(1, slots + 1):
+            i = slots - j
+            if wp.static(THREADS_PER_ENV > SHARERS):
+                if i == TRUNK:
+                    sums.limbs.add_adjoints(adj)
+            if i > 0 and i < here.n:
+                k = here.at + i
+                p = m.parent[k]
+                turned = i
+                if wp.static(NBALL > 0):
+                    p = m.inboard[k]
+                    turned = m.outboard[k]
+                own = nodes[i]
+                gain = joint_gain(m, law, here, i, ck, links[i], own, adj_factors)
+                S = links[i].S
+                by = adj[i]
+                xv = by.v - wp.spatial_cross_dual(links[p].V, by.a)
+                gq = (
+                    own.gq
+                    + wp.dot(by.p, S)
+                    - wp.dot(xv, wp.spatial_cross(S, links[p].V))
+                    - wp.dot(by.w, wp.spatial_cross(S, nodes[p].W))
+                    - wp.dot(by.a, wp.spatial_cross(S, nodes[p].A))
+                    - own.lam * gain[0]
+                )
+                if wp.static(CONSTRAINED):
+                    gq = gq - wp.dot(by.b, wp.spatial_cross(S, nodes[p].B))
+                if wp.static(DAMPED):
+                    gq = gq - wp.dot(by.d, wp.spatial_cross(S, nodes[p].D))
+                    gq = gq - wp.dot(by.w1, wp.spatial_cross(S, nodes[p].W1))
+                nodes[i].gq = gq
+                nodes[i].gqd = (
+                    own.gqd + wp.dot(xv - wp.spatial_cross_dual(links[turned].V, by.a), S) - own.lam * gain[1]
+                )
+                within = T(1.0)
+                if wp.static(CLAMP):
+                    within = own.free
+                nodes[i].gtau = own.gtau - within * own.lam
+                if wp.static(NBALL > 0):
+                    p = m.parent[k]
+                if wp.static(FLOATING) or p > 0:
+                    adj[p] = link.plus(adj[p], by)
+
+    @wp.func
+    def ball_springs(m: Model, here: Lane, links: Links, nodes: Nodes):
+        """The spring sees the rotation vector, whose derivative in the tangent space is not the identity."""
+        for b in range(m.ball_count[here.lane]):
+            i = m.ball_slot[here.lane * NBALL + b]
+            lb = vec3(nodes[i].lam, nodes[i + 1].lam, nodes[i + 2].lam)
+            turn = vec3(links[i].q, links[i + 1].q, links[i + 2].q)
+            lb = T(m.stiffness[here.at + i]) * (sp.log_adjoint(turn, lb) - lb)
+            for k in range(3):
+                nodes[i + k].gq = nodes[i + k].gq + lb[k]
+
+    @wp.func
+    def base_inward(link: Link, own: Node, adj: Adjoint, base: Base):
+        """The floating base is a translation, whose "parent" twists are pure linear ones, then a ball joint."""
+        vp = join(vec3(), base.v)
+        wl = join(vec3(), wp.spatial_bottom(own.W))
+        ap = join(vec3(), base.vdot)
+        xv = adj.v - wp.spatial_cross_dual(vp, adj.a)
+        tq = adj.p - wp.spatial_cross_dual(vp, xv)
+        tq = tq - wp.spatial_cross_dual(wl, adj.w) - wp.spatial_cross_dual(ap, adj.a)
+        if wp.static(CONSTRAINED):
+            tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(own.B)), adj.b)
+        if wp.static(DAMPED):
+            tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(own.D)), adj.d)
+            tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(own.W1)), adj.w1)
+        tw = xv - wp.spatial_cross_dual(link.V, adj.a)
+        base.gp = base.gp + wp.spatial_bottom(adj.p)
+        base.gr = base.gr + wp.transpose(link.R) * wp.spatial_top(tq)
+        base.gv = base.gv + wp.spatial_bottom(xv)
+        base.gw = base.gw + wp.transpose(link.R) * wp.spatial_top(tw)
+        return base
+
+    @wp.func
+    def broken_numbers(
+        m: Model, here: Lane, base: Base, nodes: Nodes, adj_pull: Array, adj_factors: Array, adj_forces: t.vec6s
+    ):
+        """How many numbers of the gradient are not finite."""
+        broken = T(0.0)
+        for i in range(1, here.n):
+            broken = broken + block.broken(nodes[i].gq) + block.broken(nodes[i].gqd) + block.broken(nodes[i].gtau)
+        if wp.static(FLOATING):
+            for k in range(3):
+                broken = broken + block.broken(base.gp[k]) + block.broken(base.gr[k])
+                broken = broken + block.broken(base.gv[k]) + block.broken(base.gw[k])
+        if wp.static(MUSCLE):
+            for entry in range(m.muscle_begin[here.lane], m.muscle_begin[here.lane + 1]):
+                broken = broken + block.broken(adj_pull[m.muscle[entry]])
+        if wp.static(VARIED):
+            for k in range(NFACTORS):
+                broken = broken + block.broken(adj_factors[k])
+        if wp.static(FORCED):
+            broken = broken + force.broken_forces(m, here, adj_forces)
+        if wp.static(THREADS_PER_ENV > 1):
+            broken = sums.add(broken)
+        return broken
 
     @wp.func
     def hand_out(out: t.array2, e: int, column: int, drop: T, value: T):
         """Writes the value, but 0 where the gradient is dropped."""
         write(out, e, column, pick(T(0.0), drop, T(0.0), value))
+
+    @wp.func
+    def write_controls(
+        m: Model,
+        law: Law,
+        here: Lane,
+        drop: T,
+        ctrl: t.array2,
+        nodes: Nodes,
+        adj_pull: Array,
+        adj_factors: Array,
+        g: t.Start,
+    ):
+        """Writes the gradients of actions and factors."""
+        for k in range(NU):
+            if m.motor_lane[k] == here.lane:
+                by = T(0.0)
+                if wp.static(DRIVEN):
+                    by = nodes[m.motor_slot[here.lane * NU + k]].gtau
+                if wp.static(MUSCLE):
+                    by = by + adj_pull[k]
+                if wp.static(VARIED):
+                    motor = T(m.gear[k]) * read(ctrl, here.e, k) + T(m.motor_bias[k])
+                    adj_factors[MOTOR] = adj_factors[MOTOR] + by * motor
+                    by = law.motor * by
+                hand_out(g.ctrl, here.e, k, drop, by * T(m.gear[k]))
+        if wp.static(VARIED):
+            for k in range(NFACTORS):
+                total = adj_factors[k]
+                if wp.static(THREADS_PER_ENV > 1):
+                    total = sums.add(total)
+                if here.lane == 0:
+                    hand_out(g.factors, here.e, k, drop, total)
+
+    @wp.func
+    def write_state(m: Model, here: Lane, drop: T, qpos: t.array2, base: Base, nodes: Nodes, g: t.Start):
+        """Writes the gradients of qpos and qvel."""
+        e = here.e
+        for i in range(1, here.n):
+            hand_out(g.qpos, e, qpos_adr(m, here.at + i), drop, nodes[i].gq)
+            hand_out(g.qvel, e, VADR + link_of(m, here.at + i), drop, nodes[i].gqd)
+        if wp.static(NBALL > 0):
+            for b in range(m.ball_count[here.lane]):
+                i = m.ball_slot[here.lane * NBALL + b]
+                adr = qpos_adr(m, here.at + i)
+                gb = vec3(nodes[i].gq, nodes[i + 1].gq, nodes[i + 2].gq)
+                gb4 = sp.from_tangent(kin.load_quat(qpos, e, adr), gb)
+                hand_out(g.qpos, e, adr, drop, gb4[3])
+                for k in range(3):
+                    hand_out(g.qpos, e, adr + 1 + k, drop, gb4[k])
+        if wp.static(FLOATING):
+            g4 = sp.from_tangent(kin.load_quat(qpos, e, 3), base.gr)
+            for k in range(3):
+                hand_out(g.qpos, e, k, drop, base.gp[k])
+                hand_out(g.qpos, e, 4 + k, drop, g4[k])
+                hand_out(g.qvel, e, k, drop, base.gv[k])
+                hand_out(g.qvel, e, 3 + k, drop, base.gw[k])
+            hand_out(g.qpos, e, 3, drop, g4[3])
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def backward(
@@ -78,378 +404,74 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         substeps: int,
         # checkpoint in
         row0: int,
-        ck_q: t.array3,
-        ck_v: t.array3,
-        ck_a: t.array3,
-        ck_f: t.array3,
-        # the state that came in (its quaternion may not be of unit length), and whether the step was contained
-        qpos: t.array2,
-        ctrl: t.array2,
-        factors: t.array2,
-        forces: t.array2,
+        ck: t.Checkpoint,
+        # what came in (its quaternions may not be of unit length), and whether the step was contained
+        start: t.Start,
         nonfinite: wp.array(dtype=wp.bool),
         # gradient in
         g_qpos_out: t.array2,
         g_qvel_out: t.array2,
         # gradient out
-        g_qpos: t.array2,
-        g_qvel: t.array2,
-        g_ctrl: t.array2,
-        g_factors: t.array2,
-        g_forces: t.array2,
+        g: t.Start,
         nonfinite_gradients: wp.array(dtype=int),
     ):
-        h = T(seconds)
-        theta = T(implicitness)
         here = kin.lane_of(m, first, wp.tid())
-        e = here.e
-        lane = here.lane
-        at = here.at
-        n = here.n
-        slots = int(SLOTS)
+        law = law_of(m, T(seconds), T(implicitness), start.factors, here.e)
         links = wp.zeros(shape=SLOTS, dtype=Link)
-        A = wp.zeros(shape=SLOTS, dtype=vec6)
-        W = wp.zeros(shape=SLOTS, dtype=vec6)
-        adj_a = wp.zeros(shape=SLOTS, dtype=vec6)
-        adj_v = wp.zeros(shape=SLOTS, dtype=vec6)
-        adj_w = wp.zeros(shape=SLOTS, dtype=vec6)
-        adj_p = wp.zeros(shape=SLOTS, dtype=vec6)
-        gq = wp.zeros(shape=SLOTS, dtype=T)
-        gqd = wp.zeros(shape=SLOTS, dtype=T)
-        gtau = wp.zeros(shape=SLOTS, dtype=T)
-        lam = wp.zeros(shape=SLOTS, dtype=T)
-        u = wp.zeros(shape=SLOTS, dtype=T)
-        law = law_of(m, h, theta, factors, e)
+        nodes = wp.zeros(shape=SLOTS, dtype=Node)
+        adj = wp.zeros(shape=SLOTS, dtype=Adjoint)
+        adj_factors = wp.zeros(shape=NFACTORS, dtype=T)
+        adj_forces = wp.zeros(shape=BODIES, dtype=vec6)
+        pull = wp.zeros(shape=PULLS, dtype=T)
+        adj_pull = wp.zeros(shape=PULLS, dtype=T)
         if wp.static(CLAMP):
             driven = wp.zeros(shape=SLOTS, dtype=T)
-            joint.drive(m, law, here, ctrl, driven)
-            free = wp.zeros(shape=SLOTS, dtype=T)  # see joint.py
-        adj_factors = wp.zeros(shape=SOME_FACTORS, dtype=T)
-        if wp.static(FORCED):
-            adj_forces = wp.zeros(shape=NBODY, dtype=vec6)
-        for i in range(1, n):
-            gq[i] = read(g_qpos_out, e, qpos_adr(m, at + i))
-            gqd[i] = read(g_qvel_out, e, VADR + link_of(m, at + i))
+            joint.drive(m, law, here, start.ctrl, driven)
+            for i in range(1, here.n):
+                nodes[i].driven = driven[i]
         if wp.static(MUSCLE):
-            pull = wp.zeros(shape=NU, dtype=T)
-            adj_pull = wp.zeros(shape=NU, dtype=T)
-            muscle.activate(m, law, here, ctrl, pull)
-        if wp.static(CONSTRAINED):
-            B = wp.zeros(shape=SLOTS, dtype=vec6)  # as in the forward kernel, and its adjoint
-            adj_b = wp.zeros(shape=SLOTS, dtype=vec6)
-            rate = wp.zeros(shape=SLOTS, dtype=T)  # the acceleration, before damping
-        if wp.static(DAMPED):
-            W1 = wp.zeros(shape=SLOTS, dtype=vec6)
-            D = wp.zeros(shape=SLOTS, dtype=vec6)  # what damping adds to B
-            ga = wp.zeros(shape=SLOTS, dtype=T)
-            adj_d = wp.zeros(shape=SLOTS, dtype=vec6)
-            adj_w1 = wp.zeros(shape=SLOTS, dtype=vec6)
+            muscle.activate(m, law, here, start.ctrl, pull)
         links[0].R = wp.identity(3, dtype=T)
-        end = row0 + substeps - 1
-        if wp.static(NBALL > 0):
-            turn = wp.zeros(shape=NBALL, dtype=quat)
-            for b in range(m.ball_count[lane]):
-                i = m.ball_slot[lane * NBALL + b]
-                adr = qpos_adr(m, at + i)
-                wb = next_rate(ck_v, ck_a, end, VADR + link_of(m, at + i), e, h)
-                rot_b = wp.normalize(kin.load_quat_row(ck_q, end, adr, e) * sp.exp_quat(h * wb))
-                gb = sp.to_tangent(rot_b, kin.load_quat(g_qpos_out, e, adr))
-                for k in range(3):
-                    gq[i + k] = gb[k]
-        if wp.static(FLOATING):
-            w = next_rate(ck_v, ck_a, end, 3, e, h)
-            rot = wp.normalize(kin.load_quat_row(ck_q, end, 3, e) * sp.exp_quat(h * w))
-            gp = vec3(read(g_qpos_out, e, 0), read(g_qpos_out, e, 1), read(g_qpos_out, e, 2))
-            gr = sp.to_tangent(rot, kin.load_quat(g_qpos_out, e, 3))
-            gv = vec3(read(g_qvel_out, e, 0), read(g_qvel_out, e, 1), read(g_qvel_out, e, 2))
-            gw = vec3(read(g_qvel_out, e, 3), read(g_qvel_out, e, 4), read(g_qvel_out, e, 5))
-
+        here.row = row0 + substeps - 1
+        base = end_of(m, here, ck, law.h, g_qpos_out, g_qvel_out, nodes)
         for sub in range(substeps):
-            row = row0 + substeps - 1 - sub
+            here.row = row0 + substeps - 1 - sub
             # 1. the state of this substep, and the adjoint of the integrator
             place = kin.carrier_place(m, T(0.0), T(0.0))
-            A[0] = join(vec3(), -vec3(m.gravity))
-            for i in range(1, n):
-                links[i].q = load(ck_q, row, qpos_adr(m, at + i), e)
-                links[i].qd = load(ck_v, row, VADR + link_of(m, at + i), e)
-                gqd[i] = gqd[i] + h * gq[i]
+            nodes[0].A = join(vec3(), -vec3(m.gravity))
+            for i in range(1, here.n):
+                links[i].q = load(ck.q, here.row, qpos_adr(m, here.at + i), here.e)
+                links[i].qd = load(ck.v, here.row, VADR + link_of(m, here.at + i), here.e)
+                nodes[i].gqd = nodes[i].gqd + law.h * nodes[i].gq
             if wp.static(NBALL > 0):
-                for b in range(m.ball_count[lane]):
-                    i = m.ball_slot[lane * NBALL + b]
-                    turn[b] = kin.load_quat_row(ck_q, row, qpos_adr(m, at + i), e)
-                    gb = vec3(gq[i], gq[i + 1], gq[i + 2])
-                    gb_turn, gb_start = sp.exp_adjoint(
-                        h * next_rate(ck_v, ck_a, row, VADR + link_of(m, at + i), e, h), gb
-                    )
-                    for k in range(3):
-                        gqd[i + k] = gqd[i + k] + h * (gb_turn[k] - gb[k])
-                        gq[i + k] = gb_start[k]
-                kin.place_balls(m, here, turn, links)
+                balls_state(m, law, here, ck, links, nodes)
             if wp.static(FLOATING):
-                rot = kin.load_quat_row(ck_q, row, 3, e)
-                v = vec3(load(ck_v, row, 0, e), load(ck_v, row, 1, e), load(ck_v, row, 2, e))
-                w = vec3(load(ck_v, row, 3, e), load(ck_v, row, 4, e), load(ck_v, row, 5, e))
-                vdot = vec3(load(ck_a, row, 0, e), load(ck_a, row, 1, e), load(ck_a, row, 2, e)) - vec3(m.gravity)
-                wdot = vec3(load(ck_a, row, 3, e), load(ck_a, row, 4, e), load(ck_a, row, 5, e))
-                g_turn, gr_start = sp.exp_adjoint(h * (w + h * wdot), gr)
-                gv = gv + h * gp
-                gw = gw + h * g_turn
-                gr = gr_start
-                place = kin.carrier_place(m, load(ck_q, row, 0, e), load(ck_q, row, 2, e))
-                links[0].R = wp.quat_to_matrix(rot)
-                links[0].V = join(links[0].R * w, v)
-                if wp.static(DAMPED):
-                    D[0] = join(links[0].R * wdot, vdot)
-                if wp.static(CONSTRAINED):
-                    vdot = vec3(load(ck_a, row, NV, e), load(ck_a, row, NV + 1, e), load(ck_a, row, NV + 2, e))
-                    vdot = vdot - vec3(m.gravity)
-                    wdot = vec3(load(ck_a, row, NV + 3, e), load(ck_a, row, NV + 4, e), load(ck_a, row, NV + 5, e))
-                if wp.static(DAMPED):
-                    D[0] = D[0] - join(links[0].R * wdot, vdot)
-                A[0] = join(links[0].R * wdot, vdot - wp.cross(links[0].R * w, v))
-                if wp.static(CONSTRAINED):
-                    B[0] = join(links[0].R * wdot, vdot + vec3(m.gravity))
+                base = base_state(m, law, here, ck, links, nodes, base)
+                place = kin.carrier_place(m, load(ck.q, here.row, 0, here.e), load(ck.q, here.row, 2, here.e))
             place = kin.place_links(m, here, links, place)
-            for i in range(1, n):
-                k = at + i
-                p = m.parent[k]
-                links[i].V = links[p].V + links[i].S * links[i].qd
-                turning = i
-                if wp.static(NBALL > 0):
-                    turning = m.inboard[k]
-                qdd = load(ck_a, row, int(CONSTRAINED) * NV + VADR + link_of(m, k), e)
-                A[i] = A[p] + links[i].S * qdd + wp.spatial_cross(links[turning].V, links[i].S * links[i].qd)
-                if wp.static(CONSTRAINED):
-                    rate[i] = qdd
-                    B[i] = B[p] + links[i].S * qdd
-                if wp.static(DAMPED):
-                    D[i] = D[p] + links[i].S * (load(ck_a, row, VADR + link_of(m, k), e) - qdd)
-                if wp.static(CLAMP):
-                    ahead = links[i].q
-                    if wp.static(IMPLICIT):
-                        ahead = ahead + theta * h * links[i].qd
-                    free[i] = joint.actuation_free(m, k, driven[i], ahead, links[i].qd)
-            # 2. lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
-            # first, and g + h b lambda1 reaches the acceleration before it.
-            g_base = vec6()
-            if wp.static(FLOATING):
-                g_base = join(links[0].R * gw, gv)
-            for solve in range(SOLVES):
-                if wp.static(DAMPED):
-                    for i in range(n):
-                        W1[i] = W[i]
-                        within = T(1.0)
-                        if wp.static(CLAMP):
-                            within = free[i]
-                        ga[i] = gqd[i] + T(solve) * joint.damping(m, at + i, within) * lam[i]
-                    solve_with_factor(m, here, ck_f, SOLVES * row + solve, links, h, g_base, ga, u, W, lam)
-                else:
-                    solve_with_factor(m, here, ck_f, row, links, h, g_base, gqd, u, W, lam)
-            # 3. the partial derivatives of phi, link by link
-            for i in range(1, INERT + 1):
-                adj_a[i] = vec6()
-                adj_v[i] = vec6()
-                adj_w[i] = vec6()
-                adj_p[i] = vec6()
-                if wp.static(CONSTRAINED):
-                    adj_b[i] = vec6()
-                if wp.static(DAMPED):
-                    adj_d[i] = vec6()
-                    adj_w1[i] = vec6()
-            for i in range(FIRST, n):
-                la, lv, lw, lp = link.link_adjoint(m, law, at + i, links[i], A[i], W[i], place, adj_factors)
-                if wp.static(CONSTRAINED and CONTACT):
-                    lv, lw, lp, l_twist = constraint.add_contacts_adjoint(
-                        m, law, at + i, links[i], B[i], W[i], place, lv, lw, lp, adj_factors
-                    )
-                    adj_b[i] = l_twist
-                adj_a[i] = la
-                adj_v[i] = lv
-                adj_w[i] = lw
-                adj_p[i] = lp
-                if wp.static(DAMPED):
-                    # phi has W1 . I D besides.
-                    ld, lw1 = link.damping_adjoint(m, law, at + i, links[i], D[i], W1[i], adj_factors)
-                    adj_d[i] = ld
-                    adj_w1[i] = lw1
+            joints_state(m, law, here, ck, links, nodes)
+            # 2. to 4.
+            solve(m, law, here, ck, links, nodes, base)
+            partials(m, law, here, links, nodes, place, adj, adj_factors)
             if wp.static(FORCED):
-                force.add_forces_adjoint(m, here, forces, links, W, adj_w, adj_p, adj_forces)
+                force.add_forces_adjoint(m, here, start.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):
-                muscle.add_muscles_adjoint(m, here, pull, links, W, adj_w, adj_p, adj_pull)
-            # 4. inward: sum over subtrees, project on the joints
-            if wp.static(SHARERS > 1):
-                sums.sharers.add_vectors(adj_a)
-                sums.sharers.add_vectors(adj_v)
-                sums.sharers.add_vectors(adj_w)
-                sums.sharers.add_vectors(adj_p)
-                if wp.static(CONSTRAINED):
-                    sums.sharers.add_vectors(adj_b)
-                if wp.static(DAMPED):
-                    sums.sharers.add_vectors(adj_d)
-                    sums.sharers.add_vectors(adj_w1)
-            for j in range(1, slots + 1):
-                i = slots - j
-                if wp.static(THREADS_PER_ENV > SHARERS):
-                    if i == TRUNK:
-                        sums.limbs.add_vectors(adj_a)
-                        sums.limbs.add_vectors(adj_v)
-                        sums.limbs.add_vectors(adj_w)
-                        sums.limbs.add_vectors(adj_p)
-                        if wp.static(CONSTRAINED):
-                            sums.limbs.add_vectors(adj_b)
-                        if wp.static(DAMPED):
-                            sums.limbs.add_vectors(adj_d)
-                            sums.limbs.add_vectors(adj_w1)
-                if i > 0 and i < n:
-                    k = at + i
-                    p = m.parent[k]
-                    turned = i
-                    if wp.static(NBALL > 0):
-                        p = m.inboard[k]
-                        turned = m.outboard[k]
-                    qi = links[i].q
-                    end_rate = links[i].qd
-                    if wp.static(IMPLICIT):
-                        qi = qi + theta * h * links[i].qd
-                        if wp.static(LIMIT):
-                            end_rate = end_rate + h * load(ck_a, row, VADR + link_of(m, k), e)
-                    within = T(1.0)
-                    if wp.static(CLAMP):
-                        within = free[i]
-                    gain = joint.gain(m, law, k, qi, links[i].qd, end_rate, within)
-                    if wp.static(VARIED and LIMIT):
-                        if m.carried[k] == 1:  # of the lanes that have the joint
-                            by = joint.limit_constants_gain(m, law, k, qi, links[i].qd, end_rate, theta * h)
-                            adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - lam[i] * by[0]
-                            adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - lam[i] * by[1]
-                    if wp.static(CONSTRAINED):
-                        of_held = constraint.joint_gain(m, law, k, links[i].q, links[i].qd, rate[i])
-                        gain = gain + vec2(of_held[0], of_held[1])
-                        if wp.static(VARIED):
-                            if m.carried[k] == 1:  # of the lanes that have the joint
-                                adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - lam[i] * of_held[2]
-                    kv = gain[1]
-                    if wp.static(IMPLICIT):
-                        kv = kv + theta * h * gain[0]
-                    xv = adj_v[i] - wp.spatial_cross_dual(links[p].V, adj_a[i])
-                    gq[i] = (
-                        gq[i]
-                        + wp.dot(adj_p[i], links[i].S)
-                        - wp.dot(xv, wp.spatial_cross(links[i].S, links[p].V))
-                        - wp.dot(adj_w[i], wp.spatial_cross(links[i].S, W[p]))
-                        - wp.dot(adj_a[i], wp.spatial_cross(links[i].S, A[p]))
-                        - lam[i] * gain[0]
-                    )
-                    if wp.static(CONSTRAINED):
-                        gq[i] = gq[i] - wp.dot(adj_b[i], wp.spatial_cross(links[i].S, B[p]))
-                    if wp.static(DAMPED):
-                        gq[i] = gq[i] - wp.dot(adj_d[i], wp.spatial_cross(links[i].S, D[p]))
-                        gq[i] = gq[i] - wp.dot(adj_w1[i], wp.spatial_cross(links[i].S, W1[p]))
-                    gqd[i] = (
-                        gqd[i] + wp.dot(xv - wp.spatial_cross_dual(links[turned].V, adj_a[i]), links[i].S) - lam[i] * kv
-                    )
-                    gtau[i] = gtau[i] - within * lam[i]
-                    if wp.static(NBALL > 0):
-                        p = m.parent[k]
-                    if wp.static(FLOATING) or p > 0:
-                        adj_a[p] = adj_a[p] + adj_a[i]
-                        adj_v[p] = adj_v[p] + adj_v[i]
-                        adj_w[p] = adj_w[p] + adj_w[i]
-                        adj_p[p] = adj_p[p] + adj_p[i]
-                        if wp.static(CONSTRAINED):
-                            adj_b[p] = adj_b[p] + adj_b[i]
-                        if wp.static(DAMPED):
-                            adj_d[p] = adj_d[p] + adj_d[i]
-                            adj_w1[p] = adj_w1[p] + adj_w1[i]
+                muscle.add_muscles_adjoint(m, here, pull, links, nodes, adj, adj_pull)
+            inward(m, law, here, ck, links, nodes, adj, adj_factors)
             if wp.static(BALL_SPRING):
-                # The spring sees the rotation vector, whose derivative in the tangent space is not the identity.
-                for b in range(m.ball_count[lane]):
-                    i = m.ball_slot[lane * NBALL + b]
-                    lb = vec3(lam[i], lam[i + 1], lam[i + 2])
-                    lb = T(m.stiffness[at + i]) * (
-                        sp.log_adjoint(vec3(links[i].q, links[i + 1].q, links[i + 2].q), lb) - lb
-                    )
-                    for k in range(3):
-                        gq[i + k] = gq[i + k] + lb[k]
+                ball_springs(m, here, links, nodes)
             if wp.static(FLOATING):
-                # The floating base is a translation, whose "parent" twists are pure linear ones, then a ball joint.
-                vp = join(vec3(), v)
-                wl = join(vec3(), wp.spatial_bottom(W[0]))
-                ap = join(vec3(), vdot)
-                xv = adj_v[0] - wp.spatial_cross_dual(vp, adj_a[0])
-                tq = adj_p[0] - wp.spatial_cross_dual(vp, xv)
-                tq = tq - wp.spatial_cross_dual(wl, adj_w[0]) - wp.spatial_cross_dual(ap, adj_a[0])
-                if wp.static(CONSTRAINED):
-                    tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(B[0])), adj_b[0])
-                if wp.static(DAMPED):
-                    tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(D[0])), adj_d[0])
-                    tq = tq - wp.spatial_cross_dual(join(vec3(), wp.spatial_bottom(W1[0])), adj_w1[0])
-                tw = xv - wp.spatial_cross_dual(links[0].V, adj_a[0])
-                gp = gp + wp.spatial_bottom(adj_p[0])
-                gr = gr + wp.transpose(links[0].R) * wp.spatial_top(tq)
-                gv = gv + wp.spatial_bottom(xv)
-                gw = gw + wp.transpose(links[0].R) * wp.spatial_top(tw)
+                base = base_inward(links[0], nodes[0], adj[0], base)
 
         # A gradient that left the finite numbers, or of a contained step, is zero.
-        broken = T(0.0)
-        for i in range(1, n):
-            broken = broken + block.broken(gq[i]) + block.broken(gqd[i]) + block.broken(gtau[i])
-        if wp.static(FLOATING):
-            for k in range(3):
-                broken = broken + block.broken(gp[k]) + block.broken(gr[k]) + block.broken(gv[k]) + block.broken(gw[k])
-        if wp.static(MUSCLE):
-            for entry in range(m.muscle_begin[lane], m.muscle_begin[lane + 1]):
-                broken = broken + block.broken(adj_pull[m.muscle[entry]])
-        if wp.static(VARIED):
-            for k in range(NFACTORS):
-                broken = broken + block.broken(adj_factors[k])
-        if wp.static(FORCED):
-            broken = broken + force.broken_forces(m, here, adj_forces)
-        if wp.static(THREADS_PER_ENV > 1):
-            broken = sums.add(broken)
-        contained = block.read_flags(nonfinite, e)
-        if lane == 0:
-            block.count(nonfinite_gradients, e, pick(T(0.0), contained, T(0.0), broken))
+        broken = broken_numbers(m, here, base, nodes, adj_pull, adj_factors, adj_forces)
+        contained = block.read_flags(nonfinite, here.e)
+        if here.lane == 0:
+            block.count(nonfinite_gradients, here.e, pick(T(0.0), contained, T(0.0), broken))
         drop = broken + contained
-        for k in range(NU):
-            if m.motor_lane[k] == lane:
-                g = T(0.0)
-                if wp.static(DRIVEN):
-                    g = gtau[m.motor_slot[lane * NU + k]]
-                if wp.static(MUSCLE):
-                    g = g + adj_pull[k]
-                if wp.static(VARIED):
-                    motor = T(m.gear[k]) * read(ctrl, e, k) + T(m.motor_bias[k])
-                    adj_factors[MOTOR] = adj_factors[MOTOR] + g * motor
-                    g = law.motor * g
-                hand_out(g_ctrl, e, k, drop, g * T(m.gear[k]))
-        if wp.static(VARIED):
-            for k in range(NFACTORS):
-                total = adj_factors[k]
-                if wp.static(THREADS_PER_ENV > 1):
-                    total = sums.add(total)
-                if lane == 0:
-                    hand_out(g_factors, e, k, drop, total)
+        write_controls(m, law, here, drop, start.ctrl, nodes, adj_pull, adj_factors, g)
         if wp.static(FORCED):
-            force.write_forces_adjoint(m, here, drop, adj_forces, g_forces)
-        for i in range(1, n):
-            hand_out(g_qpos, e, qpos_adr(m, at + i), drop, gq[i])
-            hand_out(g_qvel, e, VADR + link_of(m, at + i), drop, gqd[i])
-        if wp.static(NBALL > 0):
-            for b in range(m.ball_count[lane]):
-                i = m.ball_slot[lane * NBALL + b]
-                adr = qpos_adr(m, at + i)
-                gb4 = sp.from_tangent(kin.load_quat(qpos, e, adr), vec3(gq[i], gq[i + 1], gq[i + 2]))
-                hand_out(g_qpos, e, adr, drop, gb4[3])
-                for k in range(3):
-                    hand_out(g_qpos, e, adr + 1 + k, drop, gb4[k])
-        if wp.static(FLOATING):
-            g4 = sp.from_tangent(kin.load_quat(qpos, e, 3), gr)
-            for k in range(3):
-                hand_out(g_qpos, e, k, drop, gp[k])
-                hand_out(g_qpos, e, 4 + k, drop, g4[k])
-                hand_out(g_qvel, e, k, drop, gv[k])
-                hand_out(g_qvel, e, 3 + k, drop, gw[k])
-            hand_out(g_qpos, e, 3, drop, g4[3])
+            force.write_forces_adjoint(m, here, drop, adj_forces, g.forces)
+        write_state(m, here, drop, start.qpos, base, nodes, g)
 
     return backward

@@ -182,22 +182,18 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         law: Law,
         k: int,
         link: Link,
-        B: vec6,
-        W: vec6,
+        node: t.Node,
         height: T,
-        adj_v: vec6,
-        adj_w: vec6,
-        adj_p: vec6,
+        adj: t.Adjoint,
         adj_factors: t.array,
     ):
-        """The adjoints of link k with its contacts' part of phi added, and the adjoint of B."""
-        adj_b = vec6()
+        """The adjoints of link k with its contacts' part of phi added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             centre, distance, on = place(m, c, link, height)
             if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, B)
+                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, node.B)
                 f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
-                w = point_velocity(W, p)
+                w = point_velocity(node.W, p)
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
                 if wp.static(spec.touchdown):
@@ -213,16 +209,18 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_numbers[c][2]) * by_mu
                 G = force_at(p, g_jar)
                 wrench = force_at(p, f)
-                g_p = wp.cross(g_jar, wp.spatial_top(B) + of[1] * wp.spatial_top(link.V)) - wp.cross(
-                    f, wp.spatial_top(W)
+                g_p = wp.cross(g_jar, wp.spatial_top(node.B) + of[1] * wp.spatial_top(link.V)) - wp.cross(
+                    f, wp.spatial_top(node.W)
                 )
-                adj_w = adj_w - wrench
-                adj_v = adj_v + of[1] * G
-                adj_b = adj_b + G
+                adj.w = adj.w - wrench
+                adj.v = adj.v + of[1] * G
+                adj.b = adj.b + G
                 # The point follows the sphere's centre, at half its speed up and down.
-                adj_p = adj_p + force_at(centre, vec3(g_p[0], g_p[1], T(0.5) * g_p[2] + g_r))
-                adj_p = adj_p + wp.spatial_cross_dual(of[1] * link.V + B, G) - wp.spatial_cross_dual(W, wrench)
-        return adj_v, adj_w, adj_p, adj_b
+                adj.p = adj.p + force_at(centre, vec3(g_p[0], g_p[1], T(0.5) * g_p[2] + g_r))
+                adj.p = (
+                    adj.p + wp.spatial_cross_dual(of[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
+                )
+        return adj
 
     @wp.func
     def limit_row(m: Model, law: Law, i: int, q: T):

@@ -137,13 +137,9 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         law: Law,
         k: int,
         link: Link,
-        A: vec6,
-        W: vec6,
+        node: t.Node,
         place: Place,
-        adj_a: vec6,
-        adj_v: vec6,
-        adj_w: vec6,
-        adj_p: vec6,
+        adj: t.Adjoint,
         adj_factors: t.array,
     ):
         """The adjoints of link k with its contacts' part of phi added."""
@@ -157,14 +153,14 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 depth = on * depth  # no force on the others, as it grows with the depth
                 fc = contact_force(law, depth, v)
                 f = vec3(fc[0], fc[1], fc[2])
-                g_f = -on * point_velocity(W, p)
+                g_f = -on * point_velocity(node.W, p)
                 if wp.static(TERRAIN):
                     g_f = wp.transpose(E) * g_f
                 a = vec3()
                 hi = T(0.0)
                 if wp.static(IMPLICIT):
                     hi = law.h
-                    a = point_velocity(A, p) + vec3(m.gravity)
+                    a = point_velocity(node.A, p) + vec3(m.gravity)
                     if wp.static(TERRAIN):
                         a = wp.transpose(E) * a
                     B = on * contact_resistance(law, depth, fc[3])
@@ -186,19 +182,19 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 g_p = vec3(T(0.0), T(0.0), g[3])
                 if wp.static(TERRAIN):
                     g_p = E * g_p
-                g_p = g_p + wp.cross(g_v, wp.spatial_top(link.V)) - wp.cross(f, wp.spatial_top(W))
+                g_p = g_p + wp.cross(g_v, wp.spatial_top(link.V)) - wp.cross(f, wp.spatial_top(node.W))
                 if wp.static(IMPLICIT):
                     g_a = -wp.cw_mul(B, g_f)
                     if wp.static(TERRAIN):
                         g_turn = g_turn + wp.cross(g_a, a)[1]
                         g_a = E * g_a
                     GA = force_at(p, g_a)
-                    g_p = g_p + wp.cross(g_a, wp.spatial_top(A))
-                    adj_a = adj_a + GA
-                    adj_v = adj_v + wp.spatial_cross_dual(link.V, GA)
-                    adj_p = adj_p + wp.spatial_cross_dual(A, GA)
-                adj_w = adj_w - wrench
-                adj_v = adj_v + G
+                    g_p = g_p + wp.cross(g_a, wp.spatial_top(node.A))
+                    adj.a = adj.a + GA
+                    adj.v = adj.v + wp.spatial_cross_dual(link.V, GA)
+                    adj.p = adj.p + wp.spatial_cross_dual(node.A, GA)
+                adj.w = adj.w - wrench
+                adj.v = adj.v + G
                 # The lowest point follows the sphere's centre, not the body's material.
                 if wp.static(TERRAIN):
                     radius = T(m.contact_radius[c])
@@ -207,8 +203,8 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                     g_p = g_p + curvature * (g_turn - radius * wp.dot(tangent, g_p)) * tangent
                 else:
                     centre = p + vec3(T(0.0), T(0.0), T(m.contact_radius[c]))
-                adj_p = adj_p + force_at(centre, g_p)
-                adj_p = adj_p + wp.spatial_cross_dual(link.V, G) - wp.spatial_cross_dual(W, wrench)
-        return adj_a, adj_v, adj_w, adj_p
+                adj.p = adj.p + force_at(centre, g_p)
+                adj.p = adj.p + wp.spatial_cross_dual(link.V, G) - wp.spatial_cross_dual(node.W, wrench)
+        return adj
 
     return by_name(add_contacts, add_contacts_adjoint)

@@ -16,7 +16,6 @@ from diffsim.kernels.spec import KernelSpec
 def lane_sums(spec: KernelSpec) -> SimpleNamespace:
     t, threads = types(spec), spec.threads_per_env
     T, vec6, mat3 = t.T, t.vec6, t.mat3
-    loads_of, vec6s = wp.array(dtype=t.Load), wp.array(dtype=vec6)
     neighbour = f"""
 #if defined(__CUDA_ARCH__)
     const unsigned first = (threadIdx.x & 31u) & ~({threads}u - 1u);
@@ -53,7 +52,7 @@ def lane_sums(spec: KernelSpec) -> SimpleNamespace:
             return value
 
         @wp.func
-        def add_loads(loads: loads_of):
+        def add_loads(loads: t.Loads):
             begin = int(inertial)
             for i in range(begin, last + 1):
                 loads[i].a = add_mat3(loads[i].a)
@@ -62,12 +61,26 @@ def lane_sums(spec: KernelSpec) -> SimpleNamespace:
                 loads[i].f = add_vec6(loads[i].f)
 
         @wp.func
-        def add_vectors(a: vec6s):
+        def add_twists(nodes: t.Nodes):
             begin = int(0)
             for i in range(begin, last + 1):
-                a[i] = add_vec6(a[i])
+                nodes[i].W = add_vec6(nodes[i].W)
 
-        return by_name(add, add_loads, add_vectors)
+        @wp.func
+        def add_adjoints(adj: t.Adjoints):
+            begin = int(0)
+            for i in range(begin, last + 1):
+                adj[i].a = add_vec6(adj[i].a)
+                adj[i].v = add_vec6(adj[i].v)
+                adj[i].w = add_vec6(adj[i].w)
+                adj[i].p = add_vec6(adj[i].p)
+                if wp.static(spec.constrained):
+                    adj[i].b = add_vec6(adj[i].b)
+                if wp.static(spec.damped):
+                    adj[i].d = add_vec6(adj[i].d)
+                    adj[i].w1 = add_vec6(adj[i].w1)
+
+        return by_name(add, add_loads, add_twists, add_adjoints)
 
     powers = [2**k for k in range(threads.bit_length() - 1)]
     return SimpleNamespace(

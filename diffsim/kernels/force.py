@@ -37,7 +37,7 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         return f, force_at(p, f) + join(torque, vec3())
 
     @wp.func
-    def add_forces(m: Model, here: Lane, forces: t.array2, links: t.links, loads: t.loads):
+    def add_forces(m: Model, here: Lane, forces: t.array2, links: t.Links, loads: t.Loads):
         """Adds the forces to the links' bias forces."""
         for i in range(FIRST, here.n):
             for entry in range(m.body_begin[here.at + i], m.body_begin[here.at + i + 1]):
@@ -51,10 +51,9 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         m: Model,
         here: Lane,
         forces: t.array2,
-        links: t.links,
-        W: t.vec6s,
-        adj_w: t.vec6s,
-        adj_p: t.vec6s,
+        links: t.Links,
+        nodes: t.Nodes,
+        adj: t.Adjoints,
         adj_forces: t.vec6s,  # of each body, (force, torque)
     ):
         """Adds the forces' part of phi to the links' adjoints."""
@@ -63,10 +62,11 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
                 body = m.body[entry]
                 p = sp.on_link(links[i].R, links[i].x, m.body_com[entry])
                 f, wrench = external(forces, here.e, body, p)
-                turn = wp.spatial_top(W[i])
-                adj_w[i] = adj_w[i] - wrench
-                adj_p[i] = adj_p[i] - force_at(p, wp.cross(f, turn)) - wp.spatial_cross_dual(W[i], wrench)
-                adj_forces[body] = adj_forces[body] - join(point_velocity(W[i], p), turn)
+                W = nodes[i].W
+                turn = wp.spatial_top(W)
+                adj[i].w = adj[i].w - wrench
+                adj[i].p = adj[i].p - force_at(p, wp.cross(f, turn)) - wp.spatial_cross_dual(W, wrench)
+                adj_forces[body] = adj_forces[body] - join(point_velocity(W, p), turn)
 
     @wp.func
     def broken_forces(m: Model, here: Lane, adj_forces: t.vec6s):

@@ -65,13 +65,13 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         m: Model,
         law: Law,
         here: Lane,
-        links: t.links,
+        links: t.Links,
         B: t.vec6s,
         height: T,
         guess: t.array,
         step: t.array,
         twist: t.vec6s,
-        loads: t.loads,
+        loads: t.Loads,
     ):
         """The part of Newton's step that MuJoCo's cost is least after, or all of it where that is near.
 
@@ -134,19 +134,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         implicitness: t.U,
         substeps: int,
         passes: int,  # of Newton's method, read with constraints
-        # state in
-        qpos: t.array2,
-        qvel: t.array2,
-        ctrl: t.array2,
-        factors: t.array2,  # without columns unless varied
-        forces: t.array2,  # without columns unless forced
+        start: t.Start,
         # checkpoint out: rows row0 .. row0 + substeps - 1, written if record is 1
         record: int,
         row0: int,
-        ck_q: t.array3,
-        ck_v: t.array3,
-        ck_a: t.array3,
-        ck_f: t.array3,
+        ck: t.Checkpoint,
         # state out; with constraints the last column of qvel_out is how far the last pass moved the acceleration
         qpos_out: t.array2,
         qvel_out: t.array2,
@@ -168,25 +160,25 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         dinv = wp.zeros(shape=SLOTS, dtype=T)
         u = wp.zeros(shape=SLOTS, dtype=T)
         motor = wp.zeros(shape=SLOTS, dtype=T)
-        law = law_of(m, h, theta, factors, e)
+        law = law_of(m, h, theta, start.factors, e)
         if wp.static(MUSCLE):
             pull = wp.zeros(shape=NU, dtype=T)
-            muscle.activate(m, law, here, ctrl, pull)
+            muscle.activate(m, law, here, start.ctrl, pull)
         if wp.static(MOTOR):
-            joint.drive(m, law, here, ctrl, motor)
+            joint.drive(m, law, here, start.ctrl, motor)
         for i in range(1, n):
-            links[i].q = read(qpos, e, qpos_adr(m, at + i))
-            links[i].qd = read(qvel, e, VADR + link_of(m, at + i))
+            links[i].q = read(start.qpos, e, qpos_adr(m, at + i))
+            links[i].qd = read(start.qvel, e, VADR + link_of(m, at + i))
         if wp.static(NBALL > 0):
             turn = wp.zeros(shape=NBALL, dtype=quat)
             for b in range(m.ball_count[lane]):
-                turn[b] = wp.normalize(kin.load_quat(qpos, e, qpos_adr(m, at + m.ball_slot[lane * NBALL + b])))
+                turn[b] = wp.normalize(kin.load_quat(start.qpos, e, qpos_adr(m, at + m.ball_slot[lane * NBALL + b])))
         links[0].R = wp.identity(3, dtype=T)
         if wp.static(FLOATING):
-            pos = vec3(read(qpos, e, 0), read(qpos, e, 1), read(qpos, e, 2))
-            rot = wp.normalize(kin.load_quat(qpos, e, 3))
-            v = vec3(read(qvel, e, 0), read(qvel, e, 1), read(qvel, e, 2))
-            w = vec3(read(qvel, e, 3), read(qvel, e, 4), read(qvel, e, 5))
+            pos = vec3(read(start.qpos, e, 0), read(start.qpos, e, 1), read(start.qpos, e, 2))
+            rot = wp.normalize(kin.load_quat(start.qpos, e, 3))
+            v = vec3(read(start.qvel, e, 0), read(start.qvel, e, 1), read(start.qvel, e, 2))
+            w = vec3(read(start.qvel, e, 3), read(start.qvel, e, 4), read(start.qvel, e, 5))
 
         if wp.static(CONSTRAINED):
             free_loads = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
@@ -205,38 +197,37 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 place = kin.carrier_place(m, pos[0], pos[2])
                 if record == 1:
                     for k in range(3):
-                        store(ck_q, row, k, e, pos[k])
-                        store(ck_q, row, 4 + k, e, rot[k])
-                        store(ck_v, row, k, e, v[k])
-                        store(ck_v, row, 3 + k, e, w[k])
-                    store(ck_q, row, 3, e, rot[3])
+                        store(ck.q, row, k, e, pos[k])
+                        store(ck.q, row, 4 + k, e, rot[k])
+                        store(ck.v, row, k, e, v[k])
+                        store(ck.v, row, 3 + k, e, w[k])
+                    store(ck.q, row, 3, e, rot[3])
             # 1. outward: poses, velocities, velocity products, inertias and bias forces
             if wp.static(NBALL > 0):
                 kin.place_balls(m, here, turn, links)
             place = kin.place_links(m, here, links, place)
             for i in range(1, n):
                 k = at + i
-                links[i].V = links[m.parent[k]].V + links[i].S * links[i].qd
                 turning = i
                 if wp.static(NBALL > 0):
                     turning = m.inboard[k]
                 C[i] = wp.spatial_cross(links[turning].V, links[i].S * links[i].qd)
                 if record == 1:
-                    store(ck_q, row, qpos_adr(m, k), e, links[i].q)
-                    store(ck_v, row, VADR + link_of(m, k), e, links[i].qd)
+                    store(ck.q, row, qpos_adr(m, k), e, links[i].q)
+                    store(ck.v, row, VADR + link_of(m, k), e, links[i].qd)
             if wp.static(NBALL > 0):
                 for b in range(m.ball_count[lane]):
                     if record == 1:
                         adr = qpos_adr(m, at + m.ball_slot[lane * NBALL + b])
-                        store(ck_q, row, adr, e, turn[b][3])
+                        store(ck.q, row, adr, e, turn[b][3])
                         for k in range(3):
-                            store(ck_q, row, adr + 1 + k, e, turn[b][k])
+                            store(ck.q, row, adr + 1 + k, e, turn[b][k])
             for i in range(1, INERT + 1):
                 loads[i] = Load()
             for i in range(FIRST, n):
                 loads[i] = link.link_inertia(m, law, at + i, links[i], place)
             if wp.static(FORCED):
-                force.add_forces(m, here, forces, links, loads)
+                force.add_forces(m, here, start.forces, links, loads)
             if wp.static(MUSCLE):
                 muscle.add_muscles(m, here, pull, links, loads)
             # 2. inward: articulated inertias. With constraints each pass is a step of Newton's method, the first as if
@@ -333,8 +324,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if record == 1:
                             f0 = 7 * (link_of(m, k) - 1)
                             for r in range(6):
-                                store(ck_f, factor_row, f0 + r, e, Ui[r])
-                            store(ck_f, factor_row, f0 + 6, e, di)
+                                store(ck.f, factor_row, f0 + r, e, Ui[r])
+                            store(ck.f, factor_row, f0 + 6, e, di)
                 # 3. outward: accelerations (minus gravity, which acts as an acceleration of the base)
                 A[0] = join(vec3(), -vec3(m.gravity))
                 if wp.static(DAMPED):
@@ -345,7 +336,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
                     speeding_up = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(links[0].V), v) + vec3(m.gravity)
                     if record == 1:
-                        base.store_base(ck_f, factor_row, e, L)
+                        base.store_base(ck.f, factor_row, e, L)
                 for i in range(1, n):
                     ai = A[m.parent[at + i]] + C[i]
                     qdd = (u[i] - wp.dot(U[i], ai)) * dinv[i]
@@ -383,10 +374,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if record == 1 and solve == passes - 1:  # where the last step begins, of which the adjoint is
                             if wp.static(FLOATING):
                                 for k in range(3):
-                                    store(ck_a, row, NV + k, e, vdot[k])
-                                    store(ck_a, row, NV + 3 + k, e, wdot[k])
+                                    store(ck.a, row, NV + k, e, vdot[k])
+                                    store(ck.a, row, NV + 3 + k, e, wdot[k])
                             for i in range(1, n):
-                                store(ck_a, row, NV + VADR + link_of(m, at + i), e, guess[i])
+                                store(ck.a, row, NV + VADR + link_of(m, at + i), e, guess[i])
                         if wp.static(FLOATING):
                             wdot = wdot + part * (turning_up - wdot)
                             vdot = vdot + part * (speeding_up - vdot)
@@ -410,8 +401,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(FLOATING):
                 if record == 1:
                     for k in range(3):
-                        store(ck_a, row, k, e, speeding_up[k])
-                        store(ck_a, row, 3 + k, e, turning_up[k])
+                        store(ck.a, row, k, e, speeding_up[k])
+                        store(ck.a, row, 3 + k, e, turning_up[k])
                 v = v + h * speeding_up
                 w = w + h * turning_up
                 pos = pos + h * v
@@ -420,7 +411,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 links[i].qd = links[i].qd + h * u[i]
                 links[i].q = links[i].q + h * links[i].qd
                 if record == 1:
-                    store(ck_a, row, VADR + link_of(m, at + i), e, u[i])
+                    store(ck.a, row, VADR + link_of(m, at + i), e, u[i])
             if wp.static(NBALL > 0):
                 for b in range(m.ball_count[lane]):
                     i = m.ball_slot[lane * NBALL + b]
@@ -445,19 +436,19 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             write(qvel_out, e, NV, pick(T(0.0), broken, T(0.0), residual))
         if wp.static(FLOATING):
             for k in range(3):
-                hand_back(qpos_out, qpos, e, k, broken, pos[k])
-                hand_back(qpos_out, qpos, e, 4 + k, broken, rot[k])
-                hand_back(qvel_out, qvel, e, k, broken, v[k])
-                hand_back(qvel_out, qvel, e, 3 + k, broken, w[k])
-            hand_back(qpos_out, qpos, e, 3, broken, rot[3])
+                hand_back(qpos_out, start.qpos, e, k, broken, pos[k])
+                hand_back(qpos_out, start.qpos, e, 4 + k, broken, rot[k])
+                hand_back(qvel_out, start.qvel, e, k, broken, v[k])
+                hand_back(qvel_out, start.qvel, e, 3 + k, broken, w[k])
+            hand_back(qpos_out, start.qpos, e, 3, broken, rot[3])
         for i in range(1, n):
-            hand_back(qpos_out, qpos, e, qpos_adr(m, at + i), broken, links[i].q)
-            hand_back(qvel_out, qvel, e, VADR + link_of(m, at + i), broken, links[i].qd)
+            hand_back(qpos_out, start.qpos, e, qpos_adr(m, at + i), broken, links[i].q)
+            hand_back(qvel_out, start.qvel, e, VADR + link_of(m, at + i), broken, links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[lane]):
                 adr = qpos_adr(m, at + m.ball_slot[lane * NBALL + b])
-                hand_back(qpos_out, qpos, e, adr, broken, turn[b][3])
+                hand_back(qpos_out, start.qpos, e, adr, broken, turn[b][3])
                 for k in range(3):
-                    hand_back(qpos_out, qpos, e, adr + 1 + k, broken, turn[b][k])
+                    hand_back(qpos_out, start.qpos, e, adr + 1 + k, broken, turn[b][k])
 
     return forward

@@ -74,7 +74,7 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
         return quat_of(load(a, row, k, e), load(a, row, k + 1, e), load(a, row, k + 2, e), load(a, row, k + 3, e))
 
     @wp.func
-    def place_balls(m: Model, here: Lane, turn: t.quats, links: t.links):
+    def place_balls(m: Model, here: Lane, turn: t.quats, links: t.Links):
         """Into the first link's R the turn of each ball joint, and into q, for the spring, its rotation vector."""
         for b in range(m.ball_count[here.lane]):
             i = m.ball_slot[here.lane * NBALL + b]
@@ -93,8 +93,8 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             return T(m.carrier_height) + z
 
     @wp.func
-    def place_links(m: Model, here: Lane, links: t.links, place: Place):
-        """Rotation, position relative to the carrier, and motion axis of each link; returns the carrier's place.
+    def place_links(m: Model, here: Lane, links: t.Links, place: Place):
+        """Where each link is (about the carrier), its joint's axis and its velocity; returns the carrier's place.
 
         R of a ball joint's first link comes with the joint's own turn.
         """
@@ -130,6 +130,7 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
                         place = place + a[2] * links[i].q
             links[i].x = xi
             links[i].S = Si
+            links[i].V = links[p].V + Si * links[i].qd
         return place
 
     return by_name(

@@ -16,7 +16,7 @@ from diffsim.kernels.spec import KernelSpec
 @cache
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
-    T, vec3, vec6, mat3, Model, Law, Link = t.T, t.vec3, t.vec6, t.mat3, t.Model, t.Law, t.Link
+    T, vec3, mat3, Model, Law, Link, Adjoint = t.T, t.vec3, t.mat3, t.Model, t.Law, t.Link, t.Adjoint
     momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
     LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
@@ -66,53 +66,65 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         return load
 
     @wp.func
-    def link_adjoint(m: Model, law: Law, k: int, link: Link, A: vec6, W: vec6, place: Place, adj_factors: t.array):
-        """(adj_a, adj_v, adj_w, adj_p) of one link's part of phi, all about the carrier's position.
+    def link_adjoint(m: Model, law: Law, k: int, link: Link, node: t.Node, place: Place, adj_factors: t.array):
+        """The adjoints of one link's part of phi, all about the carrier's position.
 
         adj_factors, here and in all laws, are written if varied only.
         """
         com, inertia = mass_of(m, k, link)
         V = link.V
+        W = node.W
         Iv = momentum(T(m.mass[k]), com, inertia, V)
-        adj_a = momentum(T(m.mass[k]), com, inertia, W)
-        adj_w = momentum(T(m.mass[k]), com, inertia, A) + wp.spatial_cross_dual(V, Iv)
-        adj_v = momentum(T(m.mass[k]), com, inertia, wp.spatial_cross(W, V))
-        adj_v = adj_v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj_a)
-        adj_p = vec6()
+        adj = Adjoint()
+        adj.a = momentum(T(m.mass[k]), com, inertia, W)
+        adj.w = momentum(T(m.mass[k]), com, inertia, node.A) + wp.spatial_cross_dual(V, Iv)
+        adj.v = momentum(T(m.mass[k]), com, inertia, wp.spatial_cross(W, V))
+        adj.v = adj.v - wp.spatial_cross_dual(W, Iv) + wp.spatial_cross_dual(V, adj.a)
         if wp.static(LIFT):  # as an external force, see force.py
             p, f, up = lift(m, k, link)
-            adj_w = adj_w - up
-            adj_p = -sp.force_at(p, wp.cross(f, wp.spatial_top(W))) - wp.spatial_cross_dual(W, up)
+            adj.w = adj.w - up
+            adj.p = -sp.force_at(p, wp.cross(f, wp.spatial_top(W))) - wp.spatial_cross_dual(W, up)
         if wp.static(VARIED):
             # phi's inertial part is W . adj_w, and all of this is that of a factor of one.
-            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
-            adj_a = law.mass * adj_a
-            adj_w = law.mass * adj_w
-            adj_v = law.mass * adj_v
+            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj.w)
+            adj.a = law.mass * adj.a
+            adj.w = law.mass * adj.w
+            adj.v = law.mass * adj.v
             if wp.static(LIFT):
-                adj_p = law.mass * adj_p
+                adj.p = law.mass * adj.p
         if wp.static(DAMPED):
-            adj_w = adj_w + T(m.base_damping[k]) * V
-            adj_v = adj_v + T(m.base_damping[k]) * W
+            adj.w = adj.w + T(m.base_damping[k]) * V
+            adj.v = adj.v + T(m.base_damping[k]) * W
         if wp.static(DRAG):
-            adj_w = adj_w - drag.drag_wrench(m, k, link.R, com, V)
-            adj_v = adj_v + drag.drag_adjoint(m, k, link.R, com, V, W)
+            adj.w = adj.w - drag.drag_wrench(m, k, link.R, com, V)
+            adj.v = adj.v + drag.drag_adjoint(m, k, link.R, com, V, W)
         if wp.static(CONTACT):
-            adj_a, adj_v, adj_w, adj_p = contact.add_contacts_adjoint(
-                m, law, k, link, A, W, place, adj_a, adj_v, adj_w, adj_p, adj_factors
-            )
-        return adj_a, adj_v, adj_w, adj_p
+            adj = contact.add_contacts_adjoint(m, law, k, link, node, place, adj, adj_factors)
+        return adj
 
     @wp.func
-    def damping_adjoint(m: Model, law: Law, k: int, link: Link, D: vec6, W: vec6, adj_factors: t.array):
-        """The adjoints of D and W in W . I D, with I the inertia of one link."""
+    def add_damping_adjoint(m: Model, law: Law, k: int, link: Link, node: t.Node, adj: Adjoint, adj_factors: t.array):
+        """With the adjoints of D and W1 in phi's part W1 . I D, where damping follows the constraints."""
         com, inertia = mass_of(m, k, link)
-        adj_d = momentum(T(m.mass[k]), com, inertia, W)
-        adj_w = momentum(T(m.mass[k]), com, inertia, D)
+        adj.d = momentum(T(m.mass[k]), com, inertia, node.W1)
+        adj.w1 = momentum(T(m.mass[k]), com, inertia, node.D)
         if wp.static(VARIED):
-            adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj_w)
-            adj_d = law.mass * adj_d
-            adj_w = law.mass * adj_w
-        return adj_d, adj_w
+            adj_factors[MASS] = adj_factors[MASS] + wp.dot(node.W1, adj.w1)
+            adj.d = law.mass * adj.d
+            adj.w1 = law.mass * adj.w1
+        return adj
 
-    return by_name(link_inertia, link_adjoint, damping_adjoint)
+    @wp.func
+    def plus(x: Adjoint, y: Adjoint):
+        x.a = x.a + y.a
+        x.v = x.v + y.v
+        x.w = x.w + y.w
+        x.p = x.p + y.p
+        if wp.static(spec.constrained):
+            x.b = x.b + y.b
+        if wp.static(spec.damped):
+            x.d = x.d + y.d
+            x.w1 = x.w1 + y.w1
+        return x
+
+    return by_name(link_inertia, link_adjoint, add_damping_adjoint, plus)

@@ -223,9 +223,19 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     U = spec.dtype
     T = wp.float64 if spec.block > 1 else U
     vec2, vec3, vec4, vec6 = (wp.types.vector(n, T) for n in (2, 3, 4, 6))
+    array3 = wp.array3d(dtype=T)
     mat3, mat6, quat = wp.types.matrix((3, 3), T), wp.types.matrix((6, 6), T), wp.types.quaternion(T)
     Link = struct("Link", {"R": mat3, "x": vec3, "S": vec6, "V": vec6, "q": T, "qd": T})
     Load = struct("Load", {"a": mat3, "b": mat3, "d": mat3, "f": vec6})
+    Node = dict.fromkeys(("A", "W"), vec6) | dict.fromkeys("gq gqd gtau g u lam".split(), T)
+    Adjoint = dict.fromkeys(("a", "v", "w", "p"), vec6)
+    if "clamp" in spec.features:
+        Node |= {"driven": T, "free": T}
+    if spec.constrained:
+        Node, Adjoint = Node | {"B": vec6, "rate": T}, Adjoint | {"b": vec6}
+    if spec.damped:
+        Node, Adjoint = Node | {"D": vec6, "W1": vec6}, Adjoint | {"d": vec6, "w1": vec6}
+    Node, Adjoint = struct("Node", Node), struct("Adjoint", Adjoint)
     constants = dict.fromkeys("h theta k_n k_d k_t mu k_limit d_limit mass motor".split(), T)
     return SimpleNamespace(
         T=T,
@@ -240,20 +250,36 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         Place=vec2 if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
         array=wp.array(dtype=T),
         array2=wp.array2d(dtype=U),  # a row for each environment
-        array3=wp.array3d(dtype=T),  # checkpoints
+        array3=array3,
+        # what a step depends on, a row for each environment; forces and factors have no columns unless they vary
+        Start=struct("Start", dict.fromkeys("qpos qvel ctrl factors forces".split(), wp.array2d(dtype=U))),
+        # what backward needs of each substep: qpos, qvel, qacc and the factor of the mass matrix
+        Checkpoint=struct("Checkpoint", dict.fromkeys("qvaf", array3)),
         scene=scene_types(U),
         Model=scene_types(U).Model,
         # h: s, of a substep; theta: how implicit it is; constants of the laws, or factors of those that each link has
-        # its own of (k_limit to motor, read where they vary); whose environments' row of Model.terrain is read
+        # its own of (k_limit to motor, read where they vary); whose row of Model.terrain is read
         Law=struct("Law", constants | {"block": int}),
-        # a lane of an environment, or of a block of them, e; the entries of its n links in Model's arrays begin at `at`
-        Lane=struct("Lane", dict.fromkeys(("e", "lane", "at", "n"), int)),
+        # a lane of an environment, or of a block of them, e; its n links are entries at, at + 1, ... of Model's arrays;
+        # the substep's row of checkpoints
+        Lane=struct("Lane", dict.fromkeys(("e", "lane", "at", "n", "row"), int)),
         # where a link is (about the carrier, in world axes), its joint's axis, its velocity, and its joint's state
         Link=Link,
-        links=wp.array(dtype=Link),
+        Links=wp.array(dtype=Link),
         # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force
         Load=Load,
-        loads=wp.array(dtype=Load),
+        Loads=wp.array(dtype=Load),
+        # what backward keeps of a link and its joint: the link's acceleration A and twist W under lambda; the gradients
+        # of the joint's position, rate and force; right-hand side, intermediate and solution of the solve; the motors'
+        # force, and 1 where it is within its bounds; with constraints the twist B of constraint.py and the acceleration
+        # before damping, which adds D to B and has a twist W1 of its own
+        Node=Node,
+        Nodes=wp.array(dtype=Node),
+        # the adjoints of a link's acceleration, velocity, W and pose, of B, D and W1
+        Adjoint=Adjoint,
+        Adjoints=wp.array(dtype=Adjoint),
+        # gradients of a floating base's position, turn and velocities, its linear velocity and acceleration
+        Base=struct("Base", dict.fromkeys("gp gr gv gw v vdot".split(), vec3)),
         vec6s=wp.array(dtype=vec6),
         quats=wp.array(dtype=quat),
     )

@@ -60,7 +60,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
         return join(wp.transpose(R) * wp.spatial_top(v), wp.transpose(R) * point_velocity(v, x))
 
     @wp.func
-    def add_muscles(m: Model, here: Lane, pull: array, links: t.links, loads: t.loads):
+    def add_muscles(m: Model, here: Lane, pull: array, links: t.Links, loads: t.Loads):
         """Adds the muscles to the links' bias forces."""
         for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):
             i = m.pair_link[2 * pair]
@@ -83,7 +83,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_muscles_adjoint(
-        m: Model, here: Lane, pull: array, links: t.links, W: t.vec6s, adj_w: t.vec6s, adj_p: t.vec6s, adj_pull: array
+        m: Model, here: Lane, pull: array, links: t.Links, nodes: t.Nodes, adj: t.Adjoints, adj_pull: array
     ):
         """Adds the muscles' part of phi to the adjoints of the links and of pull."""
         for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):
@@ -93,7 +93,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
             x = links[i].x
             turn = wp.transpose(R) * links[j].R
             shift = wp.transpose(R) * (links[j].x - x)
-            w = inward(R, x, W[j] - W[i])
+            w = inward(R, x, nodes[j].W - nodes[i].W)
             force = vec3()
             torque = vec3()
             place = vec3()
@@ -115,10 +115,10 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
                 place = place + e
                 place_torque = place_torque + wp.cross(a, e)
             wrench = outward(R, x, torque, force)
-            gp = outward(R, x, place_torque, place) + wp.spatial_cross_dual(W[i], wrench)
-            adj_w[i] = adj_w[i] - wrench
-            adj_w[j] = adj_w[j] + wrench
-            adj_p[i] = adj_p[i] - gp
-            adj_p[j] = adj_p[j] + gp
+            gp = outward(R, x, place_torque, place) + wp.spatial_cross_dual(nodes[i].W, wrench)
+            adj[i].w = adj[i].w - wrench
+            adj[j].w = adj[j].w + wrench
+            adj[i].p = adj[i].p - gp
+            adj[j].p = adj[j].p + gp
 
     return by_name(activate, add_muscles, add_muscles_adjoint)

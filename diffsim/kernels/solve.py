@@ -88,45 +88,48 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
     @wp.func
     def solve(
         m: Model,
+        law: t.Law,
         here: Lane,
-        ck_f: t.array3,
+        ck: t.Checkpoint,
         row: int,
-        links: t.links,
-        h: T,
+        links: t.Links,
+        nodes: t.Nodes,
         g_base: vec6,  # read of a floating base
-        g: t.array,  # of the joints
-        u: t.array,  # for use here
-        W: t.vec6s,  # out: the twists of the links under lambda
-        lam: t.array,  # out
     ):
-        """lambda = -M^-1 h g; on the way in, W holds the articulated bias force."""
+        """lambda = -M^-1 h g and the twists W under it, into nodes.
+
+        On the way in, W holds the articulated bias force.
+        """
         slots = int(SLOTS)
+        h = law.h
         for i in range(here.n):
-            W[i] = vec6()
+            nodes[i].W = vec6()
         for j in range(1, slots + 1):
             i = slots - j
             if wp.static(THREADS_PER_ENV > SHARERS):
                 if i == TRUNK:
-                    sums.limbs.add_vectors(W)
+                    sums.limbs.add_twists(nodes)
             if i > 0 and i < here.n:
                 p = m.parent[here.at + i]
-                ui = -h * g[i] - wp.dot(links[i].S, W[i])
-                u[i] = ui
+                W = nodes[i].W
+                u = -h * nodes[i].g - wp.dot(links[i].S, W)
+                nodes[i].u = u
                 if wp.static(FLOATING) or p > 0:
                     f0 = 7 * (link_of(m, here.at + i) - 1)
                     Ui = vec6()
                     for r in range(6):
-                        Ui[r] = load(ck_f, row, f0 + r, here.e)
-                    W[p] = W[p] + W[i] + Ui * (ui * load(ck_f, row, f0 + 6, here.e))
+                        Ui[r] = load(ck.f, row, f0 + r, here.e)
+                    nodes[p].W = nodes[p].W + W + Ui * (u * load(ck.f, row, f0 + 6, here.e))
         if wp.static(FLOATING):
-            W[0] = base.solve_base(ck_f, row, here.e, g_base * (-h) - W[0])
+            nodes[0].W = base.solve_base(ck.f, row, here.e, g_base * (-h) - nodes[0].W)
         for i in range(1, here.n):
-            p = m.parent[here.at + i]
+            W = nodes[m.parent[here.at + i]].W
             f0 = 7 * (link_of(m, here.at + i) - 1)
             UW = T(0.0)
             for r in range(6):
-                UW = UW + load(ck_f, row, f0 + r, here.e) * W[p][r]
-            lam[i] = (u[i] - UW) * load(ck_f, row, f0 + 6, here.e)
-            W[i] = W[p] + links[i].S * lam[i]
+                UW = UW + load(ck.f, row, f0 + r, here.e) * W[r]
+            lam = (nodes[i].u - UW) * load(ck.f, row, f0 + 6, here.e)
+            nodes[i].lam = lam
+            nodes[i].W = W + links[i].S * lam
 
     return solve

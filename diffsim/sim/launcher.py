@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -95,6 +96,13 @@ class Launcher:
                 for first, end in self._shares
             ]
 
+    def start(self, parts: Iterable[torch.Tensor]) -> Any:
+        """The kernels' struct Start, of qpos, qvel, ctrl, factors and forces."""
+        result = types(self.spec).Start()
+        for name, part in zip(("qpos", "qvel", "ctrl", "factors", "forces"), parts, strict=True):
+            setattr(result, name, wp.from_torch(part))
+        return result
+
     def launch(self, command: list[wp.Launch]) -> None:
         """Runs a command; on a CPU returns when it is done."""
         if self.device.type == "cuda":
@@ -108,24 +116,23 @@ class Launcher:
         for future in pending:
             future.result()
 
-    def checkpoints(self, count: int) -> list[wp.array]:
-        """What backward needs of `count` substeps: qpos, qvel, qacc and the factor of the mass matrix.
+    def checkpoints(self, count: int) -> Any:
+        """The kernels' struct Checkpoint, of `count` substeps.
 
         With MuJoCo's constraints also the acceleration where the last pass began, and where damping follows them the
         factors of both.
         """
-        spec, n = self.spec, self.num_envs
+        spec, n, result = self.spec, self.num_envs, types(self.spec).Checkpoint()
         widths = (spec.nq, spec.nv, (1 + spec.constrained) * spec.nv, spec.nfactor)
         counts = (count, count, count, spec.solves * count)
         numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
         check_memory("checkpoints", n, numbers * self.dtype.itemsize, self.device)
         wide = spec.block > 1
-        arrays = list[Any]()
-        for rows, width in zip(counts, widths, strict=True):
+        for name, rows, width in zip("qvaf", counts, widths, strict=True):
             each = (self.num_blocks, width, spec.block) if wide else (width, n) if spec.env_last else (n, width)
             values = torch.zeros(rows, *each, dtype=self.dtype, device=self.device)
-            arrays.append(array_of_vectors(values, types(spec).T) if wide else wp.from_torch(values))
-        return arrays
+            setattr(result, name, array_of_vectors(values, types(spec).T) if wide else wp.from_torch(values))
+        return result
 
 
 def array_of_vectors(values: torch.Tensor, dtype: type) -> wp.array:

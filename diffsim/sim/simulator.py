@@ -91,7 +91,7 @@ class Simulator:
         self._end, self._g_end = self._zeros(n, sum(self._end_widths)), self._zeros(n, scene.nq + scene.nv)
         self._nonfinite = self._zeros(slots, n, dtype=torch.bool)
         self.nonfinite_gradients = self._zeros(n, dtype=torch.int32)
-        self._rows: list[wp.array] | None = None  # what backward needs of each substep, of all slots
+        self._rows: Any = None  # what backward needs of each substep, of all slots
         self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
         self._slot, self._last = 0, horizon  # of the next differentiable step, of the last step
         self._versions = [0] * horizon  # each slot serves a new step after each round of the ring
@@ -201,24 +201,21 @@ class Simulator:
         record, how = slot < self.horizon, self.integration
         if record and self._rows is None:
             self._rows = self._launcher.checkpoints(self.horizon * how.substeps)
-        rows = self._rows if record and self._rows else self._launcher.checkpoints(0)
+        rows = self._rows if record else self._launcher.checkpoints(0)
         row0 = slot * how.substeps if record else 0
-        start, end, g_start, g_end = (
+        start, g_start = (
+            self._launcher.start(buffer.split(self._widths, dim=1)) for buffer in (self._start[slot], self._g_start)
+        )
+        end, g_end = (
             [wp.from_torch(part) for part in buffer.split(widths, dim=1)]
-            for buffer, widths in (
-                (self._start[slot], self._widths),
-                (self._end, self._end_widths),
-                (self._g_start, self._widths),
-                (self._g_end, self._widths[:2]),
-            )
+            for buffer, widths in ((self._end, self._end_widths), (self._g_end, self._widths[:2]))
         )
         real, nonfinite = self._launcher.spec.dtype, wp.from_torch(self._nonfinite[slot])
         scalars = [real(self.control_dt / how.substeps), real(how.theta), how.substeps]
         if kernel == "forward":
-            return [*scalars, how.passes, *start, int(record), row0, *rows, *end, nonfinite]
-        qpos, _, *inputs = start  # ctrl, factors and forces
+            return [*scalars, how.passes, start, int(record), row0, rows, *end, nonfinite]
         blown_up = wp.from_torch(self.nonfinite_gradients)
-        return [*scalars, row0, *rows, qpos, *inputs, nonfinite, *g_end, *g_start, blown_up]
+        return [*scalars, row0, rows, start, nonfinite, *g_end, g_start, blown_up]
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
