@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -204,9 +204,17 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     if given.resume and "modules" not in saved:
         fail(f"{path} holds a policy alone, which can be evaluated but not resumed")
     hints = get_type_hints(kind, include_extras=True)
-    known = {name: value for name, value in saved["args"].items() if name in hints and not name.isupper()}
-    if given.resume and (unknown := [flag(name) for name in saved["args"] if name not in known]):
-        fail(f"{path} was written by a {kind.script()}.py with other flags: {', '.join(unknown)}")
+    choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
+    known = {
+        name: value
+        for name, value in saved["args"].items()
+        if name in hints and not name.isupper() and value in choices.get(name, (value,))
+    }
+    if gone := ", ".join(f"{flag(name)} {value}" for name, value in saved["args"].items() if name not in known):
+        message = f"{path} was written by a {kind.script()}.py with other flags: {gone}"
+        if given.resume:
+            fail(message)
+        print(f"{Path(sys.argv[0]).name}: {message}; they do not count here", file=sys.stderr)
     defaults = kind(**known)
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained

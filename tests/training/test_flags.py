@@ -263,10 +263,14 @@ def test_what_a_checkpoint_decides(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_checkpoint_of_flags_that_the_script_lacks_is_only_evaluated(capsys: pytest.CaptureFixture[str]) -> None:
-    path = save(parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"]), old_flag=3)
+    """And of choices that it lacks; what does not count is told."""
+    path = save(parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"]), old_flag=3, accuracy="exact")
     line = refusal(lambda: parse(shac.Args, ["--resume", str(path)]), capsys)
-    assert line == f"script.py: {path} was written by a shac.py with other flags: --old-flag"
-    assert parse(shac.Args, ["--evaluate", str(path)]).gamma == 0.9
+    expected = f"script.py: {path} was written by a shac.py with other flags: --accuracy exact, --old-flag 3"
+    assert line == expected
+    args = parse(shac.Args, ["--evaluate", str(path)])
+    assert (args.gamma, args.accuracy) == (0.9, "default")
+    assert capsys.readouterr().err == f"{expected}; they do not count here\n"
 
 
 def test_a_checkpoint_older_than_a_flag_has_its_default() -> None:
