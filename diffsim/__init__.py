@@ -16,7 +16,7 @@ from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration
-from diffsim.sim.options import check_device, check_dtype
+from diffsim.sim.options import Options, check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation, Task, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
@@ -35,6 +35,11 @@ __all__ = [
     "make",
     "read_clip",
 ]
+
+
+# Arguments of `make` that it hands on
+KEYWORDS = {"stochastic_init", "early_termination", "max_episode_steps", "render_mode", *Options._fields}
+KEYWORDS -= {"integration", "device", "dtype"}
 
 
 def make(
@@ -68,7 +73,7 @@ def make(
         substeps, integrator, theta, passes, touchdown: each in place of the preset's, if given.
         contact: "soft" (the paper's springs) or "mujoco" (MuJoCo's own constraints, see Integration): the laws of
             contact and limits and how they are integrated; docs/transfer.md has what policies keep of their speed.
-            Default the task's: soft for those of diffsim.TASKS, mujoco for others.
+            Default the task's: soft for those of the papers, mujoco for go1, go2, g1 and tasks of your own.
         penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
         terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
             of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
@@ -80,7 +85,10 @@ def make(
 
     Raises:
         ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
+        TypeError: an argument of another name.
     """
+    if unknown := sorted(others.keys() - KEYWORDS):
+        raise TypeError(f"make has no argument {unknown[0]!r}: choose from {', '.join(sorted(KEYWORDS))}")
     device, dtype = check_device(device), check_dtype(dtype)
     kind = find_task(name)
     startup.check_kernel_cache()

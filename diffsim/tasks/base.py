@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+from difflib import get_close_matches
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias, get_args
 
@@ -26,6 +27,7 @@ Accuracy = Literal["fast", "default", "accurate"]
 Contact = Literal["soft", "mujoco"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
+LIKENESS = 0.9  # of a misspelt name, by difflib's measure
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
@@ -86,8 +88,9 @@ class Task:
         """Itself, fitted to its robot: start, num_random, obs_dim and forward_column are found where they are missing.
 
         Raises:
-            TaskError: a number that does not fit, by name.
+            TaskError: a name, a number or what a method returns does not fit; an episode is over where it starts.
         """
+        self._check_names()
         n, m = scene.nq + scene.nv, scene.mj_model
         self.forward_column = getattr(self, "forward_column", way_forward(scene))
         self.num_random = getattr(self, "num_random", n)
@@ -105,19 +108,44 @@ class Task:
         self._check("the width of qpos and of qvel from reset", (qpos.shape[-1], qvel.shape[-1]), (scene.nq, scene.nv))
         memory = self.begin(rand)
         self._check("the width of what begin returns", memory.shape[-1], self.num_memory, "num_memory")
-        obs = self.observe_with(*state, memory)
+        obs = self._tensor("observe", self.observe_with(*state, memory))
         self._check("the shape of two observations", tuple(obs.shape), (2, obs.shape[-1]))
         self.obs_dim = getattr(self, "obs_dim", obs.shape[-1])
         self._check("obs_dim", self.obs_dim, obs.shape[-1], "what observe returns")
         if self.obs_parts:
             self._check("the sum of obs_parts", sum(size for _, size in self.obs_parts), self.obs_dim, "obs_dim")
-        if type(self).reward is not Task.reward:  # who only watches needs none
-            self._check("the shape of two rewards", tuple(self.reward(obs, action).shape), (2,))
+        reward = self._tensor("reward", self.reward(obs, action))
+        self._check("the shape of two rewards", tuple(reward.shape), (2,))
+        for k in scene.quaternion_adr:
+            if not qpos[:, k : k + 4].any(1).all():
+                raise TaskError(f"task {self.name!r}: the quaternion qpos[{k}:{k + 4}] of the start is zero")
+        if self.terminated(obs).any():
+            bound = "" if self.min_height is None else f", and min_height is {self.min_height}"
+            raise TaskError(f"task {self.name!r}: an episode ends where it starts; obs[0] is {obs[0, 0]:.4g}{bound}")
         return self
+
+    def _tensor(self, method: str, value: Tensor) -> Tensor:
+        """What a method returns for the start."""
+        if not isinstance(value, Tensor):
+            raise TaskError(f"task {self.name!r}: {method} returns {type(value).__name__}, must return a torch tensor")
+        if not value.isfinite().all():
+            raise TaskError(f"task {self.name!r}: what {method} returns for the start is not finite")
+        return value
 
     def _check(self, name: str, value: object, expected: object, source: str = "") -> None:
         if value != expected:
             raise TaskError(f"task {self.name!r}: {name} is {value}, must be {expected}{source and f' ({source})'}")
+
+    def _check_names(self) -> None:
+        """That a class outside this package has the methods that it needs, and none of Task's names misspelt."""
+        own = {name for kind in type(self).__mro__ if not kind.__module__.startswith("diffsim.") for name in vars(kind)}
+        known = {name for name in (*vars(Task), *Task.__annotations__) if not name.startswith("_")}
+        for name in sorted(own - known):
+            if meant := get_close_matches(name, known - own, 1, LIKENESS):
+                raise TaskError(f"task {self.name!r} has {name!r}: is {meant[0]!r} meant?")
+        for names in (("observe", "observe_with"), ("reward",)):
+            if all(getattr(type(self), name) is getattr(Task, name) for name in names):
+                raise TaskError(f"task {self.name!r} has no method {names[0]!r}")
 
     @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:

@@ -224,6 +224,11 @@ def test_a_task_starts_at_the_keyframe() -> None:
         (dict(observe=lambda self, qpos, qvel, action: qpos[..., 0]), "the shape of two observations is (2,), must be"),
         (dict(reward=lambda self, obs, action: obs[..., :1]), "the shape of two rewards is (2, 1), must be (2,)"),
         (dict(reward=lambda self, obs, action: obs.sum()), "the shape of two rewards is (), must be (2,)"),
+        (dict(reward=lambda self, obs, action: obs[:, 0].numpy()), "reward returns ndarray, must return a torch"),
+        (dict(reward=lambda self, obs, action: obs[:, 0].log()), "what reward returns for the start is not finite"),
+        (dict(observe=lambda self, qpos, qvel, action: qpos / 0), "what observe returns for the start is not finite"),
+        (dict(min_height=5.0), "an episode ends where it starts; obs[0] is 0, and min_height is 5.0"),
+        (dict(terminated=lambda self, obs: obs[:, 0] == 0), "an episode ends where it starts; obs[0] is 0"),
     ],
 )  # fmt: skip
 def test_a_number_that_does_not_fit_is_named(changes: dict[str, object], message: str) -> None:
@@ -231,6 +236,24 @@ def test_a_number_that_does_not_fit_is_named(changes: dict[str, object], message
     with pytest.raises(TaskError) as error:
         diffsim.DiffEnv(wrong(), scene_of(EXAMPLE.read_text()), 1)
     assert line_of(error).startswith(f"task 'wrong': {message}")
+
+
+def test_what_is_missing_or_misspelt_is_named() -> None:
+    def refused(mjcf: str = EXAMPLE.read_text(), **changes: object) -> str:
+        with pytest.raises(TaskError) as error:
+            diffsim.DiffEnv(type("Wrong", (Bare,), changes | {"name": "wrong"})(), scene_of(mjcf), 1)
+        return line_of(error)
+
+    assert refused(episode_lenght=5) == "task 'wrong' has 'episode_lenght': is 'episode_length' meant?"
+    assert refused(terminate=lambda self, obs: obs) == "task 'wrong' has 'terminate': is 'terminated' meant?"
+    assert refused(reward=Task.reward) == "task 'wrong' has no method 'reward'"
+    assert refused(observe=Task.observe) == "task 'wrong' has no method 'observe'"
+    flat = BALLS.format(key="")
+    assert refused(flat, start=(0.0,) * 20) == "task 'wrong': the quaternion qpos[3:7] of the start is zero"
+    others = {"rewards": 3, "rest": (), "max_height": 2.0, "walls": 1, "observe_with": Bare.observe_with}
+    assert fitted(type("Mine", (Bare,), others), scene_of(EXAMPLE.read_text())).obs_dim == 10
+    with pytest.raises(TypeError, match="make has no argument 'foo': choose from .*early_termination, factors, forces"):
+        diffsim.make("ant", foo=1)
 
 
 def test_a_policy_of_a_task_that_has_changed_since_is_refused() -> None:
