@@ -1,0 +1,207 @@
+"""Whether what goes wrong in one environment stays there, and whether extreme contacts are solved as by MuJoCo.
+
+    python benchmarks/extremes.py                        hopper: 1,260 tries, and 512 states
+    python benchmarks/extremes.py --parts containment --env ant
+
+Containment: one environment of a batch gets a number of DISTURBANCES, as the first, the middle or the last one, in
+batches of several sizes and kinds of kernels, and all take four steps. It holds if all states, gradients, flags and
+counts of the others are bit for bit those of the batch without it, and its own states (unless they began so) and
+gradients are finite.
+
+States: a robot of two links whose masses differ by up to 1e9, thrown into the ground at up to 1000 m/s and rad/s, takes
+one step of MuJoCo's contact, to the end of Newton's method. It holds if nothing is contained, and velocities are
+MuJoCo's within 1e-9 in float64 and 1e-2 in float32, of the largest velocity and its change.
+
+Writes containment.csv and extreme_states.csv and, with --update-results, the tables of docs/stability.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from common import CommonFlags, Part, TaskName, Tasks, measured, run
+from groups import grouped, numbers
+from tables import Row, markdown
+from torch import Tensor
+from worlds import Array
+
+import diffsim
+from diffsim import Integration, Scene, Simulator, load_scene
+
+PartName = Literal["containment", "states"]
+INTEGRATIONS = {
+    "semi_implicit": Integration("semi_implicit", 8),
+    "implicit": Integration("implicit", 8),
+    "implicit, theta 1": Integration("implicit", 8, 1.0),
+    "extrapolated": Integration("extrapolated", 8),
+    "mujoco": Integration("mujoco", 4),
+}
+BATCHES: list[tuple[int, int | None, torch.dtype]] = [  # environments, and how wide a kernel's blocks are
+    *((16, 16, torch.float32), (17, 16, torch.float32), (8, 8, torch.float32)),
+    *((5, None, torch.float32), (3, None, torch.float64), (33, None, torch.float32)),
+]
+ALL, NAN, INF = slice(None), float("nan"), float("inf")
+DISTURBANCES: list[tuple[str, Any, float]] = [  # what of an environment gets which value
+    *(("qvel", 0, NAN), ("qvel", -1, INF), ("qvel", ALL, 9e4), ("qvel", ALL, 1e30), ("qpos", -1, NAN)),
+    *(("forces", 1, 1e30), ("forces", 1, 1e8), ("ctrl", ALL, NAN), ("ctrl", ALL, 1e30), ("factors", [0, 4], 1e30)),
+    *(("factors", 6, 0.0), ("factors", 6, 1e30), ("factors", 7, 1e30), ("qpos", "height", -100.0)),
+    ("qpos", "quaternion", 0.0),
+]
+MASSES = (1.0, 1.0), (1e2, 1e-2), (1e4, 1e-4), (1e5, 1e-4), (1e-4, 1e-4), (3e5, 3e5)  # kg, of root and of links
+ROBOTS = [*((*masses, 1.0) for masses in MASSES), (1.0, 1.0, 0.0), (1.0, 1.0, 100.0)]  # with the friction
+SPEEDS = {1.0: 0.01, 10.0: 0.05, 100.0: 0.1, 1000.0: 0.3}  # m/s and rad/s: how deep it may be in the ground [m]
+ROBOT_KEY = ("root (kg)", "links (kg)", "friction")
+STATES, STEP, PASSES = 16, 0.002, 300  # of each robot and speed; s; of Newton's method
+EXACT = {torch.float64: 1e-9, torch.float32: 1e-2}
+ROBOT = """<mujoco><option timestep="{step}" cone="elliptic" iterations="2000" tolerance="0" ls_iterations="500"
+ls_tolerance="1e-14"/><worldbody><geom type="plane" size="0 0 1"/><body pos="0 0 .5"><freejoint/>
+<geom type="sphere" size=".2" mass="{root}"/><body pos="0 0 -.25"><joint axis="0 1 0" range="-60 60"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.2" size=".03" mass="{link}" friction="{friction}"/><body pos="0 0 -.2">
+<joint axis="1 0 0" range="-30 30"/><geom type="sphere" size=".05" mass="{link}" friction="{friction}"/>
+</body></body></body></worldbody></mujoco>"""
+
+
+@dataclass
+class Args(CommonFlags):
+    env: Tasks = ("hopper",)  # tasks whose environments are disturbed
+    parts: tuple[PartName, ...] = ("containment", "states")  # what to measure
+
+
+class Inputs(NamedTuple):
+    qpos: Tensor
+    qvel: Tensor
+    ctrl: Tensor
+    factors: Tensor
+    forces: Tensor
+
+    def disturbed(self, scene: Scene, k: int, what: str, where: Any, value: float) -> Inputs:
+        tensor = getattr(self, what).clone()
+        places = {"height": 2 if scene.floating else 1, "quaternion": slice(3, 7)}
+        tensor[k][places.get(where, where) if isinstance(where, str) else where] = value
+        return self._replace(**{what: tensor})
+
+
+class Outcome(NamedTuple):
+    """Of four steps and their backward pass, a row for each environment."""
+
+    states: Tensor
+    gradients: Tensor
+    flags: Tensor  # which have been contained, and their gradients that were
+
+
+def four_steps(sim: Simulator, given: Inputs) -> Outcome:
+    leaves = Inputs(*(x.clone().requires_grad_() for x in given))
+    sim.factors, sim.forces = leaves.factors, leaves.forces
+    state, states, lost = (leaves.qpos, leaves.qvel), list[Tensor](), list[Tensor]()
+    sim.nonfinite_gradients.zero_()
+    for _ in range(4):
+        state = sim.step(*state, leaves.ctrl)
+        states += state
+        lost.append(sim.nonfinite.clone())
+    weights = torch.arange(1.0, sim.num_envs + 1, dtype=sim.dtype).unsqueeze(1)  # each environment has its own
+    gradients = torch.autograd.grad(sum(((x * weights).sum() for x in states), torch.tensor(0.0)), leaves)
+    flags = torch.stack([*lost, sim.nonfinite_gradients], 1)
+    return Outcome(torch.cat(states, 1).detach(), torch.cat([x.flatten(1) for x in gradients], 1), flags)
+
+
+def contain(args: Args, task: TaskName) -> Iterator[Row]:
+    """A row for each integrator."""
+    env = diffsim.make(task, max(n for n, *_ in BATCHES), seed=3)
+    scene, drawn = env.scene, torch.Generator().manual_seed(0)
+    for name, integration in INTEGRATIONS.items():
+        tried = held = 0
+        for n, block, dtype in BATCHES:
+            options: dict[str, Any] = dict(dtype=dtype, block=block, factors=True, forces=True)
+            sim = Simulator(scene, n, integration, 1 / 60, 4, **options)
+            ctrl = 2 * torch.rand(n, scene.nu, generator=drawn) - 1
+            parts = env.qpos[:n], env.qvel[:n], ctrl, sim.factors, sim.forces
+            given = Inputs(*(part.to(dtype) for part in parts))
+            expected = four_steps(sim, given)
+            for (what, where, value), k in product(DISTURBANCES, (0, n // 2, n - 1)):
+                if where == "quaternion" and not scene.floating:
+                    continue
+                found, others = four_steps(sim, given.disturbed(scene, k, what, where, value)), torch.arange(n) != k
+                good = all(torch.equal(x[others], y[others]) for x, y in zip(found, expected, strict=True))
+                begun = what in ("qpos", "qvel") and not np.isfinite(value)
+                good &= bool(found.gradients[k].isfinite().all() and (begun or found.states[k].isfinite().all()))
+                if not good:
+                    print(f"{task}, {name}, {n} environments in blocks of {block}: {what} {where} = {value} of {k}")
+                tried, held = tried + 1, held + good
+        yield {"task": task, "integrator": name, "tried": tried, "held": held}
+
+
+def robot(root: float, link: float, friction: float) -> Scene:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.xml"
+        path.write_text(ROBOT.format(step=STEP, root=root, link=link, friction=friction))
+        return load_scene(path)
+
+
+def thrown(model: mujoco.MjModel, speed: float, depth: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Start positions and velocities (STATES, ...), a sphere in the ground, and velocities a step later."""
+    states, data = list[tuple[Array, Array, Array]](), mujoco.MjData(model)
+    for _ in range(STATES):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv) * ([0] * 3 + [0.1] * 5), 1.0)
+        data.qpos[7:] = rng.uniform(-0.7, 0.7, 2)
+        mujoco.mj_kinematics(model, data)
+        lowest = min(data.geom_xpos[1, 2] - 0.2, data.geom_xpos[3, 2] - 0.05)
+        data.qpos[2] -= lowest + rng.uniform(0, depth)
+        data.qvel[:] = rng.normal(size=model.nv) * speed
+        start = data.qpos.copy(), data.qvel.copy()
+        mujoco.mj_step(model, data)
+        states.append((*start, data.qvel.copy()))
+    qpos, qvel, after = (np.stack(parts) for parts in zip(*states, strict=True))
+    return qpos, qvel, after
+
+
+def throw() -> Iterator[Row]:
+    """A row for each robot and speed."""
+    rng = np.random.default_rng(1)
+    for root, link, friction in ROBOTS:
+        scene = robot(root, link, friction)
+        for speed, depth in SPEEDS.items():
+            qpos, qvel, expected = thrown(scene.mj_model, speed, depth, rng)
+            row = dict(zip((*ROBOT_KEY, "speed", "tried"), (root, link, friction, speed, STATES), strict=True))
+            held, scale = np.full(STATES, True), np.abs(expected).max(1) + np.abs(expected - qvel).max(1)
+            for dtype, exact in EXACT.items():
+                sim = Simulator(scene, STATES, Integration("mujoco", 1, passes=PASSES), STEP, dtype=dtype)
+                start = torch.tensor(qpos).to(dtype), torch.tensor(qvel).to(dtype)
+                _, after = sim.step(*start, torch.zeros(STATES, 0, dtype=dtype))
+                error = np.abs(after.double().numpy() - expected).max(1) / scale
+                held &= (error < exact) & ~sim.nonfinite.numpy()
+                row[f"error, {str(dtype).removeprefix('torch.')}"] = float(error.max())
+            yield row | {"held": int(held.sum())}
+
+
+def worst(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each robot: all its speeds."""
+    lines = list[Row]()
+    for key, own in grouped(rows, *ROBOT_KEY).items():
+        line: dict[str, object] = dict(zip(ROBOT_KEY, key, strict=True))
+        line |= {name: f"{sum(numbers(own, name)):.0f}" for name in ("tried", "held")}
+        errors = [name for name in own[0] if name.startswith("error")]
+        lines.append(line | {name: f"{max(numbers(own, name)):.0e}" for name in errors})
+    return lines
+
+
+def main(args: Args) -> None:
+    if "containment" in args.parts:
+        key = "task", "integrator"
+        measured(args, Part("containment", contain, key, "containment", "stability.md"))
+    if "states" in args.parts:
+        for row in () if args.draw_only else throw():
+            args.keep("extreme_states", row, (*ROBOT_KEY, "speed"))
+        args.publish("states", markdown(worst(args.read("extreme_states"))), "stability.md")
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
