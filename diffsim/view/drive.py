@@ -6,10 +6,15 @@ user asks for goes back as a POST. Several pages show one robot; their commands 
 
 from __future__ import annotations
 
+import base64
 import functools
+import hashlib
+import ipaddress
 import itertools
 import json
 import math
+import re
+import socket
 import sys
 import threading
 import time
@@ -17,6 +22,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -36,6 +42,7 @@ TURN = 0.3  # rad/s by which a key turns the way of a robot that otherwise runs 
 STIFFNESS, MAX_PULL = 20.0, 19.62  # N/kg per m of the mouse's pull, and N/kg: twice the weight
 SILENCE = 10.0  # s after which a page that takes no more pictures is given up
 LONGEST = 1000  # bytes of what a page asks for
+SECURITY = "default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; frame-ancestors 'none'"
 
 
 class Wish(NamedTuple):
@@ -148,6 +155,21 @@ class Stage:
                 del self.wishes[client]
 
 
+def is_here(host: str, own: str) -> bool:
+    """Whether a request's Host is an address, or a name of this machine: others could lead any web page here."""
+    with suppress(ValueError):
+        name = urlsplit(f"//{host}").hostname or ""
+        return name in ("localhost", own.lower(), socket.gethostname().lower()) or bool(ipaddress.ip_address(name))
+    return False
+
+
+def security(page: bytes) -> str:
+    """The page talks to this server alone, no other page shows it, and no script runs except those that it has now."""
+    scripts = re.findall(b"<script>(.*?)</script>", page, re.DOTALL)
+    hashes = (base64.b64encode(hashlib.sha256(script).digest()).decode() for script in scripts)
+    return f"{SECURITY}; script-src " + " ".join(f"'sha256-{each}'" for each in hashes)
+
+
 class Server(ThreadingHTTPServer):
     daemon_threads = True
 
@@ -159,13 +181,26 @@ class Server(ThreadingHTTPServer):
 class Handler(BaseHTTPRequestHandler):
     timeout = SILENCE
 
-    def __init__(self, stage: Stage, page: str, bodies: int, *connection: Any) -> None:
-        self._stage, self._page, self._bodies = stage, page.encode(), bodies
+    def __init__(self, stage: Stage, page: bytes, bodies: int, host: str, *connection: Any) -> None:
+        self._stage, self._page, self._bodies, self._host = stage, page, bodies, host
         super().__init__(*connection)
+
+    def parse_request(self) -> bool:
+        """Only this machine's own page may ask: other pages name their origin, or lead their own name here."""
+        if not super().parse_request():
+            return False
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        if not is_here(host, self._host):
+            self.send_error(403, "take the address that drive has printed, or start it with --host and your name")
+        elif origin and origin.partition("://")[2] != host:
+            self.send_error(403, "only the page itself may ask")
+        else:
+            return True
+        return False
 
     def do_GET(self) -> None:
         if self.path == "/":
-            self._answer("text/html; charset=utf-8", self._page)
+            self._answer("text/html; charset=utf-8", self._page, **{"Content-Security-Policy": security(self._page)})
         elif self.path == "/stream":
             self._answer("text/event-stream")
             with closing(self._stage.watch()) as pictures:
@@ -175,11 +210,9 @@ class Handler(BaseHTTPRequestHandler):
             self.send_error(404)
 
     def do_POST(self) -> None:
-        origin = self.headers.get("Origin")
-        if origin and origin.partition("://")[2] != self.headers.get("Host"):
-            return self.send_error(403, "only the page itself may ask")
         try:
-            said = json.loads(self.rfile.read(min(int(self.headers.get("Content-Length", 0)), LONGEST)))
+            length = int(self.headers["Content-Length"])
+            said = json.loads(self.rfile.read(length if 0 <= length <= LONGEST else 0))
             client, wish = said["client"], parse(said, self._bodies)
         except (KeyError, OverflowError, RecursionError, TypeError, ValueError):
             return self.send_error(400)
@@ -188,10 +221,10 @@ class Handler(BaseHTTPRequestHandler):
                 self._stage.wishes[client] = wish
         self._answer("text/plain")
 
-    def _answer(self, kind: str, content: bytes = b"") -> None:
+    def _answer(self, kind: str, content: bytes = b"", **headers: str) -> None:
         self.send_response(200)
-        self.send_header("Content-Type", kind)
-        self.send_header("Cache-Control", "no-store")
+        for header, value in {"Content-Type": kind, "Cache-Control": "no-store", **headers}.items():
+            self.send_header(header, value)
         self.end_headers()
         self.wfile.write(content)
 
@@ -209,8 +242,8 @@ def serve(env: DiffEnv, policy: Callable[[Tensor], Tensor], caption: str, host: 
     motion = web.describe(scene, np.repeat(env.qpos.numpy(), 2, 0), env.control_dt)
     motion["live"] = next(text for kind, text in KEYS.items() if isinstance(env.task, kind))
     try:
-        page = web.fill_page(motion, name, caption)
-        server = Server((host, port), functools.partial(Handler, stage, page, scene.nbody))
+        page = web.fill_page(motion, name, caption).encode()
+        server = Server((host, port), functools.partial(Handler, stage, page, scene.nbody, host))
     except (OSError, OverflowError) as error:
         why = getattr(error, "strerror", None) or error
         raise OSError(f"cannot listen on {host}:{port}: {why}; choose another --host or --port") from error

@@ -26,6 +26,7 @@ AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.
 GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
+FOLLOWS = mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
 SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
 VIDEO_FPS = 30.0  # at most
@@ -61,9 +62,8 @@ class Renderer(AbstractContextManager["Renderer"]):
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not self._fast
         self._camera: Any = "track"
         if "track" not in (model.camera(i).name for i in range(model.ncam)):
-            self._camera = mujoco.MjvCamera()
-            mujoco.mjv_defaultFreeCamera(model, self._camera)
-            self._camera.type, self._camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
+            follow(model, camera := mujoco.MjvCamera())
+            self._camera = camera
 
     def draw(self, qpos: ArrayLike, ctrl: ArrayLike | None = None, profile: int = 0) -> Frame:
         """The frame (height, width, 3) of one configuration qpos (nq,).
@@ -95,8 +95,13 @@ class Renderer(AbstractContextManager["Renderer"]):
 
 
 def drawable(scene: Scene) -> tuple[mujoco.MjModel, int]:
-    """A copy of a scene's model, without planes if there is a terrain, and the material of the first plane, or -1."""
+    """A copy of a scene's model, without planes if there is a terrain, and the material of the first plane, or -1.
+
+    It has light everywhere: without a sun, a file's lamp leaves dark what walks away from it.
+    """
     model = copy.copy(scene.mj_model)
+    if (model.light_type != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL).all():
+        model.vis.headlight.ambient, model.vis.headlight.diffuse = 0.5, 0.5
     planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     material = int(model.geom_matid[planes[0]]) if len(planes) else -1
     if scene.terrain is not None:
@@ -136,14 +141,33 @@ def activations(model: mujoco.MjModel, ctrl: ArrayLike) -> tuple[NDArray[np.intp
 
 
 def orbit(model: mujoco.MjModel) -> dict[str, Any]:
-    """Where the MJCF's first camera stands relative to what it follows, as the orbit about a point that it looks at."""
-    if not model.ncam:
-        return {"yaw": -math.pi / 2, "pitch": 0.3, "distance": 3 * model.stat.extent, "aim": [0, 0, 0], "fovy": 0.8}
+    """Where the MJCF's first camera stands relative to what it follows, as the orbit about a point that it looks at.
+
+    If it follows nothing, where the robot, at its size in the start pose, fills half of the picture.
+    """
+    if not (model.ncam and model.cam_mode[0] in FOLLOWS):
+        return {"yaw": -math.pi / 2, "pitch": 0.5, "distance": 1.6 * _size(model), "aim": [0, 0, 0], "fovy": 0.8}
     # mode="trackcom": the camera keeps its place relative to the centre of mass, and its direction.
     place, back = model.cam_poscom0[0], model.cam_mat0[0].reshape(3, 3)[:, 2]
     distance = float(place @ back)
     yaw, pitch, fovy = math.atan2(back[1], back[0]), math.asin(back[2]), math.radians(float(model.cam_fovy[0]))
     return {"yaw": yaw, "pitch": pitch, "distance": distance, "aim": (place - distance * back).tolist(), "fovy": fovy}
+
+
+def _size(model: mujoco.MjModel) -> float:
+    """The diagonal of all that moves, m; MuJoCo's extent has the floor in it."""
+    mujoco.mj_kinematics(model, data := mujoco.MjData(model))
+    moves = model.body_weldid[model.geom_bodyid] > 0
+    place, radius = data.geom_xpos[moves], model.geom_rbound[moves, None]
+    return float(np.linalg.norm((place + radius).max(0) - (place - radius).min(0))) if len(place) else 1.0
+
+
+def follow(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
+    """Let a camera go along with the robot, where `orbit` says."""
+    camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, model.nbody - 1)
+    place = orbit(model)
+    camera.azimuth, camera.elevation = math.degrees(place["yaw"] + math.pi), -math.degrees(place["pitch"])
+    camera.distance = place["distance"]
 
 
 def _add_shadows(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene) -> None:

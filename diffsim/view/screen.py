@@ -72,10 +72,7 @@ class Screen:
         window = mujoco.viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
         self._threads = {*threading.enumerate()} - others
         with window.lock():
-            camera, orbit = window.cam, render.orbit(self._model)
-            camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, min(1, self._model.nbody - 1)
-            camera.azimuth, camera.elevation = np.degrees((orbit["yaw"] + np.pi, -orbit["pitch"]))
-            camera.distance = orbit["distance"]
+            render.follow(self._model, window.cam)
             if self._scene.terrain is not None:
                 render.add_terrain(window.user_scn, self._scene.terrain[0], material)
         return window

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import hashlib
 import http.client
 import json
 import math
@@ -14,6 +16,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +32,7 @@ from diffsim.view import drive
 from diffsim.view.drive import Handler, Pilot, Server, Stage, Wish
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGE = b"<p>the page</p><script>act()</script>"
 
 
 # The pages' side, without a simulation --------------------------------------------------------------------------------
@@ -37,8 +41,8 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def stage() -> Iterator[tuple[Stage, int]]:
     shared = Stage()
-    with Server(("127.0.0.1", 0), functools.partial(Handler, shared, "the page", 3)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+    with Server(("127.0.0.1", 0), functools.partial(Handler, shared, PAGE, 3, "robot.lan")) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         yield shared, server.server_port
         server.shutdown()
 
@@ -58,9 +62,16 @@ def news(stream: http.client.HTTPResponse) -> str:
 
 
 def ask(port: int, body: object, **headers: str) -> int:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("POST", "/ask", body if isinstance(body, str) else json.dumps(body), headers)
-    return connection.getresponse().status
+    words = body if isinstance(body, str) else json.dumps(body)
+    return request(
+        port, "POST", "/ask", words, headers={name.replace("_", "-"): x for name, x in headers.items()}
+    ).status
+
+
+def request(port: int, *words: str, **more: Any) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    connection.request(*words, **more)
+    return connection.getresponse()
 
 
 def test_two_clients_see_all_and_one_that_leaves_takes_its_wish_along(
@@ -107,14 +118,41 @@ def test_nonsense_changes_nothing(stage: tuple[Stage, int], said: object) -> Non
 def test_only_the_page_itself_asks(stage: tuple[Stage, int]) -> None:
     shared, port = stage
     _, _, client = connect(port)
-    wish = GOOD | {"client": client}
-    assert ask(port, wish, Origin="http://elsewhere.org") == 403 and shared.wishes == {client: Wish()}
-    assert ask(port, wish, Origin=f"http://127.0.0.1:{port}") == 200 and shared.wishes == {client: Wish((0, 0, 1))}
+    wish, own = GOOD | {"client": client}, f"127.0.0.1:{port}"
+    for host, origin, status in (
+        (own, f"http://{own}", 200),
+        *(
+            (f"{name}:{port}", f"http://{name}:{port}", 200)
+            for name in ("localhost", "[::1]", "robot.lan", "ROBOT.lan")
+        ),
+        (own, "http://elsewhere.org", 403),
+        (own, "null", 403),
+        # A name of another page that its owner has led to this machine: DNS rebinding.
+        *((f"{name}:{port}", f"http://{name}:{port}", 403) for name in ("elsewhere.org", "127.0.0.1.elsewhere.org")),
+        *((name, f"http://{name}", 403) for name in ("", "[::1", "localhost.elsewhere.org", "127.0.0.1@elsewhere.org")),
+    ):
+        shared.wishes[client] = Wish()
+        assert ask(port, wish, Host=host, Origin=origin) == status, (host, origin)
+        assert shared.wishes == {client: Wish((0, 0, 1)) if status == 200 else Wish()}
+        assert [request(port, "GET", path, headers={"Host": host}).status for path in ("/", "/no")] == (
+            [403, 403] if status == 403 and host != own else [200, 404]
+        )
     assert ask(port, wish | {"client": 77}) == 200 and ask(port, wish | {"client": []}) == 200
     assert [*shared.wishes] == [client]
-    connection = http.client.HTTPConnection("127.0.0.1", port)
-    connection.request("GET", "/../secret")
-    assert connection.getresponse().status == 404
+
+
+@pytest.mark.parametrize("length", [-1, -(10**30), 1001, 10**9, "", "many"])
+def test_a_length_that_is_none_is_not_waited_for(stage: tuple[Stage, int], length: object) -> None:
+    """Content-Length: -1 was read without end."""
+    assert ask(stage[1], GOOD | {"client": 1}, Content_Length=str(length)) == 400
+
+
+def test_the_page_runs_its_own_script_alone(stage: tuple[Stage, int]) -> None:
+    answer = request(stage[1], "GET", "/")
+    policy = dict(rule.split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split("; "))
+    digest = base64.b64encode(hashlib.sha256(b"act()").digest()).decode()
+    assert answer.read() == PAGE and policy["script-src"] == f"'sha256-{digest}'"
+    assert (policy["default-src"], policy["connect-src"], policy["frame-ancestors"]) == ("'none'", "'self'", "'none'")
 
 
 # The robot's side -----------------------------------------------------------------------------------------------------

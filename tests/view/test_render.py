@@ -101,12 +101,18 @@ def test_quality_changes_no_content(opengl: None, monkeypatch: pytest.MonkeyPatc
     assert (fast != full).any() and (abs(fast - full).max(-1) > 60).mean() < 0.03  # edges alone
 
 
-def test_a_robot_without_a_camera_is_followed(opengl: None, tmp_path: Path) -> None:
-    file = tmp_path / "ball.xml"
-    file.write_text(scenes.BALL.replace('size="0.1"', 'size="0.3" rgba="1 0 0 1"'))
-    for x in (0.0, 50.0):
-        frame = frames_of(load_scene(file), np.array([[x, 0, 1, 1, 0, 0, 0]]), 64, 48)[0].astype(int)
-        assert (frame[..., 0] - frame[..., 2] > 50).sum() > 50
+def test_a_robot_without_a_camera_is_followed(opengl: None) -> None:
+    """It fills the picture whatever the size of its floor, and stays in the light where it leaves the file's lamp."""
+    ball = scenes.parse(
+        """<mujoco><worldbody>
+          <geom type="plane" size="20 20 .1"/>
+          <light pos="0 0 3"/>
+          <body pos="0 0 0.2"><freejoint/><geom size="0.2" rgba="1 0 0 1"/></body>
+        </worldbody></mujoco>"""
+    )
+    for frame in frames_of(ball, np.array([[x, 0, 0.2, 1, 0, 0, 0] for x in (0.0, 15.0)]), 64, 48).astype(int):
+        rows = ((frame[..., 0] - frame[..., 2]) > 50).any(1)
+        assert 15 < rows.sum() < 40 and frame[~rows].mean() > 70
 
 
 def test_muscles_are_coloured_by_activation(opengl: None) -> None:
