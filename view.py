@@ -50,7 +50,7 @@ class Args:
     episodes: int = 8
     """of as many episodes they show the one of median return"""
     env: str | None = None
-    """file of the task, if it is your own and not where it was in training"""
+    """file of the task, if it is your own: it is run"""
     seed: int = SEED
     """of the start states"""
     substeps: int | None = None
@@ -97,8 +97,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def show(args: Args) -> None:
     path = args.paths[0]
     saved = load_policy(path / "checkpoint.pt" if path.is_dir() else path)
-    changes: dict[str, Any] = {name: x for name in ("env", "substeps") if (x := getattr(args, name)) is not None}
-    task, name = find_task(args.env or saved.args["env"]).name, f"{saved.script}.py, iteration {saved.iteration}"
+    changes: dict[str, Any] = {"env": saved.task(args.env)} | ({"substeps": args.substeps} if args.substeps else {})
+    task, name = find_task(changes["env"]).name, f"{saved.script}.py, iteration {saved.iteration}"
     if args.viewer:
         print(f"{task}, {name}")
         play(make_policy_env(saved, 1, **changes), saved.network, args.seed)

@@ -148,7 +148,7 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
     path = checkpoint_of(path)
     saved = load_policy(path)
     try:
-        find_task(saved.args["env"])
+        find_task(saved.task())
     except TaskError as error:
         fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")

@@ -22,7 +22,7 @@ from diffsim import TASKS, SceneError, load_scene, startup
 from diffsim.robot.constraint import check_soft, constrained
 from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
-from diffsim.tasks import Contact, find_task
+from diffsim.tasks import FILE, Contact, find_task
 from diffsim.training import command, evaluate, export_onnx, export_policy, fail, load_policy, make_policy_env
 from diffsim.view import render
 
@@ -86,7 +86,7 @@ def drive(
     """Drive a robot from a page of your browser, with keys, a gamepad and the mouse; needs no display.
 
     Args:
-        robot: a task whose policy comes with the package, or that of the checkpoint.
+        robot: a task whose policy comes with the package, or that of the checkpoint, by its name or file.
         checkpoint: of any script.
         host: where the page is served: 0.0.0.0 lets other machines drive, too.
         port: of the page; 0 takes a free one.
@@ -98,12 +98,13 @@ def drive(
         able = [name for name, each in TASKS.items() if issubclass(each, kinds)]
         fail(f"{robot} cannot be driven: choose from {', '.join(able)}")
     saved = load_policy(checkpoint or shipped(task.name))
-    if (trained := find_task(saved.args["env"])) is not task:
-        fail(f"{checkpoint} is a checkpoint of {trained.name}, not of {robot}")
+    own = robot if FILE.fullmatch(robot) else None
+    if own is None and (trained := saved.task()) != task.name:
+        fail(f"{checkpoint} is a checkpoint of {trained}, not of {robot}")
     torch.set_num_threads(1)
     caption = f"{saved.script}.py, iteration {saved.iteration}"
     with startup.quick_kernels():
-        serve(make_policy_env(saved, 1, forces=True), saved.network, caption, host, port)
+        serve(make_policy_env(saved, 1, forces=True, env=own), saved.network, caption, host, port)
 
 
 def train(learner: Positional[str]) -> None:
@@ -142,14 +143,18 @@ def _give_up(robot: Path, seconds: float) -> None:
     os._exit(1)
 
 
-def export(checkpoint: Positional[Path], output: Positional[Path]) -> None:
-    """Write the policy of a checkpoint alone: OUTPUT.pt for this package, or OUTPUT.onnx for other programs."""
+def export(checkpoint: Positional[Path], output: Positional[Path], env: str | None = None) -> None:
+    """Write the policy of a checkpoint alone: OUTPUT.pt for this package, or OUTPUT.onnx for other programs.
+
+    Args:
+        env: file of the task, if it is your own and the output is .onnx: it is run.
+    """
     saved = load_policy(checkpoint)
     with render.whole_file(output) as part:
         if output.suffix == ".pt":
             export_policy(checkpoint, part)
         elif output.suffix == ".onnx":
-            export_onnx(saved, make_policy_env(saved, 1), part)
+            export_onnx(saved, make_policy_env(saved, 1, env=env), part)
         else:
             fail(f"cannot write {output}: its name must end in .pt or .onnx")
     size = output.stat().st_size / 1e3

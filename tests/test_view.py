@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import resource
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from learners import refusal
 
 import view
+from diffsim import __main__ as command
 from diffsim.training import load_policy, make_policy_env
 from diffsim.view import render
 
@@ -39,9 +43,30 @@ def test_video_page_and_curves_of_a_run(tiny_run: Path, tmp_path: Path, capsys: 
 
 
 def test_substeps_are_those_of_the_training_unless_given(tiny_run: Path) -> None:
-    saved = load_policy(tiny_run / "checkpoint.pt")
+    saved = load_policy(str(tiny_run / "checkpoint.pt"))
     assert make_policy_env(saved, 1).sim.integration.substeps == saved.args["substeps"]
     assert make_policy_env(saved, 1, substeps=7).sim.integration.substeps == 7
+
+
+@pytest.mark.parametrize("words", ["view --web x.html", "drive ant --port 0 --checkpoint", "export x.onnx"])
+def test_a_checkpoint_names_no_code_to_run(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file that a policy's env names is run only where the command line names it, too."""
+    monkeypatch.chdir(tmp_path)
+    state = torch.load(command.shipped("ant"), weights_only=True)
+    torch.save(state | {"args": state["args"] | {"env": "task.py"}}, "policy.pt")
+    code = 'open("ran", "w").close()\nfrom diffsim.tasks.ant import Ant\nclass Own(Ant): name = "own"'
+    Path("task.py").write_text(code)
+    name, *flags = words.split()
+    given = [*flags, "policy.pt"] if name != "export" else ["policy.pt", *flags]
+    call = functools.partial(view.main, given) if name == "view" else functools.partial(command.main, [name, *given])
+    assert refusal(call, capsys).endswith("task of yours: name the file, which is run, by --env task.py")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.pt", "task.py"]
+    with pytest.raises(ValueError, match="by --env task.py"):
+        make_policy_env(load_policy("policy.pt"), 1)
+    command.main(["export", "policy.pt", "alone.pt"])  # which needs no task
+    assert not Path("ran").exists() and make_policy_env(load_policy("alone.pt"), 1, env="task.py").task.name == "own"
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from torch import nn
 
 from diffsim.env import DiffEnv
 from diffsim.robot.elements import control_range
-from diffsim.tasks import TASKS
+from diffsim.tasks import FILE, TASKS
 from diffsim.tasks.imitation.clip import Clip
 from diffsim.training.errors import fail
 from diffsim.training.layers import First, Likeliest, ObsNormalizer
@@ -59,6 +59,15 @@ class SavedPolicy:
     args: dict[str, Any]  # with which arguments, env among them
     iteration: int
     simulator: str = HOME
+
+    def task(self, given: str | None = None) -> str:
+        """The name of its task, or the given file of an own one: what a checkpoint names is data, and no code to run.
+
+        Raises ValueError if the policy was trained on a file's task, and none is given.
+        """
+        if given is None and FILE.fullmatch(trained := self.args["env"]):
+            fail(f"the policy was trained on a task of yours: name the file, which is run, by --env {trained}")
+        return given or self.args["env"]
 
 
 def parts(learner: Learner) -> dict[str, Any]:
@@ -105,9 +114,9 @@ def find_nonfinite(learner: Learner) -> str | None:
     return None
 
 
-def load(path: Path, script: str | None = None) -> dict[str, Any]:
+def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, Any]:
     """The checkpoint at path, whole, of this format and of the script if one is named; else raises ValueError."""
-    if not path.is_file():
+    if not (path := Path(path)).is_file():
         fail(f"no such checkpoint: {path}")
     try:
         with zipfile.ZipFile(path) as archive:
@@ -127,7 +136,7 @@ def load(path: Path, script: str | None = None) -> dict[str, Any]:
     return state
 
 
-def load_policy(path: Path) -> SavedPolicy:
+def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
     """The policy of any script's checkpoint, on the CPU in float32; raises ValueError as `load` does."""
     state = load(path)
     try:
@@ -143,7 +152,7 @@ def load_policy(path: Path) -> SavedPolicy:
     return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))
 
 
-def export_policy(path: Path, output: Path) -> None:
+def export_policy(path: str | os.PathLike[str], output: Path) -> None:
     """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB."""
     state = load(path)
     _write(output, {name: value for name, value in state.items() if name in {"format", "simulator", *POLICY}})

@@ -167,7 +167,11 @@ def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, see
 
 
 def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **changes: Any) -> DiffEnv:
-    """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags."""
+    """The task on which a policy was trained, simulated as there, on the CPU; changes replace its flags.
+
+    Of a task of your own, env is its file.
+    """
+    changes |= {"env": saved.task(changes.get("env"))}
     args = SimpleNamespace(**vars(Flags()) | saved.args | {"device": "cpu", "threads": 0} | changes)
     env = make_env(args, num_envs, forces=forces)
     fitting(saved.network, env)

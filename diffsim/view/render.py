@@ -26,7 +26,6 @@ AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.
 GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SHADOW, FLATNESS = np.array([0.37, 0.39, 0.42, 1.0], dtype=np.float32), 1e-3
-FOLLOWS = mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
 SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
 VIDEO_FPS = 30.0  # at most
@@ -143,9 +142,10 @@ def activations(model: mujoco.MjModel, ctrl: ArrayLike) -> tuple[NDArray[np.intp
 def orbit(model: mujoco.MjModel) -> dict[str, Any]:
     """Where the MJCF's first camera stands relative to what it follows, as the orbit about a point that it looks at.
 
-    If it follows nothing, where the robot, at its size in the start pose, fills half of the picture.
+    Without one, or if the robot carries it, where the robot, in its start pose, fills half of the picture.
     """
-    if not (model.ncam and model.cam_mode[0] in FOLLOWS):
+    carried = (model.cam_mode == mujoco.mjtCamLight.mjCAMLIGHT_FIXED) & (model.body_weldid[model.cam_bodyid] > 0)
+    if not model.ncam or carried[0]:
         return {"yaw": -math.pi / 2, "pitch": 0.5, "distance": 1.6 * _size(model), "aim": [0, 0, 0], "fovy": 0.8}
     # mode="trackcom": the camera keeps its place relative to the centre of mass, and its direction.
     place, back = model.cam_poscom0[0], model.cam_mat0[0].reshape(3, 3)[:, 2]
