@@ -220,14 +220,6 @@ def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple
     return raise_ground(scene, qpos), (qpos, qvel, ctrl)
 
 
-def varied_robot(name: str, count: int, rng: np.random.Generator) -> tuple[Scene, tuple[Array, Array, Array]]:
-    """A robot for the factors, all of which matter in its states: "leg" or "hopper"."""
-    if name == "hopper":
-        scene = task_scene(name).with_penalty({"d_limit": 500.0})
-        return scene, acting_states(scene, count, rng)
-    return grounded_states(leg_scene(grounded=True), count, rng)
-
-
 # A pendulum on a cart that is pulled from the wall.
 CRANE = """
 <mujoco>

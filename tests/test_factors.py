@@ -1,14 +1,27 @@
-"""Factors of the constants that differ between environments."""
+"""Factors of the constants and external forces, of which each environment has its own."""
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 import reference
 import torch
 import warp as wp
-from scenes import leg_scene, run, task_scene, varied_robot
+from scenes import (
+    acceleration,
+    free_states,
+    grounded_states,
+    in_free_flight,
+    leg_scene,
+    run,
+    task_scene,
+    tree_scene,
+    without_ground,
+)
 from test_accuracy import source
+from test_dynamics import mujoco_acceleration, relative_error
+from test_gradient import INTEGRATORS, check_gradients
 
 import diffsim
 from diffsim.kernels.lanes import divide
@@ -18,25 +31,62 @@ from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
 SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
+BOTH = {"factors": True, "forces": True}
+TREE = tree_scene("ball", 1)  # it floats, and some of its bodies are welded to others
+
+
+def wrenches(scene, count, rng):
+    """About the weight of each body; of a light robot more than of a heavy one."""
+    return 20 * rng.normal(size=(count, scene.nbody, 6))
+
+
+def given(scene, count, rng):
+    return {"factors": rng.uniform(0.5, 2.0, (count, len(FACTORS))), "forces": wrenches(scene, count, rng)}
+
+
+def grounded_leg(count, rng):
+    return grounded_states(leg_scene(grounded=True), count, rng)
+
+
+@pytest.mark.parametrize("name", ["hopper", "tree"])
+def test_accelerations_under_forces_are_mujocos(name, rng):
+    """Of a robot on the world, where the factors are one, and of a tree."""
+    scene = without_ground(TREE if name == "tree" else task_scene(name))
+    states, forces = free_states(scene, 64, rng), wrenches(scene, 64, rng)
+    ones = {} if name == "tree" else {"factors": np.ones((64, len(FACTORS)))}
+    qacc, expected = acceleration(scene, *states, forces=forces, **ones), mujoco_acceleration(scene, *states, forces)
+    assert relative_error(qacc, expected) < 1e-10
+    assert relative_error(qacc, acceleration(scene, *states, forces=0 * forces, **ones)) > 0.01
 
 
 @pytest.mark.parametrize("integration", SETTINGS)
-@pytest.mark.parametrize("name", ["leg", "hopper"])
-def test_steps_are_the_references(name, integration, rng):
-    scene, states = varied_robot(name, 4, rng)
-    factors = rng.uniform(0.5, 2.0, (4, len(FACTORS)))
-    ends = run(scene, *states, factors=factors, integration=integration)
-    for e, (row, *start) in enumerate(zip(factors, *states, strict=True)):
-        expected = reference.step(reference.with_factors(scene, row), *start, 1 / 60, integration)
+def test_steps_are_the_references(integration, rng):
+    scene, states = grounded_leg(4, rng)
+    optional = given(scene, 4, rng)
+    ends = run(scene, *states, integration=integration, **optional)
+    for e, (row, wrench, *start) in enumerate(zip(*optional.values(), *states, strict=True)):
+        expected = reference.step(reference.with_factors(scene, row), *start, 1 / 60, integration, wrench)
         for value, end in zip(ends, expected, strict=True):
             np.testing.assert_allclose(value[e], end, rtol=1e-9, atol=1e-9)
 
 
-def test_factors_of_one_change_no_bit(rng):
-    scene, states = varied_robot("hopper", 16, rng)
+@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
+def test_gradients_are_those_of_differences(integrator, theta, rng):
+    """Of every factor by itself; and in state, control and forces where the factors are not one."""
+    scene, states = grounded_leg(16, rng)
+    check_gradients(scene, states, rng, given(scene, 16, rng), integration=Integration(integrator, 8, theta))
+
+
+def test_gradients_of_welded_bodies_are_those_of_differences(rng):
+    forces = {"forces": wrenches(TREE, 4, rng)}
+    check_gradients(TREE, free_states(TREE, 4, rng), rng, forces, integration=SETTINGS[0])
+
+
+def test_factors_of_one_and_no_force_change_no_bit(rng):
+    scene, states = grounded_leg(16, rng)
     results = []
-    for factors in (False, True):
-        sim = Simulator(scene, 16, SETTINGS[0], dtype=torch.float64, factors=factors)
+    for options in ({}, BOTH):
+        sim = Simulator(scene, 16, SETTINGS[0], dtype=torch.float64, **options)
         leaves = [torch.tensor(x, requires_grad=True) for x in states]
         q, v = sim.step(*leaves)
         results.append([q, v, *torch.autograd.grad(q.sin().sum() + v.cos().sum(), leaves)])
@@ -46,86 +96,155 @@ def test_factors_of_one_change_no_bit(rng):
 
 def test_each_environment_and_step_has_its_own(rng):
     """Steps of a window see what was written in place before them, and so do their adjoints."""
-    scene, states = varied_robot("leg", 2, rng)
-    sim = Simulator(scene, 2, SETTINGS[0], horizon=2, dtype=torch.float64, factors=True)
+    scene, states = grounded_leg(2, rng)
+    sim = Simulator(scene, 2, SETTINGS[0], horizon=2, dtype=torch.float64, **BOTH)
     q, v, u = (torch.tensor(x, requires_grad=True) for x in states)
-    per_step = rng.uniform(0.5, 2.0, (2, 2, len(FACTORS)))
+    per_step = [{name: torch.tensor(x) for name, x in given(scene, 2, rng).items()} for _ in range(2)]
     a, b = q, v
-    for row in per_step:
-        sim.factors[:] = torch.tensor(row)
+    for each in per_step:
+        sim.factors[:], sim.forces[:] = each["factors"], each["forces"]
         a, b = sim.step(a, b, u)
     slope = torch.autograd.grad(a.sum() + b.sum(), v)[0]
     for e in range(2):
-        alone = Simulator(scene, 1, SETTINGS[0], horizon=2, dtype=torch.float64, factors=True)
+        alone = Simulator(scene, 1, SETTINGS[0], horizon=2, dtype=torch.float64, **BOTH)
         start = v[e : e + 1].detach().requires_grad_()
         a, b = q[e : e + 1], start
-        for row in per_step[:, e : e + 1]:
-            alone.factors = torch.tensor(row)
+        for each in per_step:
+            alone.factors, alone.forces = each["factors"][e : e + 1], each["forces"][e : e + 1]
             a, b = alone.step(a, b, u[e : e + 1])
         assert torch.equal(torch.autograd.grad(a.sum() + b.sum(), start)[0], slope[e : e + 1])
 
 
+def test_a_push_changes_the_momentum_by_its_impulse(rng):
+    """And each environment's its own, in the steps in which it acts."""
+    scene = in_free_flight(TREE)
+    sim = Simulator(scene, 3, Integration(substeps=64), dtype=torch.float64, forces=True)
+    qpos, qvel, _ = (torch.tensor(x).expand(3, -1) for x in free_states(scene, 1, rng))
+    impulse = torch.tensor([[0.0, 0.0, 0.0], [3.0, -1.0, 2.0], [0.0, 5.0, 0.0]], dtype=torch.float64)
+    with torch.no_grad():
+        for step in range(9):
+            sim.forces[:, 1, :3] = impulse * 60 / 6 if step < 6 else 0.0
+            qpos, qvel = sim.step(qpos, qvel, torch.zeros(3, scene.nu, dtype=torch.float64))
+    ends = [reference.momentum(scene, q, v)[0] for q, v in zip(qpos.numpy(), qvel.numpy(), strict=True)]
+    for e in (1, 2):  # gravity acts on all alike; semi-implicit Euler keeps momentum to first order in the substep
+        np.testing.assert_allclose(ends[e] - ends[0], impulse[e], atol=0.02)
+
+
+def test_a_floating_world_feels_nothing():
+    sim = Simulator(TREE, 1, dtype=torch.float64, forces=True)
+    qpos, zeros = torch.tensor(TREE.qpos0[None]), torch.zeros(1, TREE.nbody, 6, dtype=torch.float64)
+    sim.forces = (zeros + 1.0).requires_grad_()
+    q, v = sim.step(qpos, zeros.new_zeros(1, TREE.nv), zeros.new_zeros(1, TREE.nu))
+    (slope,) = torch.autograd.grad(v.sum() + q.sum(), sim.forces)
+    assert (slope[0, 0] == 0).all() and (slope[0, 1:].abs().sum(1) > 0).all()
+
+
 @pytest.mark.parametrize("integrator", ["semi_implicit", "extrapolated"])
 def test_gradients_reach_a_tensor_through_the_environment(integrator):
-    """A whole window's, in the logarithms of one set of factors for all."""
+    """A whole window's, in the logarithms of one set of factors, and one force on the torso, for all."""
+    count = len(FACTORS)
 
-    def total(log_factors):
-        env = diffsim.make("hopper", 4, seed=0, horizon=4, dtype=torch.float64, integrator=integrator, factors=True)
-        env.sim.factors = log_factors.exp().expand(4, -1)
-        with torch.set_grad_enabled(log_factors.requires_grad):
+    def total(given):
+        env = diffsim.make("hopper", 4, seed=0, horizon=4, dtype=torch.float64, integrator=integrator, **BOTH)
+        torso = torch.eye(env.scene.nbody, dtype=torch.float64)[env.scene.mj_model.body("torso").id]
+        env.sim.factors = given[:count].exp().expand(4, -1)
+        env.sim.forces = (torso[:, None] * given[count:]).expand(4, -1, -1)
+        with torch.set_grad_enabled(given.requires_grad):
             return sum(env.step(torch.full((4, 3), 0.2, dtype=torch.float64))[1].sum() for _ in range(4))
 
-    start = 0.1 * torch.arange(len(FACTORS), dtype=torch.float64)
+    start = torch.cat([0.1 * torch.arange(count), torch.tensor([30.0, 5.0, -20.0, 2.0, 3.0, 4.0])]).double()
     (slope,) = torch.autograd.grad(total(leaf := start.clone().requires_grad_()), leaf)
-    eps = 1e-6 * torch.eye(len(FACTORS), dtype=torch.float64)
-    expected = torch.stack([(total(start + d) - total(start - d)) / 2e-6 for d in eps])
-    assert (slope[FACTORS.index("d_limit")] == 0) and (slope[-2:] != 0).all()  # no task damps its limits
-    torch.testing.assert_close(slope, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
+    step = torch.tensor([1e-6] * count + [1e-3] * 6, dtype=torch.float64)
+    expected = torch.stack([(total(start + d) - total(start - d)) for d in torch.diag(step)]) / (2 * step)
+    assert (slope[FACTORS.index("d_limit")] == 0) and (slope[count - 2 : count] != 0).all()  # no task damps its limits
+    assert (slope[count + 1 :: 2] == 0).all() and (slope[count::2] != 0).all()  # the robot is planar
+    for part in (slice(count), slice(count, None)):
+        tolerance = 1e-6 * float(expected[part].abs().max())
+        torch.testing.assert_close(slope[part], expected[part], rtol=1e-5, atol=tolerance)
 
 
-def test_recorded_steps_are_counted():
-    env = diffsim.make("hopper", 2, horizon=1, dtype=torch.float64, factors=True)
-    env.sim.factors = torch.ones(2, len(FACTORS), dtype=torch.float64, requires_grad=True)
+@pytest.mark.parametrize("name", BOTH)
+def test_recorded_steps_are_counted(name):
+    env = diffsim.make("hopper", 2, horizon=1, dtype=torch.float64, **BOTH)
+    setattr(env.sim, name, getattr(env.sim, name).clone().requires_grad_())
     action = torch.zeros(2, 3, dtype=torch.float64)
     env.step(action)
     with pytest.raises(RuntimeError, match="horizon of 1 differentiable steps exceeded"):
         env.step(action)
 
 
-def test_wrong_factors_are_refused():
-    sim, ones = Simulator(task_scene("cartpole"), 2, factors=True), torch.ones(2, len(FACTORS))
-    for value, message in (
-        (ones[:, 1:], r"factors has shape \(2, 7\), must be \(2, 8\)"),
-        (ones.double(), "factors has dtype torch.float64, must be torch.float32"),
-        (ones.numpy(), "factors is a ndarray"),
-    ):
+SIZES = "must be (2, 3, 6) (environments, bodies, numbers each)"
+NOT_FINITE = float("nan"), float("inf")
+WRONG = [  # a value: what is done to one that is right
+    ("factors", lambda x: x[:, 1:], "factors has shape (2, 7), must be (2, 8)"),
+    ("factors", torch.Tensor.double, "factors has dtype torch.float64, must be torch.float32"),
+    ("factors", torch.Tensor.numpy, "factors is a ndarray"),
+    ("forces", lambda x: x[:, 1:], f"forces has shape (2, 2, 6), {SIZES}"),
+    ("forces", lambda x: x.flatten(1), "forces has shape (2, 18), must be (2, 3, 6)"),
+    ("forces", torch.Tensor.double, "forces has dtype torch.float64, must be torch.float32"),
+    ("forces", torch.Tensor.numpy, "forces is a ndarray"),
+]
+WRONG_NUMBERS = [
+    *(("factors", (1, 3), x, f"the factor of mu is {x} in environment 1", "not negative") for x in (-1.0, *NOT_FINITE)),
+    *(("forces", (1, 2, 1), x, f"force y on body pole is {x} in environment 1", "finite") for x in NOT_FINITE),
+    *(("forces", (1, 2, 5), x, f"torque z on body pole is {x} in environment 1", "finite") for x in NOT_FINITE),
+]
+
+
+def test_wrong_factors_and_forces_are_refused():
+    scene = task_scene("cartpole")
+    sim, without = Simulator(scene, 2, **BOTH), Simulator(scene, 2)
+    right = {name: getattr(sim, name).clone() for name in BOTH}
+    for name, change, message in WRONG:
+        with pytest.raises(ValueError) as error:
+            setattr(sim, name, change(right[name]))
+        assert message in str(error.value)
+    for name, place, number, message, allowed in WRONG_NUMBERS:
+        bad = right[name].clone()
+        bad[place] = number
+        with pytest.raises(ValueError, match=f"{message}; .*{allowed}"):
+            setattr(sim, name, bad)
+        getattr(sim, name)[place] = number
         with pytest.raises(ValueError, match=message):
-            sim.factors = value
-    start = torch.zeros(2, 2), torch.zeros(2, 2), torch.zeros(2, 1)
-    for number in (-1.0, float("nan"), float("inf")):
-        bad = ones.clone()
-        bad[1, 3] = number
-        with pytest.raises(ValueError, match=f"the factor of mu is {number} in environment 1; .* not negative"):
-            sim.factors = bad
-        sim.factors = ones.clone()
-        sim.factors[1, 3] = number
-        with pytest.raises(ValueError, match=f"the factor of mu is {number} in environment 1"):
-            sim.step(*start)
-    with pytest.raises(ValueError, match=r"factors has shape \(2, 8\), must be \(2, 0\)"):
-        Simulator(task_scene("cartpole"), 2).factors = ones
+            sim.step(torch.zeros(2, 2), torch.zeros(2, 2), torch.zeros(2, 1))
+        setattr(sim, name, right[name].clone())
+    for name, sizes in (("factors", "(2, 8), must be (2, 0)"), ("forces", "(2, 3, 6), must be (2, 0, 6)")):
+        with pytest.raises(ValueError) as error:
+            setattr(without, name, right[name])
+        assert f"{name} has shape {sizes}" in str(error.value)
 
 
-def test_kernels_without_factors_do_not_know_them():
+def test_kernels_without_factors_and_forces_do_not_know_them():
     scene = leg_scene(grounded=True)
-    plain, varied = source(scene), source(scene, varied=True)
+    plain, varied, forced = source(scene), source(scene, varied=True), source(scene, forced=True)
     for name in ("contact_constants_adjoint", "limit_constants_gain", "(var_m).carried"):
         assert name in varied and name not in plain
+    for name in ("add_forces", "add_forces_adjoint", "(var_m).body_com"):
+        assert name in forced and name not in plain
 
 
 @pytest.mark.parametrize("team", [(1, 1), (4, 1), (8, 4)])
-def test_one_lane_counts_each_joint(team):
+def test_one_lane_counts_each_joint_and_has_each_body(team):
     scene = task_scene("humanoid")
-    model = model_of(scene, divide(scene, *team), wp.float64, "cpu")
-    count = np.zeros(scene.nlink)
-    np.add.at(count, model.link.numpy(), model.carried.numpy())
+    division, count = divide(scene, *team), np.zeros(scene.nlink)
+    model = model_of(scene, division, wp.float64, "cpu")
+    begin, body, link = model.body_begin.numpy(), model.body.numpy(), model.link.numpy()
+    np.add.at(count, link, model.carried.numpy())
     assert (count[1:] == 1).all()
+    assert sorted(body) == list(range(1, scene.nbody))
+    for entry, (first, end) in enumerate(zip(begin, begin[1:], strict=False)):
+        assert (scene.body_link[body[first:end]] == link[entry]).all()
+        assert first == end or link[entry] in division.weighs[entry // division.slots]
+
+
+def test_the_bodies_are_mujocos(rng):
+    """Their centres of mass."""
+    model, qpos = TREE.mj_model, free_states(TREE, 1, rng)[0][0]
+    data = mujoco.MjData(model)
+    data.qpos = qpos
+    mujoco.mj_forward(model, data)
+    links = reference.kinematics(TREE, qpos, np.zeros(TREE.nv))
+    assert len(set(TREE.body_link)) < TREE.nbody  # some are welded
+    for body in range(1, TREE.nbody):
+        link = links[TREE.body_link[body]]
+        np.testing.assert_allclose(link.position + link.rotation @ TREE.body_com[body], data.xipos[body], atol=1e-12)

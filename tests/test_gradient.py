@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,6 @@ from scenes import (
     COMPENSATED,
     DISTINCT,
     HINGE,
-    ROBOTS,
     SHOULDER,
     SOFT,
     acting_states,
@@ -21,10 +22,11 @@ from scenes import (
     parse,
     pass_limits,
     raise_ground,
+    random_tree,
     run,
     task_scene,
     tree_scene,
-    varied_robot,
+    without_ground,
 )
 
 from diffsim.env import DiffEnv
@@ -34,7 +36,6 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
 INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
-CASES = [(name, *kind) for kind in INTEGRATORS for name in (DISTINCT if kind[0] == "implicit" else ROBOTS)]
 LARGE = "humanoid", "humanoid_mtu", "swimmer"  # whose implicit kernels no other test needs
 ONE = Integration(substeps=1)
 STEPS = {"factors": 1e-5, "forces": 1e-2}  # of differences
@@ -86,13 +87,17 @@ def check_gradients(scene, states, rng, optional=None, **simulator):
         value = value.reshape(slope.shape)
         if slope.size:
             axis = 0 if name == "factors" else -1  # a factor weighs as much as any other, however little it moves
-            error = np.linalg.norm(value - slope, axis=axis) / np.linalg.norm(slope, axis=axis)
-            assert error.max() < 1e-6, f"gradient with respect to {name}"
+            error, size = np.linalg.norm(value - slope, axis=axis), np.linalg.norm(slope, axis=axis)
+            assert (error <= 1e-6 * size).all() and size.any(), f"gradient with respect to {name}"
 
 
 @pytest.mark.parametrize(
     "name, integrator, theta",
-    [pytest.param(*case, marks=[pytest.mark.slow] * (case[0] in LARGE and case[1] == "implicit")) for case in CASES],
+    [
+        pytest.param(name, *how, marks=[pytest.mark.slow] * (name in LARGE and how[0] == "implicit"))
+        for how in INTEGRATORS
+        for name in DISTINCT
+    ],
 )
 def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
     scene = task_scene(name)
@@ -104,7 +109,7 @@ def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
 @pytest.mark.parametrize(
     "base, seed",
     [
-        pytest.param(base, seed, marks=[pytest.mark.slow] * (seed > 1 or base in ("fixed", "planar")))
+        pytest.param(base, seed, marks=[pytest.mark.slow] * (seed > 0 or base != "floating"))
         for base in ("floating", "fixed", "planar", "ball")
         for seed in range(4)
     ],
@@ -132,41 +137,20 @@ def test_muscle_gradient_is_that_of_differences(rng):
 
 
 @pytest.mark.parametrize(
-    "name, integrator, theta",
-    [(name, *kind) for name in ("leg", "hopper") for kind in INTEGRATORS],
-)
-def test_gradient_in_factors_is_that_of_differences(name, integrator, theta, rng):
-    """Of every factor by itself; and in state and control where the factors are not one."""
-    scene, states = varied_robot(name, 16, rng)
-    factors = rng.uniform(0.5, 2.0, (16, len(FACTORS)))
-    check_gradients(scene, states, rng, {"factors": factors}, integration=Integration(integrator, 8, theta))
-
-
-@pytest.mark.parametrize(
     "integrator, theta", [*(pytest.param(*how, marks=pytest.mark.slow) for how in INTEGRATORS[:2]), INTEGRATORS[2]]
 )
 def test_gradient_of_bounded_servos_is_that_of_differences(integrator, theta, rng):
-    """At a bound the force depends on nothing."""
-    scene = parse(BOUNDED_SERVOS)
-    states, how = free_states(scene, 16, rng), {"integration": Integration(integrator, 8, theta)}
-    check_gradients(scene, states, rng, **how)
-    if integrator == "implicit":
-        w, factors = weights(scene, rng), rng.uniform(0.5, 2.0, (16, len(FACTORS)))
-        value, slope = (f(scene, states, w, optional={"factors": factors}, **how)[-1] for f in (gradients, differences))
-        assert not slope[:, :6].any() and not value[:, :6].any()  # it has no contact and no limits
-        np.testing.assert_allclose(value[:, 6:], slope[:, 6:], rtol=1e-6, atol=1e-6 * abs(slope).max())
+    """At a bound the force depends on nothing; of the factors, it knows the motors' and the mass."""
+    scene, factors = parse(BOUNDED_SERVOS), {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))}
+    check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=Integration(integrator, 8, theta))
 
 
 @pytest.mark.parametrize("integrator", [pytest.param("semi_implicit", marks=pytest.mark.slow), "mujoco"])
 def test_gradient_under_gravity_compensation_is_that_of_differences(integrator, rng):
     """And in the factor of mass."""
-    scene, how = parse(COMPENSATED), {"integration": Integration(integrator, 8)}
-    states = free_states(scene, 16, rng)
-    check_gradients(scene, states, rng, **how)
-    w, factors = weights(scene, rng), rng.uniform(0.5, 2.0, (16, len(FACTORS)))
-    if integrator == "semi_implicit":
-        value, slope = (f(scene, states, w, optional={"factors": factors}, **how)[-1] for f in (gradients, differences))
-        np.testing.assert_allclose(value, slope, rtol=1e-6, atol=1e-6 * abs(slope).max())
+    scene = parse(COMPENSATED)
+    factors = {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))} if integrator == "semi_implicit" else None
+    check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=Integration(integrator, 8))
 
 
 def test_quaternion_of_any_length(rng):
@@ -183,7 +167,7 @@ def test_quaternion_of_any_length(rng):
 @pytest.mark.parametrize("name", ["hopper", "ant", pytest.param("humanoid_mtu", marks=pytest.mark.slow)])
 def test_float32_gradient_is_that_of_float64(name, rng):
     scene, simulator = task_scene(name), {"integration": TASKS[name].integration("default")}
-    states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 15, rng)]
+    states = [x.astype(np.float32).astype(float) for x in acting_states(scene, 17, rng)]
     w = weights(scene, rng)
     single, double = (gradients(scene, states, w, dtype, **simulator) for dtype in (torch.float32, torch.float64))
     errors = [np.linalg.norm(a - b, axis=-1) / np.linalg.norm(b, axis=-1) for a, b in zip(single, double, strict=True)]
@@ -294,18 +278,14 @@ def test_gradcheck_through_policy_reward_and_three_control_steps(name, rng):
 
 def test_a_free_joint_is_three_slides_and_a_ball(rng):
     """State and gradient; the same numbers in qpos and qvel."""
-    body = """<mujoco><worldbody><body> {}
-      <inertial pos="0.1 0 -0.3" mass="2" diaginertia=".1 .2 .15"/>
-      <body pos="0 0 -0.5">
-        <joint name="knee" axis="1 0 1" damping="0.1"/> <inertial pos="0.1 0 -0.1" mass="1" diaginertia=".1 .2 .1"/>
-      </body>
-    </body></worldbody> <actuator> <motor joint="knee" gear="5"/> </actuator></mujoco>"""
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
-    free, jointed = parse(body.format("<freejoint/>")), parse(body.format(f'{slides} <joint type="ball"/>'))
+    root, tree = r"<body [^>]*><freejoint/>", random_tree("floating", 0)  # whose own place only a free joint ignores
+    free, jointed = (
+        without_ground(parse(re.sub(root, f"<body>{joint}", tree)))
+        for joint in ("<freejoint/>", f'{slides} <joint type="ball"/>')
+    )
     assert free.floating and not jointed.floating and jointed.nball == 1
-    states, how = free_states(free, 4, rng), {"integration": ONE}
-    for value, expected in zip(run(jointed, *states, **how), run(free, *states, **how), strict=True):
-        np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-10)
-    w = weights(free, rng)
-    for value, expected in zip(*(gradients(scene, states, w, **how) for scene in (jointed, free)), strict=True):
-        np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9)
+    states, how, w = free_states(free, 4, rng), {"integration": ONE}, weights(free, rng)
+    for found in (lambda scene: run(scene, *states, **how), lambda scene: gradients(scene, states, w, **how)):
+        for value, expected in zip(found(jointed), found(free), strict=True):
+            np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9 * abs(expected).max())
