@@ -122,8 +122,9 @@ class Args(ParallelFlags):
             f"{jacobians} states that do not hold the past, on which {self.env} depends": self.sample_enhance and past,
             f"{jacobians} one robot: leave out --randomise": self.sample_enhance and self.randomise,
         }
-        for message in (message for message, found in wrong.items() if found):
-            fail(message)
+        for message, found in wrong.items():
+            if found:
+                fail(message)
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

@@ -41,7 +41,9 @@ def assert_resumes(script: ModuleType, directory: Path, flags: str, stop_after: 
     whole = run(script, directory / "whole", *flags.split())
     run(script, directory / "part", *flags.split(), "--stop-after", stop_after)
     again = "--resume", directory / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet"
-    assert_same(run(script, directory / "part", *again)["modules"], whole["modules"])
+    part = run(script, directory / "part", *again)
+    for name in ("modules", "ranks", "iteration", "control_steps"):
+        assert_same(part[name], whole[name])
     return whole
 
 

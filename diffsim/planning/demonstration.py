@@ -36,12 +36,8 @@ def load_demonstration(system: Dynamics, path: Path, steps: int, row: int = 0) -
         raise ValueError(f"{path} is not an .npz with qpos, qvel and action: {why}") from error
     if not math.isclose(control_dt, system.control_dt, rel_tol=1e-6):
         raise ValueError(f"{path} has control steps of {control_dt:.4g} s, not of {system.control_dt:.4g} s")
-    parts = []
-    for name, width, rows in (
-        ("qpos", system.nq, steps + 1),
-        ("qvel", system.nv, steps + 1),
-        ("action", system.nu, steps),
-    ):
+    parts, sizes = [], {"qpos": (steps + 1, system.nq), "qvel": (steps + 1, system.nv), "action": (steps, system.nu)}
+    for name, (rows, width) in sizes.items():
         array = arrays[name][row] if arrays[name].ndim == 3 else arrays[name]
         if array.ndim != 2 or array.shape[1] != width or len(array) < rows or array.dtype.kind not in "fiu":
             found = f"{arrays[name].shape} of {array.dtype}"
