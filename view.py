@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -72,6 +73,8 @@ class Args:
             fail("--viewer goes without --video and --web")
         if self.web and self.web.suffix != ".html":
             fail(f"--web: a page ends in .html, not {self.web.suffix!r}")
+        if self.plot and self.plot.suffix not in (".png", ".svg", ".pdf"):
+            fail(f"--plot: a picture ends in .png, .svg or .pdf, not {self.plot.suffix!r}")
         try:
             if self.video:
                 render.check_video(self.video, self.size)
@@ -137,7 +140,7 @@ def plot(directories: Sequence[Path], output: Path) -> None:
     for number, directory in enumerate(directories):
         progress = read_progress(directory / "progress.csv")
         for axis, x in zip(axes, DRAWN[:2], strict=True):
-            axis.plot(progress[x], progress["return"], color=f"C{number}", label=directory.resolve().name)
+            axis.plot(progress[x], progress["return"], color=f"C{number}", label=label(directory))
             axis.plot(progress[x], progress["eval_return"], "o", color=f"C{number}", markersize=4)
             axis.set_xlabel(x.replace("_", " "))
             axis.grid(alpha=0.3)
@@ -149,15 +152,23 @@ def plot(directories: Sequence[Path], output: Path) -> None:
     print(f"curves: {output}")
 
 
+def label(directory: Path) -> str:
+    """A run's name for a legend, which takes dollars for mathematics, hides what begins with _ and draws Unicode."""
+    name = os.fsencode(directory.resolve().name).decode(errors="replace").replace("$", r"\$")
+    return f" {name}" if name.startswith("_") else name
+
+
 def read_progress(path: Path) -> dict[str, NDArray[np.float64]]:
     """The columns that are drawn, NaN where a row has no value."""
     if not path.is_file():
         fail(f"no such file: {path}; --plot takes directories of runs")
-    with path.open(newline="") as file:
-        rows = [*csv.DictReader(file)]
-    if not rows:
-        fail(f"{path} holds no iteration yet")
-    return {name: np.array([float(row.get(name) or "nan") for row in rows]) for name in DRAWN}
+    try:
+        with path.open(newline="") as file:
+            rows = [*csv.DictReader(file)]
+        columns = {name: np.array([float(row.get(name) or "nan") for row in rows]) for name in DRAWN}
+    except (ValueError, csv.Error) as error:
+        fail(f"{path} is not what a run has written: {error}")
+    return columns if rows else fail(f"{path} holds no iteration yet")
 
 
 if __name__ == "__main__":

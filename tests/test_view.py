@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import os
+import re
 import resource
 import sys
 from pathlib import Path
@@ -85,7 +87,8 @@ def test_a_checkpoint_names_no_code_to_run(
         ("{run} --viewer --web {new}/a.html", "--viewer goes without --video and --web"),
         ("{run} --episodes 3 --web {run}/progress.csv/a.html", "File exists"),
         ("{new} --plot {new}/a.png", "no such file: {new}/progress.csv; --plot takes directories of runs"),
-        ("{run} --plot {new}/a.xyz", "xyz"),
+        ("{run} --plot {new}/a.jpg", "--plot: a picture ends in .png, .svg or .pdf, not '.jpg'"),
+        ("{run} --plot {new}/curves", "--plot: a picture ends in .png, .svg or .pdf, not ''"),
         ("{run} --viewer", "there is no display"),
     ],
 )
@@ -138,12 +141,21 @@ def test_missing_matplotlib_is_one_line(
     assert capsys.readouterr().err == "view.py: --plot needs matplotlib: pip install matplotlib\n"
 
 
-def test_curves_of_several_runs(tiny_run: Path, tmp_path: Path) -> None:
-    empty = tmp_path / "gaps"
-    empty.mkdir()
-    (empty / "progress.csv").write_text("iteration,control_steps,seconds,return,eval_return\n1,10,0.5,,\n2,20,1,3,4\n")
-    columns = view.read_progress(empty / "progress.csv")
+@pytest.mark.filterwarnings("error")
+def test_curves_of_several_runs(tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever their names."""
+    odd = [tmp_path / os.fsdecode(name) for name in (b"gaps", b"_hidden", rb"a$\frac$b", b"$x$", b"bad\xff")]
+    for folder in odd:
+        folder.mkdir()
+        (folder / "progress.csv").write_text(
+            "iteration,control_steps,seconds,return,eval_return\n1,10,,,\n2,20,1,3,4\n"
+        )
+    columns = view.read_progress(odd[0] / "progress.csv")
     np.testing.assert_array_equal(columns["return"], [np.nan, 3])
-    view.main([str(tiny_run), str(empty), "--plot", str(tmp_path / "new" / "a.svg")])
-    text = (tmp_path / "new" / "a.svg").read_text()
-    assert "<svg" in text
+    view.main([str(tiny_run), *map(str, odd), "--plot", str(tmp_path / "new" / "a.svg")])
+    names = re.findall(r"<!-- (.*?) -->", (tmp_path / "new" / "a.svg").read_text())  # of all text
+    assert {tiny_run.name, "gaps", "_hidden", r"a$\frac$b", "$x$", "bad\ufffd"} <= {*map(str.strip, names)}
+    for broken in (b"iteration,return\n1,x\n", b"return\n\xff\n"):
+        (odd[0] / "progress.csv").write_bytes(broken)
+        error = refusal(lambda: view.main([str(odd[0]), "--plot", str(tmp_path / "b.png")]), capsys)
+        assert "gaps/progress.csv is not what a run has written: " in error
