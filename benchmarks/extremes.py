@@ -52,8 +52,7 @@ ALL, NAN, INF = slice(None), float("nan"), float("inf")
 DISTURBANCES: list[tuple[str, Any, float]] = [  # what of an environment gets which value
     *(("qvel", 0, NAN), ("qvel", -1, INF), ("qvel", ALL, 9e4), ("qvel", ALL, 1e30), ("qpos", -1, NAN)),
     *(("forces", 1, 1e30), ("forces", 1, 1e8), ("ctrl", ALL, NAN), ("ctrl", ALL, 1e30), ("factors", [0, 4], 1e30)),
-    *(("factors", 6, 0.0), ("factors", 6, 1e30), ("factors", 7, 1e30), ("qpos", "height", -100.0)),
-    ("qpos", "quaternion", 0.0),
+    *(("factors", 6, 0.0), ("factors", 6, 1e30), ("factors", 7, 1e30)),
 ]
 MASSES = (1.0, 1.0), (1e2, 1e-2), (1e4, 1e-4), (1e5, 1e-4), (1e-4, 1e-4), (3e5, 3e5)  # kg, of root and of links
 ROBOTS = [*((*masses, 1.0) for masses in MASSES), (1.0, 1.0, 0.0), (1.0, 1.0, 100.0)]  # with the friction
@@ -82,22 +81,9 @@ class Inputs(NamedTuple):
     factors: Tensor
     forces: Tensor
 
-    def disturbed(self, scene: Scene, k: int, what: str, where: Any, value: float) -> Inputs:
-        tensor = getattr(self, what).clone()
-        places = {"height": 2 if scene.floating else 1, "quaternion": slice(3, 7)}
-        tensor[k][places.get(where, where) if isinstance(where, str) else where] = value
-        return self._replace(**{what: tensor})
 
-
-class Outcome(NamedTuple):
-    """Of four steps and their backward pass, a row for each environment."""
-
-    states: Tensor
-    gradients: Tensor
-    flags: Tensor  # which have been contained, and their gradients that were
-
-
-def four_steps(sim: Simulator, given: Inputs) -> Outcome:
+def four_steps(sim: Simulator, given: Inputs) -> list[Tensor]:
+    """States, gradients and what was contained of four steps and their backward pass, a row for each environment."""
     leaves = Inputs(*(x.clone().requires_grad_() for x in given))
     sim.factors, sim.forces = leaves.factors, leaves.forces
     state, states, lost = (leaves.qpos, leaves.qvel), list[Tensor](), list[Tensor]()
@@ -107,15 +93,17 @@ def four_steps(sim: Simulator, given: Inputs) -> Outcome:
         states += state
         lost.append(sim.nonfinite.clone())
     weights = torch.arange(1.0, sim.num_envs + 1, dtype=sim.dtype).unsqueeze(1)  # each environment has its own
-    gradients = torch.autograd.grad(sum(((x * weights).sum() for x in states), torch.tensor(0.0)), leaves)
-    flags = torch.stack([*lost, sim.nonfinite_gradients], 1)
-    return Outcome(torch.cat(states, 1).detach(), torch.cat([x.flatten(1) for x in gradients], 1), flags)
+    gradients = torch.autograd.grad((torch.cat(states, 1) * weights).sum(), leaves)
+    parts = [x.detach() for x in states], [x.flatten(1) for x in gradients], [torch.stack(lost, 1).int()]
+    return [*(torch.cat(each, 1) for each in parts), sim.nonfinite_gradients.clone()]
 
 
 def contain(args: Args, task: TaskName) -> Iterator[Row]:
     """A row for each integrator."""
     env = diffsim.make(task, max(n for n, *_ in BATCHES), seed=3)
     scene, drawn = env.scene, torch.Generator().manual_seed(0)
+    tries = [*DISTURBANCES, ("qpos", 2 if scene.floating else 1, -100.0)]
+    tries += [("qpos", slice(3, 7), 0.0)] if scene.floating else []  # a quaternion of zeros
     for name, integration in INTEGRATIONS.items():
         tried = held = 0
         for n, block, dtype in BATCHES:
@@ -125,13 +113,12 @@ def contain(args: Args, task: TaskName) -> Iterator[Row]:
             parts = env.qpos[:n], env.qvel[:n], ctrl, sim.factors, sim.forces
             given = Inputs(*(part.to(dtype) for part in parts))
             expected = four_steps(sim, given)
-            for (what, where, value), k in product(DISTURBANCES, (0, n // 2, n - 1)):
-                if where == "quaternion" and not scene.floating:
-                    continue
-                found, others = four_steps(sim, given.disturbed(scene, k, what, where, value)), torch.arange(n) != k
+            for (what, where, value), k in product(tries, (0, n // 2, n - 1)):
+                (tensor := getattr(given, what).clone())[k][where] = value
+                found, others = four_steps(sim, given._replace(**{what: tensor})), torch.arange(n) != k
                 good = all(torch.equal(x[others], y[others]) for x, y in zip(found, expected, strict=True))
                 begun = what in ("qpos", "qvel") and not np.isfinite(value)
-                good &= bool(found.gradients[k].isfinite().all() and (begun or found.states[k].isfinite().all()))
+                good &= bool(found[1][k].isfinite().all() and (begun or found[0][k].isfinite().all()))
                 if not good:
                     print(f"{task}, {name}, {n} environments in blocks of {block}: {what} {where} = {value} of {k}")
                 tried, held = tried + 1, held + good
