@@ -174,9 +174,9 @@ def worst(rows: list[dict[str, str]]) -> list[Row]:
     lines = list[Row]()
     for key, own in grouped(rows, *ROBOT_KEY).items():
         line: dict[str, object] = dict(zip(ROBOT_KEY, key, strict=True))
-        line |= {name: f"{sum(numbers(own, name)):.0f}" for name in ("tried", "held")}
+        line |= {title: f"{sum(numbers(own, name)):.0f}" for title, name in (("states", "tried"), ("solved", "held"))}
         errors = [name for name in own[0] if name.startswith("error")]
-        lines.append(line | {name: f"{max(numbers(own, name)):.0e}" for name in errors})
+        lines.append(line | {f"largest {name}": f"{max(numbers(own, name)):.0e}" for name in errors})
     return lines
 
 
