@@ -402,6 +402,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         seconds: t.U,  # of a substep
         implicitness: t.U,
         substeps: int,
+        touchdown: int,  # see Integration, read with constraints
         # checkpoint in
         row0: int,
         ck: t.Checkpoint,
@@ -417,6 +418,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     ):
         here = kin.lane_of(m, first, wp.tid())
         law = law_of(m, T(seconds), T(implicitness), start.factors, here.e)
+        law.touchdown = touchdown
         links = wp.zeros(shape=SLOTS, dtype=Link)
         nodes = wp.zeros(shape=SLOTS, dtype=Node)
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)

@@ -196,7 +196,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 w = point_velocity(node.W, p)
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
-                if wp.static(spec.touchdown):
+                if law.touchdown == 1:
                     numbers = m.contact_numbers[c]
                     sinks = wp.max(-law.h * point_velocity(link.V, p)[2], T(LEAST_SINKING))
                     jump = wp.dot(f, w + T(numbers[4]) * g_jar) / sinks

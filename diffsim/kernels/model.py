@@ -258,8 +258,9 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         scene=scene_types(U),
         Model=scene_types(U).Model,
         # h: s, of a substep; theta: how implicit it is; constants of the laws, or factors of those that each link has
-        # its own of (k_limit to motor, read where they vary); whose row of Model.terrain is read
-        Law=struct("Law", constants | {"block": int}),
+        # its own of (k_limit to motor, read where they vary); whose row of Model.terrain is read;
+        # 1 if gradients count that contacts begin with a jump
+        Law=struct("Law", constants | {"block": int, "touchdown": int}),
         # a lane of an environment, or of a block of them, e; its n links are entries at, at + 1, ... of Model's arrays;
         # the substep's row of checkpoints
         Lane=struct("Lane", dict.fromkeys(("e", "lane", "at", "n", "row"), int)),

@@ -31,7 +31,6 @@ class KernelSpec:
     slots: int
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
     constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
-    touchdown: bool = False  # see Integration; of constraints alone, as others would compile the same kernels anew
 
     @property
     def floating(self) -> bool:

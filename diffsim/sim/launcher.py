@@ -61,7 +61,6 @@ class Launcher:
             options.forces,
             implicit=how.integrator == "implicit",
             constrained=how.constrained,
-            touchdown=how.touchdown and how.constrained,
             varied=options.factors,
             env_last=cuda,
             block=block,

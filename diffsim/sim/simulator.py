@@ -215,7 +215,7 @@ class Simulator:
         if kernel == "forward":
             return [*scalars, how.passes, start, int(record), row0, rows, *end, nonfinite]
         blown_up = wp.from_torch(self.nonfinite_gradients)
-        return [*scalars, row0, rows, start, nonfinite, *g_end, g_start, blown_up]
+        return [*scalars, int(how.touchdown), row0, rows, start, nonfinite, *g_end, g_start, blown_up]
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
