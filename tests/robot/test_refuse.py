@@ -156,7 +156,7 @@ REFUSED = {
     # the file
     "option wind: only a fluid at rest is simulated": option('viscosity="1" wind="1 0 0"'),
     "option density: must not be negative": option('density="-1"'),
-    "option flag actuation: cannot be disabled here": option("", 'actuation="disable"'),
+    "option flag actuation, eulerdamp: cannot be disabled here": option("", 'actuation="disable" eulerdamp="disable"'),
     "option flag override: cannot be enabled here": option("", 'override="enable"'),
     "numeric k_n: must be one number, not negative": [
         pendulum(rest=f'<custom><numeric name="k_n" data="{data}"/></custom>') for data in ("-1", "1 2")
@@ -262,7 +262,7 @@ def test_what_has_no_effect_is_no_obstacle():
             '<text name="author" data="me"/>',
         ).replace(
             "</mujoco>",
-            '<option cone="elliptic"><flag warmstart="disable" energy="enable" eulerdamp="disable"/></option>'
+            '<option cone="elliptic"><flag warmstart="disable" energy="enable"/></option>'
             '<sensor><clock/></sensor><keyframe><key qpos="0"/></keyframe></mujoco>',
         )
     )
