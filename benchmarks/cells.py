@@ -21,8 +21,7 @@ import common
 import fingerprints
 import numpy as np
 import tables
-from groups import Cells
-from tables import ROOT, read_csv
+from tables import ROOT, Cells, read_csv
 
 import diffsim
 from diffsim.training import checkpoint, fail

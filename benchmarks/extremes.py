@@ -28,8 +28,7 @@ import mujoco
 import numpy as np
 import torch
 from common import CommonFlags, Part, TaskName, Tasks, measured, run
-from groups import grouped, numbers
-from tables import Row, markdown
+from tables import Row, grouped, markdown, numbers
 from torch import Tensor
 from worlds import Array
 

@@ -24,8 +24,7 @@ from statistics import mean
 import torch
 from common import CheckpointFlags, checkpoint_of, run
 from gps_variants import CASES, Ground, VariantArgs, gps, named_terrains
-from groups import grouped, numbers
-from tables import Row, markdown
+from tables import Row, grouped, markdown, numbers
 from torch import Tensor
 
 from diffsim.planning import REAL, System, nearest_feedback

@@ -20,8 +20,7 @@ from typing import Any
 import common
 import torch
 from common import Part, measured, run
-from groups import grouped
-from tables import Row
+from tables import Row, grouped
 from torch import Tensor
 
 import diffsim

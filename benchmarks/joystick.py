@@ -22,8 +22,7 @@ import numpy as np
 import tables
 import torch
 from common import ABOUT, Case, Part, load_case, measured, run
-from groups import grouped, middle, numbers
-from tables import Row
+from tables import Row, grouped, middle, numbers
 from worlds import Array, OtherFile, State, in_double, rollout
 
 from diffsim.tasks.joystick import Joystick

@@ -33,8 +33,7 @@ import tables
 import transfer
 from cells import GROUPS, LEARNERS, RETURNS, Cell, Curve, Group, Runner, ScriptFlags, curve, evaluation, read_cells
 from common import LEARNT, TASKS, Line, Panel, Tasks, check_names, load_case, plot, run
-from groups import Cells, grouped, middle, numbers
-from tables import ROOT, Row, markdown, read_csv
+from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, read_csv
 
 import diffsim
 from diffsim.training import Natural, checkpoint

@@ -16,8 +16,7 @@ from typing import Any
 
 import torch
 from common import CommonFlags, run
-from groups import grouped
-from tables import ROOT, Row, markdown
+from tables import ROOT, Row, grouped, markdown
 from torch import Tensor
 
 sys.path.append(str(ROOT))

@@ -22,8 +22,7 @@ import common
 import mujoco
 import torch
 from common import ABOUT, Case, load_case, run
-from groups import grouped
-from tables import Row, markdown
+from tables import Row, grouped, markdown
 from torch import Tensor
 from worlds import Here, State, Step, rollout, starts
 

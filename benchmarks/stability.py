@@ -25,9 +25,8 @@ import mujoco
 import numpy as np
 import torch
 from common import CommonFlags, Line, Panel, Part, TaskName, lines, measured, plot, run
-from groups import grouped, numbers, pivot
 from motions import INTEGRATORS, integration, mechanics, replay
-from tables import Row
+from tables import Row, grouped, numbers, pivot
 from torch import Tensor
 from worlds import Array
 

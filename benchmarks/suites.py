@@ -19,8 +19,7 @@ from typing import NamedTuple
 
 from cells import Case, Runner, ScriptFlags, spread
 from common import TASKS, Tasks, check_names, run
-from groups import Cells, grouped, numbers
-from tables import Row, markdown, read_csv
+from tables import Cells, Row, grouped, markdown, numbers, read_csv
 from tyro.conf import Suppress
 
 KEY = ("group", "cell", "seed")

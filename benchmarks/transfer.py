@@ -29,8 +29,7 @@ from statistics import mean, median
 import common
 import numpy as np
 from common import ABOUT, Case, Part, load_case, measured, run
-from groups import grouped, middle, numbers
-from tables import Row
+from tables import Row, grouped, middle, numbers
 from worlds import Here, Motion, MuJoCo, World, travel
 
 import diffsim
