@@ -168,7 +168,7 @@ class Models(nn.Module):
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
         super().__init__()
-        size = obs_dim + 1
+        self.models, size = args.models, obs_dim + 1
         networks = [mlp(obs_dim + action_dim, args.model_hidden, 2 * size, nn.SiLU) for _ in range(args.models)]
         self.ensemble = Ensemble(networks)
         self.least, self.most = (nn.Parameter(torch.full((size,), bound)) for bound in LOG_VAR)
@@ -191,7 +191,8 @@ class Models(nn.Module):
     def predict(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Sampled change of the observation (B, obs_dim) and reward (B,); each elite predicts an equal part of them."""
         parts = [x.unflatten(0, (len(self.elites), -1)) for x in (obs, action)]
-        mean, log_var = (x.flatten(0, 1) for x in self(*parts, self.elites))
+        chosen = self.elites if self.models > 1 else None  # one network alone has no dimension to choose along
+        mean, log_var = (x.flatten(0, 1) for x in self(*parts, chosen))
         drawn = self.target.inverse(mean + (0.5 * log_var).exp() * torch.randn_like(mean))
         return drawn[:, :-1], drawn[:, -1]
 

@@ -83,6 +83,19 @@ def test_elites_predict_and_no_others() -> None:
     torch.testing.assert_close(reward, own + 37.0, atol=2e-3, rtol=0)
 
 
+def test_one_model_alone_predicts() -> None:
+    learner = build("--models", "1", "--elites", "1", "--updates", "1", "--model-updates", "1")
+    models, obs, action = learner.models, torch.randn(5, 37), torch.rand(5, 8)
+    with torch.no_grad():
+        models.most.fill_(-30.0)
+        models.least.fill_(-40.0)
+        expected = models.ensemble[0](torch.cat((obs, action), 1))[:, :38]
+    change, reward = models.predict(obs, action)
+    torch.testing.assert_close(torch.cat((change, reward.unsqueeze(1)), 1), expected, atol=1e-4, rtol=0)
+    for part in (learner.explore, learner.fit, learner.imagine, learner.update):
+        part()
+
+
 def learner_of(bandit: bool, flags: str) -> mbpo.MBPO:
     torch.manual_seed(0)
     common = "--hidden 32 32 --model-hidden 32 32 --num-envs 20 --steps 8 --batch-size 128 --actor-lr 3e-3"
