@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import seeing
+from diffsim.training.layers import Chain, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
@@ -115,7 +115,7 @@ def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Seque
             if isinstance(layer, nn.Linear):
                 nn.init.orthogonal_(layer.weight, math.sqrt(2))
                 nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
+    return Chain(*layers)
 
 
 class Actor(nn.Module):
@@ -145,7 +145,7 @@ class Actor(nn.Module):
 
     def deterministic(self) -> nn.Sequential:
         """The policy without noise, with the same weights."""
-        return nn.Sequential(self.normalizer, *self.mean, nn.Tanh())
+        return Chain(self.normalizer, *self.mean, nn.Tanh())
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ class SHAC:
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
         self.critic_optimizer = ClippedAdam(self.critic, args.max_grad_norm, args.betas)
         self.obs = torch.zeros(args.horizon * env.num_envs, obs_dim, device=env.device)  # the critic's samples
-        self.value = torch.zeros(args.horizon * env.num_envs, device=env.device)
+        self.value = torch.zeros(args.horizon * env.num_envs, 1, device=env.device)
 
     def set_learning_rates(self, iteration: int) -> None:
         args, done = self.args, (iteration - 1) / self.args.iterations
@@ -193,7 +193,7 @@ class SHAC:
         norm = self.actor_optimizer.step(loss)
         rollout = Rollout(*(tensor.detach() for tensor in rollout))
         value = td_lambda(rollout.reward, next_value.detach(), rollout.done, args.gamma, args.td_lambda)
-        self.value.copy_(value.flatten())
+        self.value.copy_(value.view(-1, 1))
         self.obs.copy_(normalizer(rollout.obs).flatten(0, 1))
         normalizer.update(rollout.obs)
         return {"losses/actor": loss.detach(), "grad/norm": norm}
@@ -202,11 +202,11 @@ class SHAC:
         """Fit the critic to the window's TD(lambda) returns (Eq. 6), and let the target critic follow."""
         args = self.args
         losses = [torch.zeros_like(self.critic_optimizer.skipped)]
+        batches = list(zip(*(part.chunk(args.critic_minibatches) for part in (self.obs, self.value)), strict=True))
         for _ in range(args.critic_iterations if args.critic else 0):
             losses = []
-            batches = self.obs.chunk(args.critic_minibatches), self.value.chunk(args.critic_minibatches)
-            for obs, value in zip(*batches, strict=True):
-                loss = F.mse_loss(self.critic(obs).squeeze(-1), value)
+            for obs, value in batches:
+                loss = F.mse_loss(self.critic(obs), value)
                 self.critic_optimizer.step(loss)
                 losses.append(loss.detach())
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):

@@ -113,7 +113,7 @@ def test_the_critic_is_fitted_to_the_returns_and_the_target_follows_slowly() -> 
     obs, value = learner.obs.normal_(), learner.value.normal_()
     learner.critic_optimizer.lr.fill_(0.0)
     before = learner.critic_optimizer.vector.clone()
-    loss = (learner.critic(obs).squeeze(-1) - value).square().mean()  # the mean of four minibatches of six samples
+    loss = (learner.critic(obs) - value).square().mean()  # the mean of four minibatches of six samples
     torch.testing.assert_close(learner.update_critic()["losses/critic"], loss.detach())
     assert torch.equal(learner.critic_optimizer.vector, before)
 

@@ -69,6 +69,15 @@ class Likeliest(nn.Module):
         return loc.gather(x.dim(), index).squeeze(-1)  # not -1, which onnx's reference evaluator gets wrong
 
 
+class Chain(nn.Sequential):
+    """Layers called by their `forward` alone: without the hooks of modules, which cost small networks 4 % of a pass."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self:
+            x = layer.forward(x)
+        return x
+
+
 class First(nn.Module):
     """The first columns of an observation: what an actor sees of it, where a critic sees all (Task.actor_dim)."""
 
@@ -82,7 +91,7 @@ class First(nn.Module):
 
 def seeing(columns: int | None, network: nn.Sequential) -> nn.Sequential:
     """A network that sees the first columns of its input alone; None: all."""
-    return network if columns is None else nn.Sequential(First(columns), *network)
+    return network if columns is None else type(network)(First(columns), *network)
 
 
 def moments(x: Tensor) -> tuple[Tensor, Tensor]:

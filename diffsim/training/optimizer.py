@@ -49,6 +49,7 @@ class ClippedAdam:
         self.lr = torch.full((), lr, device=self.vector.device)
         self.step_count, self.skipped = torch.zeros_like(self.lr), torch.zeros_like(self.lr)
         self.betas, self.max_norm, self.skip_norm = betas, max_norm, skip_norm
+        self._adam: dict[str, Any] = dict(lr=self.lr, beta1=betas[0], beta2=betas[1], **PLAIN)
 
     def flatten(self, tensors: Sequence[Tensor]) -> Tensor:
         """All numbers in one tensor."""
@@ -71,9 +72,8 @@ class ClippedAdam:
 
     def _update(self, gradient: Tensor, **scaled: Any) -> None:
         """Adam's update along the gradient, over `grad_scale` if given; where `found_inf` is 1, nothing changes."""
-        state: Any = [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]
-        options: dict[str, Any] = dict(lr=self.lr, beta1=self.betas[0], beta2=self.betas[1]) | PLAIN | scaled
-        torch._fused_adam_([self.vector], [gradient], *state, **options)
+        state: tuple[list[Tensor], ...] = [self.exp_avg], [self.exp_avg_sq], [], [self.step_count]
+        torch._fused_adam_([self.vector], [gradient], *state, **self._adam | scaled)
 
     def moments(self, parameter: Tensor) -> list[Tensor]:
         """Views of a parameter's moments (numel,), first and second."""
