@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import gc
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from browser import CHROMIUM, Browser
 
 import shac
+from diffsim.view import render
 
 torch.set_num_threads(1)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it to what they run in the background
@@ -45,3 +48,21 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     flags = "--env cartpole --device cpu --iterations 2 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet"
     shac.main([*flags.split(), "--run-dir", str(directory)])
     return directory
+
+
+@pytest.fixture(scope="session")
+def opengl() -> None:
+    """Skips what draws where nothing can."""
+    try:
+        render.check_opengl()
+    except RuntimeError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no chromium")
+    opened = Browser(tmp_path / "profile")
+    yield opened
+    opened.close()

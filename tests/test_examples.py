@@ -21,7 +21,6 @@ import torch
 
 import diffsim
 from diffsim.training import load_policy
-from diffsim.view import render
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -75,14 +74,6 @@ def test_system_identification(truth: dict[str, float], monkeypatch: pytest.Monk
     assert estimates.shape == (13, 2) and estimates[0].tolist() == [1, 1]
     for estimate, factor in zip(estimates[-1].tolist(), truth.values(), strict=True):
         assert estimate == pytest.approx(factor, rel=0.05)
-
-
-@pytest.fixture
-def opengl() -> None:
-    try:
-        render.check_opengl()
-    except RuntimeError as error:
-        pytest.skip(str(error))
 
 
 @pytest.mark.slow

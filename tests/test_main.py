@@ -35,13 +35,6 @@ def trained(tiny_run: Path) -> Path:
     return tiny_run / "checkpoint.pt"
 
 
-def opengl() -> None:
-    try:
-        render.check_opengl()
-    except RuntimeError as error:
-        pytest.skip(str(error))
-
-
 # The report -----------------------------------------------------------------------------------------------------------
 
 
@@ -85,9 +78,8 @@ def test_troubles_come_with_their_remedy(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_demonstration_of_an_exported_policy(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    opengl: None, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    opengl()
     policy, video = tmp_path / "policies" / "cartpole.pt", tmp_path / "new" / "demo.mp4"
     monkeypatch.setattr(command, "POLICIES", policy.parent)
     monkeypatch.setattr(command, "DEMO_SECONDS", 0.1)

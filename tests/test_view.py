@@ -17,7 +17,6 @@ from learners import refusal
 import view
 from diffsim import __main__ as command
 from diffsim.training import load_policy, make_policy_env
-from diffsim.view import render
 
 
 @pytest.fixture(autouse=True)
@@ -25,15 +24,18 @@ def named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["view.py"])
 
 
-def opengl() -> None:
-    try:
-        render.check_opengl()
-    except RuntimeError as error:
-        pytest.skip(str(error))
+def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line with which view.py ends, maybe after what it has found."""
+    with pytest.raises(SystemExit) as exit:
+        view.main(words)
+    error = capsys.readouterr().err
+    assert exit.value.code == 2 and error.startswith("view.py: ") and error.count("\n") == 1
+    return error
 
 
-def test_video_page_and_curves_of_a_run(tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    opengl()
+def test_video_page_and_curves_of_a_run(
+    opengl: None, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     outputs = [tmp_path / name for name in ("a.mp4", "a.html", "a.png")]
     options = ["--seconds", "0.5", "--episodes", "3", "--size", "64", "48", "--substeps", "2"]
     flags = [word for pair in zip(("--video", "--web", "--plot"), map(str, outputs), strict=True) for word in pair]
@@ -103,42 +105,32 @@ def test_mistakes_are_one_line(
     monkeypatch.setenv("DISPLAY", ":77")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     places = {"run": tiny_run, "new": tmp_path}
-    with pytest.raises(SystemExit) as exit:
-        view.main(arguments.format(**places).split())
-    error = capsys.readouterr().err
-    assert exit.value.code == 2 and error.startswith("view.py: ") and error.count("\n") == 1
-    assert message.format(**places) in error
+    assert message.format(**places) in refused(arguments.format(**places).split(), capsys)
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 @pytest.mark.parametrize("flags", ["--video {0}/a.mp4", "--video {0}/a.gif", "--web {0}/a.html", "--plot {0}/a.png"])
 def test_a_full_disk_is_one_line_and_leaves_what_was_there(
-    flags: str, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    opengl: None, flags: str, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if "--video" in flags:
-        opengl()
     path = Path(flags.format(tmp_path).split()[1])
     path.write_text("an older file")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, hard))
-        with pytest.raises(SystemExit) as exit:
-            options = [*"--episodes 3 --seconds 0.5 --size 64 48".split(), *flags.format(tmp_path).split()]
-            view.main([str(tiny_run), *options])
+        options = [*"--episodes 3 --seconds 0.5 --size 64 48".split(), *flags.format(tmp_path).split()]
+        assert refused([str(tiny_run), *options], capsys).startswith(f"view.py: cannot write {path}: ")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    error = capsys.readouterr().err
-    assert exit.value.code == 2 and error.startswith(f"view.py: cannot write {path}: ") and error.count("\n") == 1
     assert path.read_text() == "an older file" and [*tmp_path.iterdir()] == [path]
 
 
 def test_missing_matplotlib_is_one_line(
-    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(SystemExit):
-        view.main([str(tiny_run), "--plot", str(tmp_path / "a.png")])
-    assert capsys.readouterr().err == "view.py: --plot needs matplotlib: pip install matplotlib\n"
+    line = refusal(lambda: view.main([str(tiny_run), "--plot", "a.png"]), capsys)
+    assert line == "view.py: --plot needs matplotlib: pip install matplotlib"
 
 
 @pytest.mark.filterwarnings("error")

@@ -98,11 +98,7 @@ def test_what_cannot_be_compared(name: str, message: str, tmp_path: Path, capsys
     assert message in refusal(lambda: transfer.main(args), capsys)
 
 
-def test_a_video_shows_both_worlds(tmp_path: Path) -> None:
-    try:
-        diffsim.view.render.check_opengl()
-    except RuntimeError as error:
-        pytest.skip(str(error))
+def test_a_video_shows_both_worlds(opengl: None, tmp_path: Path) -> None:
     env = diffsim.make("hopper", 1)
     qpos = env.qpos.double().numpy()
     motion = transfer.Motion(np.stack([qpos] * 9), np.zeros((9, 1, 6)), np.zeros(1), np.array([8]), np.array([False]))

@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
+from browser import Browser
 
 import diffsim
 from diffsim import terrain
@@ -191,9 +191,8 @@ setTimeout(() => {
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
 @pytest.mark.parametrize("task", ["ant", "humanoid_mtu", "meshes on hills"])
-def test_a_browser_draws_the_page(task: str, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_browser_draws_the_page(task: str, browser: Browser, tmp_path: Path, rng: np.random.Generator) -> None:
     from PIL import Image
 
     if task in ("ant", "humanoid_mtu"):
@@ -203,19 +202,15 @@ def test_a_browser_draws_the_page(task: str, tmp_path: Path, rng: np.random.Gene
         motion = SimpleNamespace(mj_model=model, terrain=[hills]), np.tile(model.qpos0, (120, 1)), 1 / 60
     path = web.write_page(tmp_path / "page.html", *motion, title=HOSTILE, caption=HOSTILE)
     path.write_text(path.read_text().replace("</body>", TOUCH))
-    browser = Browser(tmp_path / "profile")
-    try:
-        page = browser.open(path.as_uri())
-        page.call("Emulation.setDeviceMetricsOverride", width=480, height=400, deviceScaleFactor=1, mobile=False)
-        page.wait("typeof page === 'object' && (page.touched || page.error)")
-        assert page.evaluate("[page.error ?? '', document.title]") == ["", HOSTILE]
-        if "hills" in task:
-            heights = page.evaluate("[-99, 1.5, 2, 7.3, 49, 999].map(x => height(below(x), x))")
-            np.testing.assert_allclose(heights, np.interp([-99, 1.5, 2, 7.3, 49, 999], *hills.T), atol=1e-4)
-        page.screenshot(tmp_path / "shot.png")
-        assert {url for url in page.requests() if not url.startswith("data:")} == {path.as_uri()}
-    finally:
-        browser.close()
+    page = browser.open(path.as_uri())
+    page.call("Emulation.setDeviceMetricsOverride", width=480, height=400, deviceScaleFactor=1, mobile=False)
+    page.wait("typeof page === 'object' && (page.touched || page.error)")
+    assert page.evaluate("[page.error ?? '', document.title]") == ["", HOSTILE]
+    if "hills" in task:
+        heights = page.evaluate("[-99, 1.5, 2, 7.3, 49, 999].map(x => height(below(x), x))")
+        np.testing.assert_allclose(heights, np.interp([-99, 1.5, 2, 7.3, 49, 999], *hills.T), atol=1e-4)
+    page.screenshot(tmp_path / "shot.png")
+    assert {url for url in page.requests() if not url.startswith("data:")} == {path.as_uri()}
     picture = np.asarray(Image.open(tmp_path / "shot.png").convert("RGB")).astype(int)[:340]
     reddish = picture[..., 0] - picture[..., 2] > 60  # the ant, muscles at work, or a mesh
     assert 0.002 < reddish.mean() < 0.5
