@@ -78,7 +78,7 @@ def test_arguments_override_the_preset():
     assert (soft.k_n, soft.k_d, soft.k_t, soft.mu) == (1e5, 1e4, file.k_t, file.mu)
     wrong = {"'kn'.*k_n, k_d, k_t, mu, k_limit, d_limit": dict(penalty={"kn": 1e5})}
     wrong |= {f"k_n is {bad}, must be": dict(penalty={"k_n": bad}) for bad in (-1.0, float("nan"), float("inf"))}
-    wrong |= {"'faster'.*fast, default, accurate": dict(accuracy="faster")}
+    wrong |= {"'faster'.*fast, accurate, default": dict(accuracy="faster")}
     wrong |= {"unknown contact 'hard'; choose from soft, mujoco": dict(contact="hard")}
     for message, arguments in wrong.items():
         with pytest.raises(ValueError, match=message):

@@ -11,7 +11,7 @@ import os
 import sys
 from difflib import get_close_matches
 from pathlib import Path
-from typing import ClassVar, Literal, TypeAlias, get_args
+from typing import ClassVar, Literal, TypeAlias
 
 import mujoco
 import torch
@@ -155,20 +155,17 @@ class Task:
             ValueError: another name, or a preset that the task has not.
         """
         contact = cls.contact if contact is None else contact
-        if contact not in get_args(Contact):
-            raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(get_args(Contact))}")
-        if accuracy not in get_args(Accuracy):
-            raise ValueError(f"unknown accuracy {accuracy!r}; choose from {', '.join(get_args(Accuracy))}")
+        if contact not in RATE:
+            raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(RATE)}")
         own = hasattr(cls, "substeps") and contact == cls.contact
-        substeps = cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt))
-        explicit = Integration.explicit(contact, substeps)
+        explicit = Integration.explicit(contact, cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt)))
+        presets = {name: getattr(cls, name) for name in ("fast", "accurate") if hasattr(cls, name)}
         if explicit.constrained:
-            return explicit.replaced(substeps=substeps * (4 if accuracy == "accurate" else 1))
-        if accuracy == "default":
-            return explicit
-        if not hasattr(cls, accuracy):
-            raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose default, or give substeps")
-        return getattr(cls, accuracy)
+            presets = {"fast": explicit, "accurate": explicit.replaced(substeps=4 * explicit.substeps)}
+        presets["default"] = explicit
+        if accuracy not in presets:
+            raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose from {', '.join(presets)}")
+        return presets[accuracy]
 
     @classmethod
     def falls(cls) -> bool:
