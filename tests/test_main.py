@@ -54,6 +54,7 @@ def test_troubles_come_with_their_remedy(monkeypatch: pytest.MonkeyPatch) -> Non
         raise RuntimeError("no OpenGL: install it")
 
     monkeypatch.setattr(render, "check_opengl", broken)
+    monkeypatch.setattr(command, "describe_tasks", list)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", "/proc/nowhere")
     for driver, torch_sees, cuda, shown, hint in (
         (False, False, None, None, ""),

@@ -155,10 +155,8 @@ def test_a_robot_may_be_a_model_or_a_spec_which_stays_as_it_is() -> None:
     class Mine(Bare):
         asset = model
 
-    env = diffsim.make(Mine, num_envs=2, dtype=torch.float64)
+    env = diffsim.make(Mine, num_envs=2)
     assert env.scene.nq == 1 and env.task.obs_dim == 2
-    _, reward, *_ = env.step(torch.zeros(2, 0, dtype=torch.float64))
-    assert reward.tolist() == [0, 0]
 
 
 # Its numbers ----------------------------------------------------------------------------------------------------------
