@@ -24,6 +24,7 @@ from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import FILE, Contact, find_task
 from diffsim.training import command, evaluate, export_onnx, export_policy, fail, load_policy, make_policy_env
+from diffsim.tune import tune
 from diffsim.view import render
 
 POLICIES = files("diffsim") / "policies"
@@ -38,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
     argv = sys.argv[1:] if argv is None else argv
     commands: dict[str, Callable[..., object]] = {
-        each.__name__: each for each in (demo, drive, train, view, check, export)
+        each.__name__: each for each in (demo, drive, train, view, check, tune, export)
     }
     match [*argv]:  # a script heeds its own flags and errors
         case ["view", *flags]:

@@ -1,0 +1,165 @@
+"""`diffsim tune`: what speed costs in accuracy for any robot on this machine, and the setting to take."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tyro.conf import Positional
+
+import diffsim
+from diffsim.sim.options import check_device
+from diffsim.tasks import Contact, Task, find_task
+from diffsim.training import Count, Positive, fail, load_policy
+from diffsim.tune.extremes import stress
+from diffsim.tune.front import Row, batches, choice, costs, front, measure, settings
+from diffsim.tune.motion import SPANS, Motion
+from diffsim.view.render import whole_file
+
+SHOWN = 10  # rows of the printed front
+POLICIES = Path(__file__).resolve().parents[1] / "policies"
+
+
+def tune(
+    robot: Positional[str],
+    error: Positive = 0.01,
+    checkpoint: Path | None = None,
+    contact: tuple[Contact, ...] = (),
+    device: str = "cpu",
+    states: Count = 16,
+    output: Path = Path("tune.png"),
+    csv: Path | None = None,
+    extremes: bool = False,
+) -> None:
+    """Measure how speed and accuracy trade for a robot on this machine, and choose a setting.
+
+    Args:
+        robot: a task, a file my_task.py, or an MJCF file robot.xml.
+        error: of the state after 0.5 s that is allowed: root mean square over joints [m, rad], median over states.
+        checkpoint: whose policy moves the robot; default the shipped one, or smooth random actions.
+        contact: models of contact to compare; default the task's own.
+        device: whose time is measured; errors are measured on the CPU.
+        states: start states.
+        output: the picture.
+        csv: where all rows are written, too.
+        extremes: find also what each integrator withstands.
+    """
+    check_device(device)
+    task = subject(robot)
+    env = diffsim.make(task, states, seed=0, early_termination=False, max_episode_steps=2**31)
+    if not env.scene.nu:
+        fail(f"{robot} has no actuators, so there is no action to differentiate in")
+    policy, source = actor(robot, task, checkpoint)
+    motion, rows = Motion(env, policy), list[Row]()
+    print(f"{task.name}: {states} start states and actions of {source}; control steps of {1e3 * env.control_dt:.4g} ms")
+    try:
+        for each in contact or (task.contact,):
+            measure(motion, settings(task, each), device, rows)
+    except KeyboardInterrupt:
+        print(f"stopped after {len(rows)} settings")
+    if not rows:
+        return
+    best, default = choice(rows, error), next(row for row in rows if row.setting.integration == env.sim.integration)
+    print(table([mark(row, best, default) | row.columns() for row in thin(front(rows), best)]))
+    print(verdict(best, default, error))
+    if csv:
+        write(csv, [row.columns() for row in rows])
+    draw(output, rows, best, default, task.name)
+    setting = (best or default).setting
+    per_call = ", ".join(f"{n} {us:.3g}" for n, us in batches(motion, setting, device).items())
+    print(f"environments per call, us of a control step with gradient: {per_call}")
+    whole, *parts = costs(motion, setting, device).items()
+    print(f"of {whole[1]:.3g} us the scene pays for " + ", ".join(f"{part} {us:.2g}" for part, us in parts))
+    if extremes:
+        print(table(stress(motion, task, contact or (task.contact,))))
+
+
+class Watched(Task):
+    """A robot of an MJCF file, without a reward."""
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        return torch.cat((qpos, qvel), dim=-1)
+
+
+def subject(robot: str) -> type[Task]:
+    """The task of a name or a file; of an MJCF file one is made."""
+    path = Path(robot)
+    if path.suffix != ".xml":
+        return find_task(robot)
+    return type("Robot", (Watched,), {"name": path.stem, "asset": path.resolve()})
+
+
+def actor(robot: str, task: type[Task], checkpoint: Path | None) -> tuple[torch.nn.Module | None, str]:
+    """The policy, None if actions are random, and what to call it."""
+    shipped = POLICIES / f"{task.name}.pt"
+    if checkpoint is None and not shipped.is_file():
+        return None, "smooth random actions"
+    saved = load_policy(checkpoint or shipped)
+    if find_task(saved.args["env"]) is not task:
+        fail(f"{checkpoint} is a checkpoint of {saved.args['env']}, not of {robot}")
+    return saved.network, f"{saved.script}.py's policy, iteration {saved.iteration}"
+
+
+def mark(row: Row, best: Row | None, default: Row) -> dict[str, str]:
+    return {"": "->" if row is best else "default" if row is default else ""}
+
+
+def thin(rows: Sequence[Row], best: Row | None) -> list[Row]:
+    """At most SHOWN of the rows, by leaving out the nearest in cost, but for the first, the last and the best one."""
+    rows = [*rows]
+    while len(rows) > SHOWN:
+        middle = [k for k in range(1, len(rows) - 1) if rows[k] is not best]
+        del rows[min(middle, key=lambda k: rows[k + 1].cost / rows[k - 1].cost)]
+    return rows
+
+
+def verdict(best: Row | None, default: Row, error: float) -> str:
+    if best is None:
+        return f"no setting keeps the state's error after {SPANS[-1]} s below {error:g}"
+    speed = default.cost / best.cost
+    return f"take {best.setting.flags}: error {best.error:.2g}, {speed:.2g} times as fast as the default"
+
+
+def table(rows: Sequence[Mapping[str, str]]) -> str:
+    """The rows under their columns' names, aligned."""
+    lines = [list(rows[0]), *(list(row.values()) for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
+
+
+def write(path: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    with whole_file(path) as part, part.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def draw(path: Path, rows: Sequence[Row], best: Row | None, default: Row, title: str) -> None:
+    """Error against cost of all rows, the front as a line."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        print("no picture: pip install matplotlib")
+        return
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    panels = {
+        f"state after {SPANS[-1]} s [m, rad]": lambda r: r.error,
+        "gradient, 8 steps, relative": lambda r: r.gradient[8],
+    }
+    for axis, (name, value) in zip(figure.subplots(1, 2), panels.items(), strict=True):
+        for kind in dict.fromkeys(row.kind for row in rows):
+            own = [row for row in rows if row.kind == kind]
+            axis.loglog([row.cost for row in own], [value(row) for row in own], "o-", label=kind, markersize=4)
+        for row, text in ((default, "default"), (best, "chosen")):
+            if row:
+                axis.annotate(text, (row.cost, value(row)), textcoords="offset points", xytext=(6, 6))
+        axis.set_xlabel("us of a control step with gradient")
+        axis.set_ylabel(name)
+    figure.suptitle(title)
+    figure.axes[0].legend(frameon=False, fontsize="small")
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=150, format=path.suffix[1:])
+    print(f"picture: {path}")

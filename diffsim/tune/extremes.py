@@ -1,0 +1,88 @@
+"""How far a robot can be driven: masses, stiffness, speeds, drops and time steps at which integrators fail."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterable
+
+import mujoco
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from diffsim.robot.mjcf import load_scene
+from diffsim.sim.integration import Integration
+from diffsim.tasks import Task
+from diffsim.tune.motion import Motion, Setting
+
+FINER = 16  # the reference's substeps, in multiples of the default's
+
+# Extremes -------------------------------------------------------------------------------------------------------------
+
+SWEEPS: dict[str, tuple[float, ...]] = {
+    "substeps": (24, 16, 12, 8, 6, 4, 3, 2, 1),
+    "contact stiffness x": (10, 100, 1000),
+    "last body's mass x": (10, 100, 1000, 10_000),
+    "last body's mass /": (10, 100, 1000, 10_000),
+    "speed of the root (m/s)": (10, 100, 1000),
+    "speed of a joint (1/s)": (10, 100, 1000),
+    "drop (m)": (1, 10, 100),
+}
+
+
+def stress(motion: Motion, task: type[Task], contacts: Iterable[str]) -> list[dict[str, str]]:
+    """Of each sweep the first value with which an integrator, at the task's substeps, fails within 0.5 s.
+
+    It fails where an environment is contained, or its kinetic energy passes twice the largest of a float64 reference.
+    """
+    kinds = dict[str, Integration]()
+    for how in (task.integration("default", contact) for contact in contacts):
+        kinds[how.integrator] = how
+        if not how.constrained:
+            kinds |= {f"implicit {theta:g}": Integration("implicit", how.substeps, theta) for theta in (0.0, 0.5)}
+    return [
+        {"sweep": sweep} | {kind: first_failure(motion, sweep, how) for kind, how in kinds.items()}
+        for sweep in tqdm(SWEEPS, "extremes", leave=False, ncols=80)
+    ]
+
+
+def first_failure(motion: Motion, sweep: str, how: Integration) -> str:
+    """The value and how it fails; "-" if no value of the sweep does."""
+    for value in SWEEPS[sweep]:
+        case, own = extreme(motion, sweep, value), how
+        if sweep == "substeps":
+            if value >= how.substeps:
+                continue
+            own = how._replace(substeps=int(value))
+        energy, finite = case.energies(Setting(own))
+        if not finite:
+            return f"{value:g} (not finite)"
+        finest = Setting(how._replace(substeps=FINER * how.substeps), torch.float64)
+        if energy[..., 0].max() > 2 * case.energies(finest)[0][..., 0].max():
+            return f"{value:g} (energy)"
+    return "-"
+
+
+def extreme(motion: Motion, sweep: str, value: float) -> Motion:
+    """The motion with one quantity at an extreme."""
+    case, model = copy.copy(motion), copy.deepcopy(motion.scene.mj_model)
+    if sweep.startswith("last body's mass"):
+        factor = value if sweep.endswith("x") else 1 / value
+        model.body_mass[-1] *= factor
+        model.body_inertia[-1] *= factor
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        case.scene = load_scene(model)
+    elif sweep == "contact stiffness x":
+        model.geom_solref[:, 0] *= np.where(model.geom_solref[:, 0] > 0, value**-0.5, value)
+        case.scene = load_scene(model).with_penalty(
+            {} if math.isnan(motion.scene.k_n) else {"k_n": value * motion.scene.k_n}
+        )
+    elif sweep == "speed of the root (m/s)":
+        case.qvel = case.qvel.index_fill(1, torch.tensor(0), value)
+    elif sweep == "speed of a joint (1/s)":
+        case.qvel = case.qvel.index_fill(1, torch.tensor(case.scene.nv - 1), value)
+    elif sweep == "drop (m)":
+        case.qpos = case.qpos.clone()
+        case.qpos[:, 2 if case.scene.floating else 1] += value
+    return case
