@@ -121,7 +121,7 @@ class Flags(RunFlags):
 class ParallelFlags(Flags):
     """Many environments at once."""
 
-    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*Flags.MAY_CHANGE, "cuda_graph", "randomise", "redraw")
+    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*Flags.MAY_CHANGE, "cuda_graph", "randomise", "redraw", "monitor")
 
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""
@@ -131,6 +131,8 @@ class ParallelFlags(Flags):
     """ranges of factors drawn for each environment: friction=0.7:1.3 stiffness mass motor (per --contact)"""
     redraw: Count = 10
     """iterations between drawings of the factors"""
+    monitor: Natural = 50
+    """iterations between replays of a window with 4 times the substeps (sim/state_error, sim/return_lost); 0: none"""
 
     def check(self) -> None:
         super().check()
