@@ -13,7 +13,7 @@ from tyro.conf import Positional
 import diffsim
 from diffsim.sim.options import check_device
 from diffsim.tasks import Contact, Task, find_task
-from diffsim.training import Count, Positive, fail, load_policy
+from diffsim.training import Count, fail, load_policy
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row, batches, choice, costs, front, measure, settings
 from diffsim.tune.motion import SPANS, Motion
@@ -25,7 +25,7 @@ POLICIES = Path(__file__).resolve().parents[1] / "policies"
 
 def tune(
     robot: Positional[str],
-    error: Positive = 0.01,
+    error: float = 0.01,
     checkpoint: Path | None = None,
     contact: tuple[Contact, ...] = (),
     device: str = "cpu",
@@ -48,6 +48,10 @@ def tune(
         extremes: find also what each integrator withstands.
     """
     check_device(device)
+    if not error > 0:
+        fail(f"--error is {error:g}, must be positive")
+    if output.suffix not in (".png", ".svg", ".pdf"):
+        fail(f"--output is {output}, must end in .png, .svg or .pdf")
     task = subject(robot)
     env = diffsim.make(task, states, seed=0, early_termination=False, max_episode_steps=2**31)
     if not env.scene.nu:
@@ -62,7 +66,8 @@ def tune(
         print(f"stopped after {len(rows)} settings")
     if not rows:
         return
-    best, default = choice(rows, error), next(row for row in rows if row.setting.integration == env.sim.integration)
+    best, usual = choice(rows, error), task.integration("default", (contact or (task.contact,))[0])
+    default = next(row for row in rows if row.setting.integration == usual)
     print(table([mark(row, best, default) | row.columns() for row in thin(front(rows), best)]))
     print(verdict(best, default, error))
     if csv:
@@ -72,16 +77,20 @@ def tune(
     per_call = ", ".join(f"{n} {us:.3g}" for n, us in batches(motion, setting, device).items())
     print(f"environments per call, us of a control step with gradient: {per_call}")
     whole, *parts = costs(motion, setting, device).items()
-    print(f"of {whole[1]:.3g} us the scene pays for " + ", ".join(f"{part} {us:.2g}" for part, us in parts))
+    shares = ", ".join(f"{part} {us:.2g}" for part, us in parts)
+    print(f"of {whole[1]:.3g} us the scene pays for {shares or 'nothing that can be left out'}")
     if extremes:
         print(table(stress(motion, task, contact or (task.contact,))))
 
 
 class Watched(Task):
-    """A robot of an MJCF file, without a reward."""
+    """A robot of an MJCF file, which nothing is asked of."""
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         return torch.cat((qpos, qvel), dim=-1)
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        return torch.zeros_like(obs[..., 0])
 
 
 def subject(robot: str) -> type[Task]:

@@ -41,7 +41,9 @@ class Row:
     def kind(self) -> str:
         """What it shares with the settings of other substeps."""
         (how, dtype), theta = self.setting, self.setting.integration.theta
-        words = f"{how.passes} passes" if how.constrained else f"theta {theta:g}" if how.implicit else ""
+        words = (
+            f"{how.passes} passes" if how.constrained else f"theta {theta:g}" if how.integrator == "implicit" else ""
+        )
         return " ".join((how.integrator, words, "float64" * (dtype == torch.float64))).strip()
 
     @property

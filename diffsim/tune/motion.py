@@ -38,7 +38,7 @@ class Setting(NamedTuple):
         if how.constrained:
             words = f"--contact mujoco --substeps {how.substeps} --passes {how.passes}"
         else:
-            theta = f" --theta {how.theta:g}" if how.implicit else ""
+            theta = f" --theta {how.theta:g}" if how.integrator == "implicit" else ""
             words = f"--contact soft --integrator {how.integrator}{theta} --substeps {how.substeps}"
         return words + (" (float64: dtype=torch.float64 in diffsim.make)" if self.dtype == torch.float64 else "")
 
