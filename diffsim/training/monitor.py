@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from diffsim.env import DiffEnv
 from diffsim.training.evaluation import FINER, make_env
@@ -20,7 +21,7 @@ class Monitor:
     """Replays a window of some of the training's environments with FINER times the substeps."""
 
     def __init__(self, args: Flags, env: DiffEnv) -> None:
-        self.env, how = env, env.sim.integration
+        self.env, self.warned, how = env, False, env.sim.integration
         count = min(WATCHED, env.num_envs)
         finer = how._replace(substeps=FINER * how.substeps)
         self.envs = [make_env(args, count, substeps=each.substeps, **ENDLESS) for each in (how, finer)]
@@ -44,15 +45,20 @@ class Monitor:
             action = policy(obs)
             obs, reward, *_ = coarse.step(action)
             total += torch.stack((reward.sum(), fine.step(action)[1].sum()))
-        away = apart(env.scene.mj_model, coarse.qpos.double().cpu().numpy(), fine.qpos.double().cpu().numpy())
         here, there = total.tolist()
-        return {"sim/state_error": float(np.median(away)), "sim/return_lost": (here - there) / max(abs(here), 1e-9)}
+        found = {"sim/state_error": float(np.median(apart(env.scene.mj_model, coarse.qpos, fine.qpos)))}
+        return found | {"sim/return_lost": (here - there) / max(abs(here), 1e-9)}
+
+    def suspects(self, found: dict[str, float]) -> bool:
+        """Whether to warn of a replay: once."""
+        first, self.warned = not self.warned, self.warned or found["sim/state_error"] > SUSPECT
+        return first and self.warned
 
 
-def apart(model: mujoco.MjModel, found: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+def apart(model: mujoco.MjModel, found: Tensor, expected: Tensor) -> NDArray[np.float64]:
     """(N,) root mean square over degrees of freedom [m, rad] between states (N, nq) and (N, nq)."""
     away, errors = np.zeros(model.nv), []
-    for one, other in zip(found, expected, strict=True):
+    for one, other in zip(found.double().cpu().numpy(), expected.double().cpu().numpy(), strict=True):
         mujoco.mj_differentiatePos(model, away, 1.0, other, one)
         errors.append(np.sqrt(np.mean(away**2)))
     return np.array(errors)

@@ -27,7 +27,7 @@ from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_wri
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import FINER, Evaluation, make_env, write_evaluation
 from diffsim.training.flags import Flags, ParallelFlags
-from diffsim.training.monitor import STEPS, SUSPECT, Monitor
+from diffsim.training.monitor import STEPS, Monitor
 from diffsim.training.variation import Variation, parse_ranges
 
 L = TypeVar("L", bound=Learner)
@@ -109,7 +109,6 @@ class Run:
         self._evaluation: tuple[int, Evaluation] | None = None
         self._scalars: dict[str, float] = {}  # that were written last
         self._monitor: Monitor | None = None
-        self._warned = False
         self._told = 0.0  # how many skipped updates a message told
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
@@ -219,7 +218,7 @@ class Run:
         scalars = {name: float(value) for name, value in metrics.items() if not isinstance(value, Tensor)}
         if self._env is not None:
             tensors |= self._env.take_statistics()
-            scalars |= self._watch()
+            scalars |= self._watch(self._env)
         signals = torch.full((), float(len(self._signals)), device=self.device)
         numbers = distributed.average(torch.stack([*tensors.values(), signals]))
         steps, begin, self._mark = control_steps or self._samples, self._mark, Mark(self.device)
@@ -227,19 +226,20 @@ class Run:
         self._records.append(Record(self.iteration, steps, list(tensors), numbers, scalars, times))
         self._times = {}
 
-    def _watch(self) -> dict[str, float]:
+    def _watch(self, env: DiffEnv) -> dict[str, float]:
         """What --monitor measures, in the iterations that are due."""
         args, learner = self.args, self._learner
-        if not self.writes or not isinstance(args, ParallelFlags) or not is_due(self.iteration, args.monitor):
+        if not self.writes or learner is None or not isinstance(args, ParallelFlags):
             return {}
-        if self._monitor is None:
-            self._monitor = Monitor(args, self._env)
+        if not is_due(self.iteration, args.monitor):
+            return {}
+        self._monitor = self._monitor or Monitor(args, env)
         found = self._monitor.replay(learner.policy)
-        if found["sim/state_error"] > SUSPECT and not self._warned:
-            self._warned = True
+        if self._monitor.suspects(found):
+            error = f"{found['sim/state_error']:.2g} m or rad"
             self.message(
-                f"iteration {self.iteration}: with {FINER} times the substeps the robot is {found['sim/state_error']:.2g} "
-                f"(m, rad) elsewhere after {STEPS} steps: the policy learns the integrator's errors; give more --substeps"
+                f"iteration {self.iteration}: with {FINER} times the substeps the robot is {error} elsewhere after {STEPS} "
+                "steps: the policy learns the integrator's errors; give more --substeps"
             )
         return found
 

@@ -15,7 +15,8 @@ from tqdm import tqdm
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
-from diffsim.tune.motion import HORIZONS, SPANS, Motion, Setting, apart, without
+from diffsim.training.monitor import apart
+from diffsim.tune.motion import HORIZONS, SPANS, Motion, Setting, without
 
 FINER = 8  # the reference's substeps, in multiples of the most measured
 TIMED, ROUNDS = 64, 7  # environments and turns of a timing; the fastest turn counts, the others were disturbed
@@ -89,7 +90,7 @@ class Reference:
     def row(self, truth: Reference) -> Row:
         row = Row(self.setting, residual=self.residual, contained=self.contained)
         for span, qpos in self.states.items():
-            row.state[span] = float(np.median(apart(self.motion.scene, qpos, truth.states[span])))
+            row.state[span] = float(np.median(apart(self.motion.scene.mj_model, qpos, truth.states[span])))
         for horizon, found in self.gradients.items():
             expected = truth.gradients[horizon]
             row.gradient[horizon] = ((found - expected).norm(dim=1) / expected.norm(dim=1)).median().item()
@@ -166,8 +167,10 @@ BATCHES = (1, 16, 64, 256, 1024)  # environments per call
 
 def costs(motion: Motion, setting: Setting, device: str) -> dict[str, float]:
     """Microseconds of a control step with its gradient: of the whole scene, and saved by leaving out each part."""
-    sim = motion.simulator(setting, TIMED, device=device)
-    parts = [part for part in COSTS if part in sim._launcher.scene.features]
+    sim, features = motion.simulator(setting, TIMED, device=device), set(motion.scene.features)
+    if setting.integration.constrained and motion.scene.mj_model.dof_frictionloss.any():
+        features.add("frictionloss")
+    parts = [part for part in COSTS if part in features]
     scenes = {part: without(motion.scene, part) for part in parts}
     sims = [sim, *(motion.simulator(setting, TIMED, scene, device=device) for scene in scenes.values())]
     whole, *others = (sum(times) for times in timed(sims, motion))

@@ -75,7 +75,7 @@ class Motion:
     def replay(self, setting: Setting) -> tuple[dict[float, Tensor], float, float]:
         """qpos (N, nq) after SPANS, the largest residual (median over environments) and the share contained."""
         sim = self.simulator(setting, len(self.qpos))
-        q, v, found = self.qpos.to(sim.dtype), self.qvel.to(sim.dtype), {}
+        q, v, found = self.qpos.to(sim.dtype), self.qvel.to(sim.dtype), dict[float, Tensor]()
         bad, residual = torch.zeros(len(q), dtype=torch.bool), torch.zeros(len(q), dtype=sim.dtype)
         for k, action in enumerate(self.actions.to(sim.dtype), start=1):
             q, v = sim.step(q, v, action)
@@ -129,21 +129,13 @@ class Motion:
         return np.array(rows).reshape(-1, len(self.qpos), 2), finite
 
 
-def apart(scene: Scene, found: Tensor, expected: Tensor) -> Array:
-    """(N,) root mean square over degrees of freedom [m, rad] between qpos (N, nq) and qpos (N, nq)."""
-    away, errors = np.zeros(scene.nv), []
-    for one, other in zip(found.numpy(), expected.numpy(), strict=True):
-        mujoco.mj_differentiatePos(scene.mj_model, away, 1.0, other, one)
-        errors.append(np.sqrt(np.mean(away**2)))
-    return np.array(errors)
-
-
 def without(scene: Scene, part: str) -> Scene:
     """The scene without its contact, limits, dry friction, muscles, terrain or fluid."""
     n = scene.nlink
     nothing = {name: getattr(scene, name)[:0] for name in ("contact_link", "contact_position", "contact_radius")}
+    spheres: Any = (values[:0] for values in scene.spheres)
     changes: dict[str, Any] = {
-        "contact": nothing | {"spheres": Spheres(*(values[:0] for values in scene.spheres)), "terrain": None},
+        "contact": nothing | {"spheres": Spheres(*spheres), "terrain": None},
         "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
         "muscle": {name: getattr(scene, name)[:0] for name in ("segment_link", "segment_position", "segment_muscle")},
         "terrain": {"terrain": None},
