@@ -238,8 +238,8 @@ class Run:
         if self._monitor.suspects(found):
             error = f"{found['sim/state_error']:.2g} m or rad"
             self.message(
-                f"iteration {self.iteration}: with {FINER} times the substeps the robot is {error} elsewhere after {STEPS} "
-                "steps: the policy learns the integrator's errors; give more --substeps"
+                f"iteration {self.iteration}: with {FINER} times the substeps the robot is {error} elsewhere after "
+                f"{STEPS} steps: the policy learns the integrator's errors; give more --substeps"
             )
         return found
 
