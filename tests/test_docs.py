@@ -268,7 +268,14 @@ def flags(script: Path) -> set[str]:
     return found
 
 
+def of_commands(path: Path) -> set[str]:
+    """The flags of the commands that a module of the package defines: the parameters of its functions."""
+    functions = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef))
+    return {f"--{each.arg.replace('_', '-')}" for node in functions for each in node.args.args}
+
+
 ANY = {flag for script in SCRIPTS for flag in flags(script)}
+ANY |= {flag for path in ("__main__.py", "tune/__init__.py") for flag in of_commands(ROOT / "diffsim" / path)}
 
 
 def commands(page: Path) -> Iterator[list[str]]:
