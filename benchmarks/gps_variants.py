@@ -33,7 +33,7 @@ from diffsim.training.evaluation import Evaluation
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
 
-Case = Literal["guided", "unregularized", "nonguided", "restart", "single-example", "policy-gradient", "dagger"]
+Case = Literal["guided", "unregularized", "nonguided", "policy-gradient", "dagger"]
 MAKERS: dict[str, Callable[..., Array]] = {
     "level": lambda: incline(0.0),
     "incline": incline,
@@ -221,32 +221,6 @@ class NonGuided(Search):
     guided = False
 
 
-class Restart(NonGuided):
-    """Without guides in S; the policy's samples start at any state of the guiding samples' path."""
-
-    def starts(self, count: int, source: int) -> Tensor:
-        if source < 0:
-            return super().starts(count, source)
-        x = torch.cat([guide.x[:-1] for guide in self.guides])
-        return x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
-
-    def optimise(self, S: gps.Samples) -> tuple[Tensor, dict[str, float]]:
-        self.student, metrics = super().optimise(S)
-        return self.student, metrics
-
-    def iterate(self, iteration: int) -> dict[str, float]:
-        """Measures the proposal from the guides' start, as the others do."""
-        return super().iterate(iteration) | self.metrics(self.draw(self.student))
-
-
-class SingleExample(NonGuided):
-    """Pretrained on the plans alone, without samples about them."""
-
-    def pretrain(self, guiding: gps.Samples) -> Tensor:
-        obs = self.system.observe(torch.stack([guide.x[:-1] for guide in self.guides]))
-        return super().pretrain(guiding._replace(obs=obs, u=torch.stack([guide.u for guide in self.guides])))
-
-
 class PolicyGradient(NonGuided):
     """GPOMDP (Baxter et al. 2001): reward to go minus its mean over the samples, at each time."""
 
@@ -277,8 +251,7 @@ class DAgger(NonGuided):
 
 
 CASES: dict[Case, type[Search]] = {"guided": Search, "unregularized": Search, "nonguided": NonGuided}
-CASES |= {"restart": Restart, "single-example": SingleExample, "policy-gradient": PolicyGradient, "dagger": DAgger}
-
+CASES |= {"policy-gradient": PolicyGradient, "dagger": DAgger}
 
 main = script(
     VariantArgs,

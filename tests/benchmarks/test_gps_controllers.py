@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import gps_controllers as controllers
@@ -39,7 +38,7 @@ def test_the_command(hopper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(controllers, "COUNT", 4)
     controllers.main(CheckpointFlags(checkpoints=(hopper,), output=tmp_path))
     rows = {(row["kind"], row["size"], row["controller"]): row for row in read_csv(tmp_path / "gps_controllers.csv")}
-    assert len(rows) == 27 and rows["start", "0", "ddp"]["kept"] == "1" > rows["start", "1", "policy"]["kept"]
+    assert len(rows) == 18 and rows["start", "0", "ddp"]["kept"] == "1" > rows["start", "1", "policy"]["kept"]
     before = (tmp_path / "gps_controllers.csv").read_bytes()
     controllers.main(CheckpointFlags(draw_only=True, output=tmp_path))
     assert before == (tmp_path / "gps_controllers.csv").read_bytes()
@@ -78,25 +77,6 @@ def test_controllers_by_time_and_by_what_looks_alike(search: gps.Search) -> None
     torch.testing.assert_close(act["tbdp"](0, guide.x[8:9]), guide.u[8:9])
     torch.testing.assert_close(act["ddp"](8, guide.x[8:9]), guide.u[8:9])
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
-
-
-def test_a_push_moves_the_state_before_its_step(search: gps.Search) -> None:
-    """A quarter of the time in; a controller keeps its clock, and what left the finite numbers stays."""
-    system, start, seen = search.system, search.system.start().expand(2, -1), list[int]()
-    kick = torch.zeros(2, system.nd).double()
-    kick[:, system.nv] = torch.tensor([1.5, -1.5])
-
-    def act(t: int, x: torch.Tensor) -> torch.Tensor:
-        seen.append(t)
-        return torch.tensor([[0.3] * 3, [math.nan if t == 1 else 0.3] * 3]).double()
-
-    x, u, finite = controllers.pushed(system, start, 12, kick, act)
-    assert seen == list(range(12)) and x.shape == (2, 13, 12) and u.shape == (2, 12, 3)
-    assert finite.tolist() == [[True] * 12, [True] + [False] * 11]
-    plain = system.rollout(start[:1], 12, lambda t, _: u[:1, t])[0]
-    torch.testing.assert_close(x[0, :4], plain[0, :4])
-    after = system.rollout(system.retract(x[:1, 3], kick[:1]), 9, lambda t, _: u[:1, t])[0]
-    torch.testing.assert_close(x[0, 4:], after[0, 1:])
 
 
 def test_terrains_are_ten_places_or_seeds(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
