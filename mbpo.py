@@ -382,7 +382,7 @@ def nearby(dynamics: Dynamics, x: Tensor, action: Tensor, samples: int, scale: f
     change = dynamics.difference(following, x).square().mean(0).sqrt()  # of a control step: a scale for each number
     d = scale * torch.randn(samples, len(x), dynamics.nd + dynamics.nu, dtype=x.dtype, device=x.device)
     d[..., : dynamics.nd] *= change
-    end = (dynamics.jacobians(x, u, following) @ d.unsqueeze(-1)).squeeze(-1)
+    end = (dynamics.jacobians(x, u) @ d.unsqueeze(-1)).squeeze(-1)
     start, push = d.split((dynamics.nd, dynamics.nu), -1)
     return dynamics.retract(x, start), (u + push).tanh(), dynamics.retract(following, end), finite[:, 0]
 

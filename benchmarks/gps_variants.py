@@ -145,11 +145,11 @@ class Ground(System):
         x, u, finite = super().rollout(start, steps, lambda t, x: act(t, self._moved(x, ground.lower)))
         return self._moved(x, ground.lower), u, finite
 
-    def jacobians(self, x: Tensor, u: Tensor, following: Tensor) -> Tensor:
+    def jacobians(self, x: Tensor, u: Tensor) -> Tensor:
         if len(self.profiles) > 1:
             raise ValueError("Jacobians need one terrain for all steps")
         ground, nq, nv = self._elevation(1), self.nq, self.nv
-        f_z = super().jacobians(self._moved(x, ground.lift), u, self._moved(following, ground.lift))
+        f_z, following = super().jacobians(self._moved(x, ground.lift), u), self.rollout(x, 1, lambda *_: u)[0][:, 1]
         before, after = (F.pad(ground.gradient(part[:, :nq])[..., :nv, :nv], (0, nv, 0, nv)) for part in (x, following))
         f_z[..., : self.nd] = f_z[..., : self.nd] + f_z[..., : self.nd] @ before
         return f_z - after @ f_z

@@ -16,6 +16,7 @@ from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration
+from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options, check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation, Task, find_task
@@ -42,6 +43,7 @@ KEYWORDS = {"stochastic_init", "early_termination", "max_episode_steps", "render
 KEYWORDS -= {"integration", "device", "dtype"}
 
 
+@in_plain_mode
 def make(
     name: str | type[Task],
     num_envs: int = 64,

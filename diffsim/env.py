@@ -19,11 +19,13 @@ from torch import Tensor
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration, check_count
 from diffsim.sim.launcher import check_memory
+from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
 from diffsim.terrain import Elevation
 
+State = tuple[Tensor, Tensor, Tensor, Tensor]  # qpos, qvel, observation and memory, (N, ...) each
 RenderMode = Literal["rgb_array", "human"]
 Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
 # What works here, as tools try whatever an environment declares: a window needs a display.
@@ -74,6 +76,7 @@ class DiffEnv(VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": RENDER_MODES}
 
+    @in_plain_mode
     def __init__(
         self,
         task: Task,
@@ -122,7 +125,7 @@ class DiffEnv(VectorEnv):
         self.episode_step = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
-        self.qpos, self.qvel, self._obs, self.memory = (start[0] for start in self._draw(1))
+        self.qpos, self.qvel, self._obs, self.memory = self._draw(1)[0]
         self._recorded = 0  # differentiable steps since the window began
         self._starts, self._time = self._draw(horizon), 0  # of the window: one batch of operations, not one per step
 
@@ -131,6 +134,7 @@ class DiffEnv(VectorEnv):
         """The seed of `generator`."""
         return self.generator.initial_seed()
 
+    @in_plain_mode
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start all episodes anew, and a window; or only the episodes of options={"reset_mask": mask (N,) bool}.
 
@@ -146,11 +150,12 @@ class DiffEnv(VectorEnv):
             self.generator.manual_seed(check_seed(seed))
         if not options:
             self._cut()
-        self._begin(mask, (start[0] for start in self._draw(1)))
+        self._begin(mask, self._draw(1)[0])
         self._starts, self._time = self._draw(self.horizon), 0
         self._show()
-        return self._obs, {}
+        return self._obs.clone(), {}
 
+    @in_plain_mode
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """One control step of all environments, and the reset of those that end.
 
@@ -167,17 +172,21 @@ class DiffEnv(VectorEnv):
             ValueError: action of the wrong shape, dtype or device; an ActionError on the CPU if it is not a number.
             RuntimeError: more than `horizon` differentiable steps without `detach`.
         """
-        _, reward, terminated, truncated, info = self.advance(action)
+        _, reward, terminated, truncated, info = self._advance(action)
         if self._time == self.horizon:
             self._starts, self._time = self._draw(self.horizon), 0
-        self._begin(info["_final_obs"], (start[self._time] for start in self._starts))
+        self._begin(info["_final_obs"], self._starts[self._time])
         self._time += 1
-        return self._obs, reward, terminated, truncated, info
+        return self._obs.clone(), reward, terminated, truncated, info
 
+    @in_plain_mode
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """`step` without the reset: obs is info["final_obs"], and what has ended waits for `reset`."""
+        return self._advance(action)
+
+    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         self.sim.check_tensor("action", action, self.scene.nu)
-        if self.device.type == "cpu" and bool(torch.isnan(action.detach()).any()):
+        if self.device.type == "cpu" and bool(torch.isnan(action).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
             raise ActionError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
@@ -194,7 +203,7 @@ class DiffEnv(VectorEnv):
         if self.task.num_memory:
             noise = self._uniform(self.num_envs, self.task.num_noise)
             self.memory = self.task.remember(self.memory, action, noise)
-        self._obs = obs = self.observe(self.qpos, self.qvel, action)
+        self._obs = obs = self._observe(self.qpos, self.qvel, action)
         reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)
         with torch.no_grad():
             self.episode_step += 1
@@ -204,14 +213,15 @@ class DiffEnv(VectorEnv):
             done = terminated | truncated
             length = self.episode_step.clone()
             episode = {"r": self._episode_return.clone(), "l": length, "t": length * self.control_dt}
-            sums = done, done * self._episode_return, done * length, nonfinite
-            for total, value in zip(self._statistics.values(), sums, strict=True):
-                total += value
+            self._statistics["episodes"] += done
+            self._statistics["return"].addcmul_(done, self._episode_return)
+            self._statistics["length"].addcmul_(done, length)
+            self._statistics["nonfinite"] += nonfinite
         self._show()
         info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
         return obs, reward, terminated, truncated, info
 
-    def _begin(self, mask: Tensor, starts: Iterable[Tensor]) -> None:
+    def _begin(self, mask: Tensor, starts: State) -> None:
         """Start new episodes in the environments of a mask (N,); gradients of the others stay as they are."""
         row = mask.unsqueeze(1)
         self._put(torch.where(row, start, now) for start, now in zip(starts, self._state(), strict=True))
@@ -242,30 +252,31 @@ class DiffEnv(VectorEnv):
         if self._screen is not None:
             self._screen.close()
 
+    @in_plain_mode
     def detach(self) -> Tensor:
         """Cut the graph at the current state, start a new window there, and return its observation (N, obs_dim)."""
         self._cut()
         self._starts, self._time = self._draw(self.horizon), 0
-        return self._obs
+        return self._obs.clone()
 
     def _cut(self) -> None:
         self._put(part.detach() for part in self._state())
         self._recorded = 0
         self.sim.rewind()
 
-    def pin(self) -> tuple[Tensor, ...]:
+    def pin(self) -> State:
         """Copy the state into fixed buffers, from which a CUDA graph replays the window; see graph.py."""
         self._put(part.detach().clone() for part in self._state())
         return self._state()
 
-    def carry_over(self, start: tuple[Tensor, ...]) -> None:
+    def carry_over(self, start: State) -> None:
         """End a captured window: write the state back to where it started, as returned by `pin`."""
         with torch.no_grad():
             for to, value in zip(start, self._state(), strict=True):
                 to.copy_(value)
         self._put(start)
 
-    def _state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _state(self) -> State:
         return self.qpos, self.qvel, self._obs, self.memory
 
     def _put(self, state: Iterable[Tensor]) -> None:
@@ -287,6 +298,7 @@ class DiffEnv(VectorEnv):
             sums["sim/residual"] = self.sim.residual.mean()
         return sums
 
+    @in_plain_mode
     def set_state(self, qpos: Tensor, qvel: Tensor) -> Tensor:
         """Put all environments into given states, keeping their episode clocks; returns the observation (N, obs_dim).
 
@@ -299,12 +311,16 @@ class DiffEnv(VectorEnv):
             self.sim.check_tensor(name, value, width)
             if not bool(torch.isfinite(value.detach()).all()):
                 raise ValueError(f"{name} holds numbers that are not finite")
-        self.qpos, self.qvel = qpos, qvel
-        self._obs = self.observe(qpos, qvel, self._no_action)
-        return self._obs
+        self.qpos, self.qvel = qpos.clone(), qvel.clone()
+        self._obs = self._observe(self.qpos, self.qvel, self._no_action)
+        return self._obs.clone()
 
+    @in_plain_mode
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         """What the task observes (N, obs_dim) of states, with its memory."""
+        return self._observe(qpos, qvel, action)
+
+    def _observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         if self._elevation is not None:
             qpos = self._elevation.lower(qpos)
         return self.task.observe_with(qpos, qvel, action, self.memory)
@@ -316,6 +332,7 @@ class DiffEnv(VectorEnv):
         tensors = {name: part.detach().clone() for name, part in parts if name != "memory" or self.task.num_memory}
         return {"task": self.task.name, **tensors, "generator": self.generator.get_state()}
 
+    @in_plain_mode
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a state_dict of the same task, size and dtype (else ValueError); call `detach` next."""
         own = self.state_dict()
@@ -328,21 +345,22 @@ class DiffEnv(VectorEnv):
             if isinstance(value, Tensor) and value.shape != state[name].shape:
                 raise ValueError(f"the state's {name} has shape {tuple(state[name].shape)}, not {tuple(value.shape)}")
         state = {"memory": self.memory} | state
-        self._put(state[name].to(self.device) for name in ("qpos", "qvel", "obs", "memory"))
+        self._put(state[name].to(self.device, copy=True) for name in ("qpos", "qvel", "obs", "memory"))
         self.episode_step.copy_(state["episode_step"])
         self._episode_return.copy_(state["episode_return"])
         self.generator.set_state(state["generator"].cpu())
         self._time = self.horizon
 
     @torch.no_grad()
-    def _draw(self, steps: int) -> tuple[Tensor, ...]:
-        """Start states (steps, N, each) of all environments, so many each: qpos, qvel, obs and memory."""
+    def _draw(self, steps: int) -> list[State]:
+        """Start states of all environments, so many each."""
         rand = self._uniform(steps, self.num_envs, self.task.num_random)
         if not self.stochastic_init:
             rand.fill_(0.5)
         (qpos, qvel), memory = self.task.reset(rand), self.task.begin(rand)
         obs = self.task.observe_with(qpos, qvel, self._no_action.expand(steps, -1, -1), memory)
-        return qpos if self._elevation is None else self._elevation.lift(qpos), qvel, obs, memory
+        qpos = qpos if self._elevation is None else self._elevation.lift(qpos)
+        return [*zip(*(part.unbind() for part in (qpos, qvel, obs, memory)), strict=True)]
 
     def _uniform(self, *size: int) -> Tensor:
         return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)

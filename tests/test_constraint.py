@@ -86,8 +86,8 @@ def tree_states(base, seed, count, rng):
     return raise_ground(scene, qpos), (qpos, qvel, ctrl)
 
 
-def in_mujoco(scene, qpos, qvel, ctrl, steps=1, substeps=1):
-    """qpos, qvel after control steps of MuJoCo's Euler with elliptic cones, and the set of its constraints' states."""
+def mujoco_model(scene):
+    """The robot's model for MuJoCo's Euler with elliptic cones and a solver that converges."""
     m = copy.copy(scene.mj_model)
     m.opt.cone, m.opt.timestep = mujoco.mjtCone.mjCONE_ELLIPTIC, H
     m.opt.iterations, m.opt.tolerance, m.opt.ls_iterations, m.opt.ls_tolerance = 200, 0, 100, 1e-10
@@ -95,6 +95,12 @@ def in_mujoco(scene, qpos, qvel, ctrl, steps=1, substeps=1):
         m.geom_pos[ground, 2] = scene.ground_height
     m.geom_contype[:], m.geom_conaffinity[:] = 1, 0  # the robot's parts pass through each other
     m.geom_contype[ground], m.geom_conaffinity[ground] = 0, 1
+    return m
+
+
+def in_mujoco(scene, qpos, qvel, ctrl, steps=1, substeps=1):
+    """qpos, qvel after control steps of MuJoCo's, and the set of its constraints' states."""
+    m = mujoco_model(scene)
     low, high = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-1.0, 1.0]).T
     data, ends, kinds = mujoco.MjData(m), [], set()
     for q, v, u in zip(qpos, qvel, np.broadcast_to(ctrl, (steps, *np.shape(ctrl)[-2:])).swapaxes(0, 1), strict=True):
@@ -250,6 +256,31 @@ def test_tree_gradient_is_that_of_differences(base, rng):
     check_gradients(scene, states, rng)
     if base in ("floating", "planar"):
         check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (16, len(FACTORS)))})
+
+
+@pytest.mark.parametrize("name", ["hopper", "ant", pytest.param("ball", marks=SLOW)])
+def test_jacobians_are_mujocos(name, rng):
+    """Of one substep, as mjd_transitionFD has them; its actions are in the units of the control range."""
+    if name == "ball":
+        scene, states = tree_states(name, 0, 32, rng)
+    else:
+        scene = task_scene(name)
+        states = acting_states(scene, 32, rng)
+    m, (qpos, qvel, ctrl) = mujoco_model(scene), states
+    for k in scene.quaternion_adr:
+        qpos[:, k : k + 4] /= np.linalg.norm(qpos[:, k : k + 4], axis=1, keepdims=True)
+    sim = Simulator(scene, 32, Integration("mujoco", 1, passes=PASSES), H, dtype=torch.float64)
+    found = sim.jacobians(*map(torch.tensor, states))
+    converged, data, errors = np.flatnonzero(sim.residual < 1e-10), mujoco.MjData(m), []
+    low, high = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-1.0, 1.0]).T
+    for k in converged:
+        mujoco.mj_resetData(m, data)
+        data.qpos, data.qvel, data.ctrl = qpos[k], qvel[k], low + (ctrl[k] + 1) / 2 * (high - low)
+        expected = np.zeros((2 * m.nv, 2 * m.nv)), np.zeros((2 * m.nv, m.nu))
+        mujoco.mjd_transitionFD(m, data, 1e-7, True, *expected, None, None)
+        pairs = zip(found, (expected[0], expected[1] * (high - low) / 2), strict=True)
+        errors.append([np.linalg.norm(ours[k].numpy() - theirs) / np.linalg.norm(theirs) for ours, theirs in pairs])
+    assert len(converged) >= 30 and np.quantile(errors, 0.9, axis=0).max() < 1e-6
 
 
 def test_few_passes_have_a_gradient_of_usual_size(rng):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import multiprocessing
 import pickle
 
 import gymnasium
@@ -11,6 +13,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 from scenes import task_scene
+from torch.autograd import forward_ad
 
 import diffsim
 from diffsim.sim.integration import INTEGRATORS, Integration
@@ -217,6 +220,25 @@ def test_threads_do_not_change_a_bit(name):
             assert_same(value, expected)
 
 
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+def test_a_forked_child_has_threads_of_its_own():
+    env, actions = diffsim.make("hopper", num_envs=40, seed=1, threads=2), torch.zeros(40, 3)
+    with torch.no_grad():
+        env.step(actions)
+        saved, expected = env.state_dict(), env.step(actions)[0]
+
+        def step():
+            env.load_state_dict(saved)
+            assert_same(env.step(actions)[0], expected)
+
+        child = multiprocessing.get_context("fork").Process(target=step)
+        child.start()
+        child.join(60)
+    hangs = child.is_alive()
+    child.kill()
+    assert not hangs and child.exitcode == 0
+
+
 def test_no_grad_takes_the_same_steps():
     for name in ("hopper", "ant"):
         envs = [diffsim.make(name, num_envs=3, seed=1, horizon=16) for _ in range(2)]
@@ -273,6 +295,70 @@ def test_set_state():
     assert all((g != 0).any() for g in torch.autograd.grad(reward.sum(), [qpos, qvel]))
 
 
+def test_what_a_caller_has_is_his_own():
+    """In-place changes of observations, and of tensors that were set or loaded, do not reach the environment."""
+    env = diffsim.make("hopper", num_envs=3, seed=0)
+    given, state = [x.clone() for x in (env.qpos, env.qvel)], env.state_dict()
+    calls = {
+        "reset": lambda: env.reset(seed=1)[0],
+        "reset of some": lambda: env.reset(options={"reset_mask": torch.tensor([True, False, False])})[0],
+        "step": lambda: env.step(torch.zeros(3, 3))[0],
+        "detach": env.detach,
+        "set_state": lambda: env.set_state(*given),
+        "load_state_dict": lambda: env.load_state_dict(state) or state["obs"],
+    }
+    for name, call in calls.items():
+        obs = call()
+        before = env.state_dict()
+        for tensor in (
+            obs,
+            *given,
+            *(x for x in state.values() if isinstance(x, torch.Tensor) and x.is_floating_point()),
+        ):
+            tensor.sub_(1)
+        for key, value in env.state_dict().items():
+            assert key == "task" or torch.equal(value, before[key]), (name, key)
+        assert torch.equal(env.detach(), before["obs"]), name
+
+
+@contextlib.contextmanager
+def default_dtype(dtype):
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_torchs_modes_and_defaults_do_not_matter(name, monkeypatch):
+    """Of dtype, device, autocast and inference_mode, in which an environment is made, reset and stepped."""
+    if name not in ("hopper", "go1", "humanoid_imitation"):  # the kernels are the same
+        monkeypatch.setattr(diffsim.Simulator, "advance", lambda _, qpos, qvel, ctrl: (qpos, qvel + 0.01 * ctrl.sum()))
+
+    def run():
+        env = diffsim.make(name, num_envs=2, seed=0, horizon=2)
+        start = env.reset(seed=1)[0]
+        action = torch.full((2, env.scene.nu), 0.3, dtype=torch.float32, device="cpu", requires_grad=True)
+        obs, reward, *_ = env.step(action)
+        return env, (start, obs, reward), action
+
+    env, expected, action = run()
+    (expected_grad,) = torch.autograd.grad(expected[2].sum(), action)
+    modes = default_dtype(torch.bfloat16), torch.device("meta"), torch.autocast("cpu", torch.bfloat16)
+    for mode in (*modes, torch.inference_mode()):
+        with mode:
+            env, found, leaf = run()
+        for value, wanted in zip(found, expected, strict=True):
+            assert_same(value, wanted)
+        if found[2].requires_grad:
+            found[2].sum().backward()
+            assert_same(leaf.grad, expected_grad)
+        env.detach()
+        env.step(action)[1].sum().backward()  # it can be trained from
+
+
 def test_state_dict_continues_exactly():
     env = diffsim.make("hopper", num_envs=3, seed=1, horizon=40)
     actions = random_actions(env, 120)
@@ -319,13 +405,41 @@ def test_a_state_of_another_kind_is_refused(arguments, theirs):
     assert_same(env.qpos, qpos)
 
 
+def along(function, x, tangent):
+    """The derivative by forward mode, without torch.func."""
+    with forward_ad.dual_level():
+        return forward_ad.unpack_dual(function(forward_ad.make_dual(x, tangent))).tangent
+
+
+DERIVATIVES = {
+    "create_graph": lambda f, x: torch.autograd.grad(f(x), x, create_graph=True),
+    "is_grads_batched": lambda f, x: torch.autograd.grad(f(x).expand(2), x, torch.eye(2), is_grads_batched=True),
+    "forward mode": lambda f, x: along(f, x.detach(), torch.ones_like(x)),
+    "forward over reverse": lambda f, x: along(lambda x: torch.autograd.grad(f(x.requires_grad_()), x)[0], x, x + 1),
+    "a dual loss": lambda f, x: along(lambda w: torch.autograd.grad(f(x) * w, x)[0], torch.ones(()), torch.ones(())),
+    "jvp": lambda f, x: torch.func.jvp(f, (x.detach(),), (torch.ones_like(x),)),
+    "vmap": lambda f, x: torch.func.vmap(f)(x.detach().expand(3, *x.shape)),
+    **{name: (lambda f, x, name=name: getattr(torch.func, name)(f)(x)) for name in ("grad", "jacrev", "jacfwd")},
+}
+
+
+@pytest.mark.parametrize("kind", DERIVATIVES)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_second_derivatives_are_refused(integrator):
-    env = diffsim.make("hopper", num_envs=2, integrator=integrator)
-    action = torch.zeros(2, 3, requires_grad=True)
-    reward = env.step(action)[1].sum()
-    with pytest.raises(RuntimeError, match="first derivative only, so no create_graph=True"):
-        torch.autograd.grad(reward, action, create_graph=True)
+def test_other_derivatives_than_backward_are_refused(kind, integrator):
+    """By the simulator and by the environment, in words that say what to take; and nothing has changed."""
+    env = diffsim.make("hopper", num_envs=2, integrator=integrator, horizon=2)
+    qpos, action = env.qpos, torch.zeros(2, 3)
+    message = (
+        "first derivative only, so no create_graph" if kind == "create_graph" else "by backward.*Simulator.jacobians"
+    )
+    for step in (lambda a: env.step(a)[1].sum(), lambda a: env.sim.step(qpos, env.qvel.detach(), a)[1].sum()):
+        env.sim.step(qpos, env.qvel.detach(), action)  # a first one prepares its kernels
+        env.detach()
+        with pytest.raises(RuntimeError, match=message) as error:
+            DERIVATIVES[kind](step, action.clone().requires_grad_())
+        assert "\n" not in str(error.value)
+    if kind not in ("create_graph", "is_grads_batched", "a dual loss"):
+        assert_same(env.qpos, qpos)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])

@@ -15,7 +15,7 @@ from diffsim.sim.options import check_device
 from diffsim.sim.simulator import Simulator
 
 REAL = torch.float64  # a dynamic program multiplies hundreds of Jacobians
-BATCH = 8192  # environments of one backward pass: bounds the memory of its checkpoints
+BATCH = 8192  # steps whose Jacobians are computed at once: bounds the memory of their checkpoints
 
 
 class Dynamics:
@@ -47,15 +47,7 @@ class Dynamics:
         self._integration = integration
         self._simulators: dict[int, Simulator] = {}
         self.steps = 0
-        self.simulator(1)
-        model = scene.mj_model
-        # mjtJoint: 0 is a free joint, whose quaternion follows three coordinates, 1 a ball joint
-        offsets = [(j, 3 * (model.jnt_type[j] == 0)) for j in range(model.njnt) if model.jnt_type[j] <= 1]
-        self.quaternions = [(int(model.jnt_qposadr[j] + k), int(model.jnt_dofadr[j] + k)) for j, k in offsets]
-        rows = [i for i in range(self.nx) if not any(q <= i < q + 4 for q, _ in self.quaternions)]
-        columns = [i for i in range(self.nd) if not any(d <= i < d + 3 for _, d in self.quaternions)]
-        self._flat = torch.zeros(self.nx, self.nd, dtype=REAL, device=self.device)
-        self._flat[rows, columns] = 1.0
+        self.tangent = self.simulator(1).tangent
 
     def simulator(self, num_envs: int) -> Simulator:
         if num_envs not in self._simulators:
@@ -68,39 +60,21 @@ class Dynamics:
         """The scene of so many trajectories."""
         return self.scene
 
-    def basis(self, x: Tensor) -> Tensor:
-        """(..., nx, nd) derivative of `retract` at zero."""
-        basis = self._flat.expand(*x.shape[:-1], self.nx, self.nd)
-        if self.quaternions:
-            basis = basis.clone()
-        for q, d in self.quaternions:
-            w, i, j, k = (0.5 * x[..., q : q + 4]).unbind(-1)
-            columns = ((-i, w, k, -j), (-j, -k, w, i), (-k, j, -i, w))  # q times each unit vector
-            basis[..., q : q + 4, d : d + 3] = torch.stack([torch.stack(column, -1) for column in columns], -1)
-        return basis
-
-    def left_inverse(self, x: Tensor) -> Tensor:
-        """(..., nd, nx) derivative of `difference` from x at x itself."""
-        inverse = self.basis(x).mT
-        for _, d in self.quaternions:
-            inverse[..., d : d + 3, :] *= 4.0
-        return inverse
-
     def retract(self, x: Tensor, tangent: Tensor) -> Tensor:
         """x moved by a tangent vector (..., nd)."""
-        moved = x + (self.basis(x) @ tangent.unsqueeze(-1)).squeeze(-1)
+        moved = x + (self.tangent.basis(x) @ tangent.unsqueeze(-1)).squeeze(-1)
         parts, start = [], 0
-        for q, _ in self.quaternions:
+        for q, _ in self.tangent.quaternions:
             parts += [moved[..., start:q], F.normalize(moved[..., q : q + 4], dim=-1)]
             start = q + 4
         return torch.cat([*parts, moved[..., start:]], dim=-1)
 
     def difference(self, x: Tensor, origin: Tensor) -> Tensor:
         """The tangent vector (..., nd) that moves origin to x."""
-        if not self.quaternions:
+        if not self.tangent.quaternions:
             return x - origin
-        tangent = (self.left_inverse(origin) @ (x - origin).unsqueeze(-1)).squeeze(-1)
-        for q, d in self.quaternions:
+        tangent = (self.tangent.left_inverse(origin) @ (x - origin).unsqueeze(-1)).squeeze(-1)
+        for q, d in self.tangent.quaternions:
             w = (x[..., q : q + 4] * origin[..., q : q + 4]).sum(-1, keepdim=True)
             tangent[..., d : d + 3] /= torch.where(w < 0, w.clamp(max=-1e-6), w.clamp(min=1e-6))
         return tangent
@@ -129,25 +103,15 @@ class Dynamics:
         self.steps += len(x) * steps
         return torch.stack(states, 1), torch.stack(actions, 1), torch.stack(alive, 1)
 
-    def jacobians(self, x: Tensor, u: Tensor, following: Tensor) -> Tensor:
-        """(n, nd, nd + nu) d following / d (x, u) of steps from x (n, nx) with u (n, nu), in tangent coordinates.
-
-        A backward pass gives one row. Environments are independent: n x nd copies give all rows of all steps at once.
-        """
-        n, nd, nq = len(x), self.nd, self.nq
-        cotangents, result = self.left_inverse(following), x.new_empty(n, nd, nd + self.nu)
-        count = min(n, max(1, BATCH // nd))
-        sim = self.simulator(count * nd)
-        for start in range(0, n, count):
-            first = min(start, n - count)  # the last batch may overlap
-            rows = slice(first, first + count)
-            parts = x[rows, :nq], x[rows, nq:], torch.tanh(u[rows])
-            leaves = [part.repeat_interleave(nd, 0).requires_grad_() for part in parts]
-            g = cotangents[rows].reshape(-1, self.nx)
-            with torch.enable_grad():
-                outputs = sim.step(*leaves)
-            g_qpos, g_qvel, g_ctrl = torch.autograd.grad(outputs, leaves, (g[:, :nq], g[:, nq:]))
-            result[rows, :, :nd] = torch.cat((g_qpos, g_qvel), -1).view(count, nd, -1) @ self.basis(x[rows])
-            result[rows, :, nd:] = g_ctrl.view(count, nd, -1) * (1.0 - parts[2].square()).unsqueeze(1)
-            self.steps += count * nd
-        return result
+    def jacobians(self, x: Tensor, u: Tensor) -> Tensor:
+        """(n, nd, nd + nu) d x' / d (x, u) of steps from x (n, nx) with u (n, nu), in tangent coordinates."""
+        count, parts = min(len(x), BATCH), []
+        sim = self.simulator(count)
+        for start in range(0, len(x), count):
+            first = min(start, len(x) - count)  # the last batch may overlap
+            qpos, qvel = (part.contiguous() for part in x[first : first + count].split((self.nq, self.nv), 1))
+            ctrl = u[first : first + count].tanh()
+            A, B = sim.jacobians(qpos, qvel, ctrl)
+            parts.append(torch.cat((A, B * (1.0 - ctrl.square()).unsqueeze(1)), -1)[start - first :])
+            self.steps += count * self.nd  # each row is a backward pass
+        return torch.cat(parts)

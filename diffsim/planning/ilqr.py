@@ -101,8 +101,8 @@ def follow(system: Dynamics, x: Tensor, u: Tensor, gains: Gains, alphas: Tensor)
 
 def step_jacobian(system: Dynamics, x: Tensor, u: Tensor) -> Tensor:
     """f_z (R, T, 2nv, 2nv + nu) of trajectories x (R, T + 1, nx), u (R, T, nu)."""
-    flat = [tensor.flatten(0, 1) for tensor in (x[:, :-1], u, x[:, 1:])]
-    return system.jacobians(*flat).view(*u.shape[:2], system.nd, -1)
+    f_z = system.jacobians(x[:, :-1].flatten(0, 1), u.flatten(0, 1))
+    return f_z.view(*u.shape[:2], system.nd, -1)
 
 
 def line_search(

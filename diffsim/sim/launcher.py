@@ -77,7 +77,8 @@ class Launcher:
         count = min(wanted, self.num_blocks)
         bounds = [self.num_blocks * k // count for k in range(count + 1)]
         self._shares = list(zip(bounds, bounds[1:], strict=False))  # blocks of each thread: first, end
-        self._pool = ThreadPoolExecutor(count - 1) if count > 1 else None
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0  # whose threads these are: a forked child has none of its parent's
 
     def command(self, kernel: str, inputs: list[Any]) -> list[wp.Launch]:
         """The launches of all shares with their arguments packed once: packing costs more than a small kernel."""
@@ -110,6 +111,8 @@ class Launcher:
                 command[0].launch()
             return
         # Warp runs a CPU kernel on the calling thread and releases the interpreter lock meanwhile.
+        if len(command) > 1 and self._process != os.getpid():
+            self._pool, self._process = ThreadPoolExecutor(len(command) - 1), os.getpid()
         pending = [self._pool.submit(share.launch) for share in command[1:]] if self._pool else []
         command[0].launch()
         for future in pending:

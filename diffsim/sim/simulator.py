@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NoReturn
 
 import torch
 import torch.nn.functional as F
 import warp as wp
+from torch.autograd.forward_ad import unpack_dual
 
 from diffsim.robot.constraint import check_soft, constrained
 from diffsim.robot.scene import FACTORS, Scene
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import Launcher, check_memory
+from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options
+from diffsim.sim.tangent import Tangent
 
 DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # with the integrator mujoco
+BACKWARD_ALONE = (
+    "a simulated step has derivatives by backward() and torch.autograd.grad alone, for one gradient at a time: no "
+    "torch.func, forward mode or is_grads_batched; Simulator.jacobians has the Jacobians of a batch"
+)
 State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 
 
@@ -52,6 +60,7 @@ class Simulator:
         nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
     """
 
+    @in_plain_mode
     def __init__(
         self,
         scene: Scene,
@@ -105,6 +114,11 @@ class Simulator:
 
     def _zeros(self, *size: int, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.zeros(size, dtype=dtype or self.dtype, device=self.device)
+
+    @functools.cached_property
+    def tangent(self) -> Tangent:
+        """Of differences between its scene's states."""
+        return Tangent(self.scene, self.device, self.dtype)
 
     @property
     def nonfinite(self) -> torch.Tensor:
@@ -185,6 +199,23 @@ class Simulator:
         bad = self.nonfinite.unsqueeze(1)
         return torch.where(bad, start[0].detach(), qpos), torch.where(bad, start[1].detach(), qvel)
 
+    def jacobians(
+        self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """A (N, 2 nv, 2 nv) and B (N, 2 nv, nu) of one control step: dx' = A dx + B dctrl, by 2 nv backward passes.
+
+        x is qpos, then qvel, and differences of qpos are those of MuJoCo's mjd_transitionFD: a free joint's rotation,
+        and a ball joint's, changes by a rotation vector in the body's frame. Factors and forces are those of a step.
+        The arguments are a step's, and so is the checkpoint that it takes; nonfinite environments have zeros.
+        """
+        leaves = [part.detach().requires_grad_() for part in (qpos, qvel, ctrl)]
+        with torch.enable_grad():
+            end = torch.cat(self.step(*leaves), dim=1)
+        cotangents = self.tangent.left_inverse(end.detach()).unbind(1)
+        rows = [torch.autograd.grad(end, leaves, row, retain_graph=True) for row in cotangents]
+        g_qpos, g_qvel, B = (torch.stack(part, dim=1) for part in zip(*rows, strict=True))
+        return torch.cat((g_qpos, g_qvel), dim=2) @ self.tangent.basis(torch.cat(leaves[:2], dim=1).detach()), B
+
     def rewind(self) -> None:
         """Let the next differentiable step use the first checkpoint: the start of a new window."""
         self._slot = 0
@@ -227,6 +258,7 @@ class Simulator:
         """Raise ValueError unless value is a (num_envs, *size) tensor of the simulator's dtype on its device."""
         if not isinstance(value, torch.Tensor):
             raise ValueError(f"{name} is a {type(value).__name__}, must be a torch.Tensor")
+        refuse_transforms(value)
         wanted, bodies = (self.num_envs, *size), "bodies, " * (len(size) - 1)
         if tuple(value.shape) != wanted:
             raise ValueError(
@@ -260,6 +292,12 @@ class Simulator:
         raise ValueError(f"the {what} is {number} in environment {env}; {name} must be finite{rest}")
 
 
+def refuse_transforms(value: torch.Tensor) -> None:
+    """Raise RuntimeError under a transform of torch.func, and for a tangent of forward mode: no kernel sees either."""
+    if torch._C._are_functorch_transforms_active() or unpack_dual(value).tangent is not None:
+        raise RuntimeError(BACKWARD_ALONE)
+
+
 class ControlStep(torch.autograd.Function):
     """qpos, qvel, ctrl, factors, forces -> qpos and qvel side by side. The simulator's slot keeps them for backward."""
 
@@ -270,6 +308,7 @@ class ControlStep(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g_end: torch.Tensor) -> tuple[Any, ...]:
+        refuse_transforms(g_end)
         if torch.is_grad_enabled():  # create_graph=True; without this, second derivatives would lack their larger part
             raise RuntimeError(
                 "a simulated step has a first derivative only, so no create_graph=True: take finite differences of it"
@@ -280,6 +319,9 @@ class ControlStep(torch.autograd.Function):
                 f"backward through a control step whose checkpoint was overwritten: at most {sim.horizon} "
                 "differentiable steps can be alive; build the simulator with a larger horizon"
             )
-        sim._g_end.copy_(g_end)
+        try:
+            sim._g_end.copy_(g_end)
+        except RuntimeError as error:  # is_grads_batched
+            raise RuntimeError(BACKWARD_ALONE) from error
         sim._launcher.launch(sim._command("backward", ctx.slot))
         return (None, None, *sim._g_start.clone().split(sim._widths, dim=1))

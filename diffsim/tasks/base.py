@@ -98,8 +98,8 @@ class Task:
             self._nq, self._quaternions = scene.nq, scene.quaternion_adr.tolist()
             if not len(self._start):
                 key = max(mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
-                home = torch.tensor(m.key_qpos[key] if m.nkey else scene.qpos0)
-                self._start = torch.cat((home.to(self._start), self._start.new_zeros(scene.nv)))
+                home = self._start.new_tensor(m.key_qpos[key] if m.nkey else scene.qpos0)
+                self._start = torch.cat((home, self._start.new_zeros(scene.nv)))
             sizes = {"num_random": self.num_random, "the length of start": len(self._start)}
             for name, size in (sizes | {"the length of spread": len(self._spread) if self._spread.ndim else n}).items():
                 self._check(name, size, n, "nq + nv")

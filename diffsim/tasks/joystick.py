@@ -132,19 +132,18 @@ class Joystick(Task):
         def tensor(values: object) -> Tensor:
             return torch.tensor(values, device=device, dtype=dtype)
 
-        fold, stride, phase = torch.zeros(n), torch.zeros(n, 3), torch.zeros(n)
+        fold, phase, stride = tensor([0.0] * n), tensor([0.0] * n), tensor([[0.0] * 3] * n)
         reach = 1.0 / (4.0 * robot.cycle * robot.length)  # rad per m/s: a stance is half a cycle
         for leg in robot.legs:
             x, y = leg.place
             pitch, roll = map(robot.joints.index, leg.joints)
-            stride[pitch] = reach * torch.tensor((1.0, 0.0, -y))
-            stride[roll] = -reach * torch.tensor((0.0, 1.0, x))
+            stride[pitch] = reach * tensor((1.0, 0.0, -y))
+            stride[roll] = -reach * tensor((0.0, 1.0, x))
             for name, angle in leg.folds.items():
                 fold[robot.joints.index(name)] = angle
             for joint in {pitch, roll, *map(robot.joints.index, leg.folds)}:
                 phase[joint] = leg.phase
-        self._fold, self._phase = fold.to(device, dtype), phase.to(device, dtype)
-        self._stride = stride.mT.contiguous().to(device, dtype)
+        self._fold, self._phase, self._stride = fold, phase, stride.mT.contiguous()
         self._home, self._most = tensor(robot.home), tensor(robot.command)
         scales = (VELOCITY_NOISE,) * 3 + (GYRO_NOISE,) * 3 + (GRAVITY_NOISE,) * 3
         self._noise = tensor(scales + (JOINT_NOISE,) * n + (0.1 * RATE_NOISE,) * n)

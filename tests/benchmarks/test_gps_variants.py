@@ -162,7 +162,7 @@ def test_several_terrains_at_once() -> None:
         one = Ground(hopper(), profiles[i % 3]).rollout(start[i : i + 1], 30, act)
         assert torch.equal(one[0][0], x[i]) and torch.equal(one[1][0], u[i])
     with pytest.raises(ValueError, match="Jacobians need one terrain"):
-        together.jacobians(x[:, 0], u[:, 0], x[:, 1])
+        together.jacobians(x[:, 0], u[:, 0])
 
 
 def test_the_place_does_not_count_for_feedback_by_similarity(rng: np.random.Generator) -> None:

@@ -50,7 +50,7 @@ class Linear:
         x, u, _ = self.rollout(x, steps, lambda t, state: state.new_zeros(len(state), self.nu))
         return x, u
 
-    def jacobians(self, x: Tensor, u: Tensor, following: Tensor) -> Tensor:
+    def jacobians(self, x: Tensor, u: Tensor) -> Tensor:
         return torch.cat((self.A, self.B), 1).expand(len(x), -1, -1)
 
     def dense(self, steps: int, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,7 +94,7 @@ def jacobian_errors(system: System, x: Tensor, u: Tensor, eps: float = 1e-6) -> 
 
     d = eps * torch.eye(nz, dtype=torch.float64).repeat(n, 1)
     differences = ((step(d) - step(-d)) / (2 * eps)).view(n, nz, system.nd).mT
-    error = torch.linalg.matrix_norm(system.jacobians(x, u, following) - differences)
+    error = torch.linalg.matrix_norm(system.jacobians(x, u) - differences)
     return error / torch.linalg.matrix_norm(differences)
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from systems import jacobian_errors, normal, one_step, random_states, task_system
+from systems import jacobian_errors, normal, random_states, task_system
 
 from diffsim.planning import dynamics
 
@@ -19,9 +19,8 @@ def test_jacobians_are_those_of_differences(name: str, rng: np.random.Generator)
     system = task_system(name)
     x, u = random_states(system, rng)
     assert jacobian_errors(system, x, u).max() < 1e-5
-    following = one_step(system, x, u)
-    alone = system.jacobians(x[2:3], u[2:3], following[2:3])
-    together = system.jacobians(x, u, following)
+    alone = system.jacobians(x[2:3], u[2:3])
+    together = system.jacobians(x, u)
     assert torch.equal(alone[0], together[2])  # environments do not know each other
     assert (together.abs().amax(0) > 0).any(0).all()  # no column that never reached the simulator
 
@@ -29,10 +28,9 @@ def test_jacobians_are_those_of_differences(name: str, rng: np.random.Generator)
 def test_jacobians_in_several_batches(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     system = task_system("hopper")
     x, u = random_states(system, rng)
-    following = one_step(system, x, u)
-    expected = system.jacobians(x, u, following)
-    monkeypatch.setattr(dynamics, "BATCH", 4 * system.nd)  # six states: four, and four with an overlap of two
-    assert torch.equal(system.jacobians(x, u, following), expected)
+    expected = system.jacobians(x, u)
+    monkeypatch.setattr(dynamics, "BATCH", 4)  # six states: four, and four with an overlap of two
+    assert torch.equal(system.jacobians(x, u), expected)
 
 
 def test_tangents_of_a_free_joint(rng: np.random.Generator) -> None:
@@ -56,12 +54,11 @@ def test_tangents_of_a_free_joint(rng: np.random.Generator) -> None:
 def test_jacobians_do_not_know_a_quaternions_length(rng: np.random.Generator) -> None:
     system = task_system("ant")
     x, u = random_states(system, rng)
-    following = one_step(system, x, u)
-    expected = system.jacobians(x, u, following)
+    expected = system.jacobians(x, u)
     longer = x.clone()
     longer[:, 3:7] *= 1 + 1e-4
     atol = 1e-8 * expected.abs().max().item()
-    torch.testing.assert_close(system.jacobians(longer, u, following), expected, rtol=1e-8, atol=atol)
+    torch.testing.assert_close(system.jacobians(longer, u), expected, rtol=1e-8, atol=atol)
 
 
 def test_a_trajectory_that_blows_up_stays_where_it_was() -> None:

@@ -106,7 +106,7 @@ def read_clip(source: str | Path) -> Clip:
         path = shipped()[str(source)]
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            qpos, loop = torch.tensor(arrays["qpos"].astype(np.float64)), bool(arrays.get("loop", True))
+            qpos, loop = torch.from_numpy(arrays["qpos"].astype(np.float64)), bool(arrays.get("loop", True))
             dt = float(arrays["dt"]) if "dt" in arrays else 1.0 / float(arrays["fps"])
         frames, norm = (len(qpos) - 1) * dt / CONTROL_DT, qpos[:, 3:7].norm(dim=1, keepdim=True)
         if not (qpos.isfinite().all() and norm.min() >= 0.5 and SHORTEST - 1.5 <= frames <= LONGEST):
@@ -126,7 +126,7 @@ def read_clip(source: str | Path) -> Clip:
 
 def _resample(qpos: Tensor, frames: int) -> Tensor:
     """(frames, nq) at equal times from the first to the last of qpos (T, nq)."""
-    time = torch.linspace(0.0, len(qpos) - 1.0, frames, dtype=qpos.dtype)
+    time = torch.linspace(0.0, len(qpos) - 1.0, frames, dtype=qpos.dtype, device=qpos.device)
     k = time.long().clamp(max=len(qpos) - 2)
     a, b, s = qpos[k], qpos[k + 1], (time - k).unsqueeze(1)
     turn = s * difference(a[:, 3:7], b[:, 3:7])
