@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
@@ -98,21 +99,12 @@ def refusal(call: Callable[[], object], capsys: pytest.CaptureFixture[str]) -> s
 
 
 def assert_refuses(
-    script: ModuleType,
-    arguments: str,
-    message: str,
-    trained: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    script: ModuleType, arguments: str, message: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Arguments, with {places} to fill in, give one line that holds the message, exit code 2, and no file."""
-    places = {name: tmp_path / name for name in ("file", "truncated", "foreign", "older", "other", "elsewhere")}
-    places["trained"] = trained
+    places = {name: tmp_path / name for name in ("file", "other", "elsewhere")} | {"trained": trained}
     checkpoint = torch.load(trained / "checkpoint.pt", weights_only=True)
     places["file"].write_text("hello")
-    places["truncated"].write_bytes((trained / "checkpoint.pt").read_bytes()[:5000])
-    torch.save({"weights": torch.zeros(3)}, places["foreign"])
-    torch.save(checkpoint | {"format": f"{script.__name__}-1"}, places["older"])
     torch.save(checkpoint | {"script": "other"}, places["other"])
     torch.save(checkpoint | {"args": checkpoint["args"] | {"device": "cuda:0"}}, places["elsewhere"])
     before = sorted(tmp_path.rglob("*"))
@@ -120,6 +112,5 @@ def assert_refuses(
     if not {"--run-dir", "--resume", "--evaluate"} & set(argv):
         argv += ["--run-dir", str(tmp_path / "run")]
     error = refusal(lambda: script.main(argv), capsys)
-    assert error.startswith(f"{script.__name__}.py: ")
-    assert message.format(**places, name=script.__name__) in error
+    assert error.startswith(f"{Path(sys.argv[0]).name}: ") and message.format(**places) in error
     assert sorted(tmp_path.rglob("*")) == before

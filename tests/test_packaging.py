@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import shutil
@@ -90,3 +91,13 @@ def test_every_part_can_be_imported_by_its_name() -> None:
     assert scene.Scene is diffsim.Scene and diffsim.robot.scene is scene
     for part in ("kernels", "planning", "robot", "sim", "tasks", "training", "view"):
         assert importlib.import_module(f"diffsim.{part}") is getattr(diffsim, part)
+
+
+def test_no_script_imports_another() -> None:
+    scripts = {path.stem: ast.walk(ast.parse(path.read_text())) for path in ROOT.glob("*.py")}
+    assert {*LEARNERS, "view"} == scripts.keys()
+    for name, nodes in scripts.items():
+        for node in nodes:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not scripts.keys() & {part.partition(".")[0] for part in names}, name

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 import diffsim
+import shac
 from diffsim.training import Evaluation, evaluate, evaluation
 from diffsim.view import render
 
@@ -105,3 +106,24 @@ def test_the_video_is_of_the_median_episode(
     assert scene is result.scene and dt == 1 / 60
     np.testing.assert_array_equal(qpos[:, 0], range(7))  # seven steps of the episode of return 3
     np.testing.assert_allclose(ctrl[:, 0], np.arange(7) / 10, rtol=1e-6)
+
+
+def test_evaluate_a_checkpoint_with_other_substeps(
+    tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Returns of cartpole are costs, so the share that is kept is the inverse ratio."""
+
+    def found(folder: str, *flags: str) -> dict[str, Any]:
+        path = tmp_path / "new" / folder
+        shac.main(["--evaluate", str(tiny_run / "checkpoint.pt"), "--run-dir", str(path), *flags])
+        return json.loads((path / "evaluation.json").read_text())
+
+    own = found("own")
+    finer, out = own.pop("finer"), capsys.readouterr().out
+    assert own == json.loads((tiny_run / "evaluation.json").read_text())
+    assert finer["substeps"] == 16 and finer["kept"] == pytest.approx(own["return"] / finer["return"])
+    assert f"semi_implicit with 16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} kept" in out
+    explicit = found("explicit", *"--integrator semi_implicit --substeps 16 --no-finer".split())
+    assert explicit["return"] == finer["return"] and "finer" not in explicit
+    other = found("other", *"--substeps 16 --eval-episodes 4 --no-finer".split())["settings"]
+    assert (other["substeps"], other["eval_episodes"], other["iteration"]) == (16, 4, 2)

@@ -14,7 +14,7 @@ from typing import get_type_hints
 
 import pytest
 import torch
-from learners import SCRIPTS, refusal
+from learners import SCRIPTS, assert_refuses, refusal
 
 import bptt
 import diffsim
@@ -52,63 +52,64 @@ def save(args: flags.Flags, **further: object) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("script", "arguments", "complaint"),
+    ("script", "arguments", "allowed"),
     [
-        (shac, "--num-envs 0", "--num-envs must be from 1 to 1,000,000,000, not 0"),
-        (shac, "--num-envs -64", "--num-envs must be from 1 to 1,000,000,000, not -64"),
-        (shac, "--iterations 0", "--iterations must be from 1 to 1,000,000,000, not 0"),
-        (shac, "--horizon 0", "--horizon must be from 1 to 1,000,000,000, not 0"),
-        (shac, "--substeps 0", "--substeps must be from 1 to 1,000,000,000, not 0"),
-        (shac, "--eval-episodes 0", "--eval-episodes must be from 1 to 1,000,000,000, not 0"),
-        (shac, "--critic-iterations 0", "--critic-iterations must be from 1 to 10,000, not 0"),
-        (shac, "--critic-minibatches 0", "--critic-minibatches must be from 1 to 10,000, not 0"),
-        (ppo_baseline, "--epochs 0", "--epochs must be from 1 to 10,000, not 0"),
-        (ppo_baseline, "--minibatch-size 0", "--minibatch-size must be from 1 to 1,000,000,000, not 0"),
-        (shac, "--actor-hidden 0", "--actor-hidden must be from 1 to 16,384, not 0"),
-        (shac, "--critic-hidden 64 -1 64", "--critic-hidden must be from 1 to 16,384, not -1"),
-        (shac, "--eval-every -5", "--eval-every must be from 0 to 1,000,000,000, not -5"),
-        (shac, "--save-every -1", "--save-every must be from 0 to 1,000,000,000, not -1"),
-        (shac, "--stop-after -1", "--stop-after must be from 0 to 1,000,000,000, not -1"),
-        (shac, "--threads -1", "--threads must be from 0 to 1,000,000,000, not -1"),
-        (shac, "--actor-lr nan", "--actor-lr must be finite, not nan"),
-        (shac, "--actor-lr inf", "--actor-lr must be finite, not inf"),
-        (shac, "--actor-lr -1", "--actor-lr must be positive, not -1.0"),
-        (shac, "--critic-lr 0", "--critic-lr must be positive, not 0.0"),
-        (bptt, "--lr -1e-3", "--lr must be positive, not -0.001"),
-        (shac, "--max-grad-norm 0", "--max-grad-norm must be positive, not 0.0"),
-        (ppo_baseline, "--lr-bounds 0 1e-2", "--lr-bounds must be positive, not 0.0"),
-        (ppo_baseline, "--lr-bounds 1e-2 1e-6", "--lr-bounds 0.01 1e-06 are the wrong way round"),
-        (ppo_baseline, "--value-coef -1", "--value-coef must be at least 0, not -1.0"),
-        (ppo_baseline, "--entropy-coef nan", "--entropy-coef must be finite, not nan"),
-        (shac, "--gamma 2", "--gamma must be in [0, 1], not 2.0"),
-        (shac, "--gamma nan", "--gamma must be finite, not nan"),
-        (shac, "--td-lambda -0.1", "--td-lambda must be in [0, 1], not -0.1"),
-        (shac, "--target-alpha 1.1", "--target-alpha must be in [0, 1], not 1.1"),
-        (shac, "--theta 1.5", "--theta must be in [0, 1], not 1.5"),
-        (shac, "--betas 2 3", "--betas must be in [0, 1), not 2.0"),
-        (bptt, "--betas 0.9 1", "--betas must be in [0, 1), not 1.0"),
-        (shac, "--initial-log-std nan", "--initial-log-std must be finite, not nan"),
-        (shac, "--initial-log-std -inf", "--initial-log-std must be finite, not -inf"),
-        (shac, "--actor-lr 1e39", "--actor-lr must be finite in single precision, not 1e+39"),
-        (shac, "--seed 99999999999999999999", "--seed must be below 2^62 in size, not 99999999999999999999"),
-        (shac, "--critic-iterations 2147483648", "--critic-iterations must be from 1 to 10,000, not 2147483648"),
-        (
-            shac,
-            "--actor-hidden 4611686018427387904",
-            "--actor-hidden must be from 1 to 16,384, not 4611686018427387904",
-        ),
-        (sapo, "--actor-hidden", "--actor-hidden must be at least one number, not ()"),
-        (sapo, "--critics 2147483648", "--critics must be from 1 to 1,000, not 2147483648"),
-        (sac_baseline, "--hidden", "--hidden must be at least one number, not ()"),
-        (sac_baseline, "--target-entropy nan", "--target-entropy must be finite, not nan"),
-        (sac_baseline, "--target-entropy inf", "--target-entropy must be finite, not inf"),
+        (shac, "--num-envs 0", "from 1 to 1,000,000,000"),
+        (shac, "--threads -1", "from 0 to 1,000,000,000"),
+        (shac, "--critic-iterations 2147483648", "from 1 to 10,000"),
+        (shac, "--actor-hidden 4611686018427387904", "from 1 to 16,384"),
+        (shac, "--critic-hidden -1", "from 1 to 16,384"),
+        (sapo, "--critics 2147483648", "from 1 to 1,000"),
+        (shac, "--seed 99999999999999999999", "below 2^62 in size"),
+        (shac, "--actor-lr inf", "finite"),
+        (shac, "--gamma nan", "finite"),
+        (sac_baseline, "--target-entropy nan", "finite"),
+        (shac, "--actor-lr 1e+39", "finite in single precision"),
+        (shac, "--critic-lr 0.0", "positive"),
+        (ppo_baseline, "--value-coef -1.0", "at least 0"),
+        (shac, "--theta 1.5", "in [0, 1]"),
+        (bptt, "--betas 0.9 1.0", "in [0, 1)"),
+        (sac_baseline, "--hidden ()", "at least one number"),
+        (ppo_baseline, "--lr-bounds 0.01 1e-06", "are the wrong way round"),
     ],
 )
 def test_a_number_out_of_range_is_named_before_anything_is_written(
-    script: ModuleType, arguments: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    script: ModuleType, arguments: str, allowed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert refusal(lambda: script.main(arguments.split()), capsys) == f"script.py: {complaint}"
+    name, *values = arguments.split()
+    complaint = f"{arguments} {allowed}" if "way" in allowed else f"{name} must be {allowed}, not {values[-1]}"
+    words = [word for word in arguments.split() if word != "()"]
+    assert refusal(lambda: script.main(words), capsys) == f"script.py: {complaint}"
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant, humanoid"),
+        ("--substeps 5 --integrator extrapolated", "substeps is 5, must be even"),
+        ("--penalty mu=1 k_n", "--penalty takes pairs like k_n=1e5, not 'mu=1 k_n'"),
+        ("--penalty k_n=stiff", "--penalty takes pairs like k_n=1e5, not 'k_n=stiff'"),
+        ("--penalty kn=1e5", "unknown penalty constant 'kn'"),
+        ("--device nonsense", "nonsense"),
+        ("--device cuda", "device 'cuda' asked for, but PyTorch sees 0 CUDA GPUs here; choose cpu"),
+        ("--run-dir {file}", "cannot write to run directory {file}: Not a directory"),
+        ("--run-dir {file}/deeper", "cannot write to run directory {file}/deeper: Not a directory"),
+        ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
+        ("--resume {file}.pt", "no such checkpoint: {file}.pt"),
+        ("--evaluate {file}", "{file} is not a whole checkpoint of shac.py"),
+        ("--evaluate {other}", "{other} is a checkpoint of 'other', not of shac.py"),
+        ("--resume {elsewhere} --device cpu --iterations 9", "{elsewhere} was trained on cuda:0, which cpu cannot"),
+        ("--evaluate {trained}/checkpoint.pt --run-dir {file}", "cannot write to run directory {file}"),
+        ("--resume {trained}/checkpoint.pt", "is at iteration 2 already"),
+        ("--resume {trained}/checkpoint.pt --iterations 20 --stop-after 2", "is at iteration 2 already"),
+        ("--resume {file} --evaluate {file}", "--resume and --evaluate exclude each other"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    arguments: str, message: str, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert_refuses(shac, arguments, message, tiny_run, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(
@@ -153,13 +154,6 @@ def test_every_number_has_a_range(script: ModuleType) -> None:
             assert len(
                 [number for number, _ in ranges._ranges(hint, value) if number is not value or numbers == [value]]
             ) == len(numbers), name
-
-
-def test_penalty_is_pairs(capsys: pytest.CaptureFixture[str]) -> None:
-    assert flags.parse_penalty(("k_n=1e5", "mu=0")) == {"k_n": 1e5, "mu": 0.0}
-    for wrong in ("k_n", "k_n=", "k_n=stiff"):
-        line = refusal(lambda wrong=wrong: flags.parse_penalty(["mu=1", wrong]), capsys)
-        assert line == f"script.py: --penalty takes pairs like k_n=1e5, not 'mu=1 {wrong}'"
 
 
 # Defaults -------------------------------------------------------------------------------------------------------------
@@ -322,4 +316,5 @@ def test_help_explains_each_flag(script: ModuleType, capsys: pytest.CaptureFixtu
     for kind in script.Args.__mro__[:-1]:
         for field, explanation in itertools.pairwise(ast.parse(inspect.getsource(kind)).body[0].body):
             if isinstance(field, ast.AnnAssign) and isinstance(explanation, ast.Expr):
+                assert re.search(rf"{ranges.flag(field.target.id)}[ ,]", text)
                 assert ast.literal_eval(explanation.value).split(" (")[0][:40] in text

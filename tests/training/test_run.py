@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import runpy
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,13 +17,13 @@ from typing import Any
 
 import pytest
 import torch
-from learners import SMALL, read_progress, refusal, run
+from learners import ROOT, SMALL, assert_same, read_progress, refusal, run
 from torch import Tensor, nn
 
 import bptt
 import shac
 from diffsim.env import DiffEnv
-from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, evaluate, parse
+from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, evaluate, load_policy, parse
 from diffsim.training.directory import COLUMNS
 
 # Iterations of a few milliseconds.
@@ -301,6 +303,25 @@ def test_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert exit.value.code == 2
     assert capsys.readouterr().err == "bptt.py: MuJoCo finds no OpenGL to draw with\n"
     assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["iteration"] == 2
+
+
+def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What users do, under a name that is no identifier; the first time as a process of its own."""
+    copy = tmp_path / "my-bptt.py"
+    copy.write_text((ROOT / "bptt.py").read_text())
+    monkeypatch.chdir(tmp_path)
+    first = [*TINY, "--iterations", "3", "--stop-after", "2", "--quiet"]
+    result = subprocess.run([sys.executable, copy.name, *first], capture_output=True, text=True, check=True)
+    assert "2 iterations, 32 control steps" in result.stdout
+    (directory,) = Path("runs").glob("cartpole__my-bptt__1__*")
+    path = directory / "checkpoint.pt"
+    for arguments in (["--resume", str(path), "--quiet"], ["--evaluate", str(path)]):
+        monkeypatch.setattr(sys, "argv", [copy.name, *arguments])
+        runpy.run_path(copy.name, run_name="__main__")
+    state = torch.load(path, weights_only=True)
+    assert (state["script"], state["iteration"], len(read_progress(directory))) == (copy.stem, 3, 3)
+    assert json.loads((directory / "evaluation.json").read_text())["settings"]["script"] == copy.stem
+    assert_same(dict(load_policy(path).network.state_dict()), dict(state["policy"]["weights"]))
 
 
 # By itself ------------------------------------------------------------------------------------------------------------
