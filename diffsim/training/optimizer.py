@@ -89,8 +89,7 @@ class ClippedAdam:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Raises a ValueError where moments are missing or of another shape."""
-        own = self._state()  # an earlier version saved none before the first step
-        saved = state["adam"].get(0, {name: torch.zeros_like(value) for name, value in own.items()})
+        own, saved = self._state(), state["adam"][0]
         if {name: value.shape for name, value in saved.items()} != {name: value.shape for name, value in own.items()}:
             raise ValueError("the state of an optimizer")
         if not bool(state["skipped"].isfinite()):

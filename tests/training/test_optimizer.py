@@ -18,29 +18,6 @@ def network() -> nn.Module:
     return nn.Sequential(nn.Linear(3, 5), nn.ELU(), nn.LayerNorm(5), nn.Linear(5, 1))
 
 
-def test_it_is_adam_after_clipping_and_skips_bad_gradients() -> None:
-    torch.manual_seed(0)
-    ours, theirs = network(), network()
-    theirs.load_state_dict(ours.state_dict())
-    optimizer = ClippedAdam(ours, 0.5, (0.7, 0.95))
-    optimizer.lr.fill_(1e-2)
-    reference = torch.optim.Adam(theirs.parameters(), lr=1e-2, betas=(0.7, 0.95))
-    for scale in (1.0, 1e-3, math.nan, 10.0, math.inf, 1e9, 1.0):
-        inputs = torch.randn(20, 3)
-        before = optimizer.vector.clone()
-        norm = optimizer.step(scale * ours(inputs).square().mean())
-        if norm < 1e6:
-            reference.zero_grad()
-            (scale * theirs(inputs).square().mean()).backward()
-            torch.testing.assert_close(norm, nn.utils.clip_grad_norm_(theirs.parameters(), 0.5))
-            reference.step()
-        else:
-            torch.testing.assert_close(optimizer.vector, before, rtol=0, atol=0)
-        for p, q in zip(ours.parameters(), theirs.parameters(), strict=True):
-            torch.testing.assert_close(p, q)
-    assert optimizer.skipped == 3
-
-
 def test_it_is_bitwise_what_torchs_fused_adam_computes() -> None:
     """Whose hooks for a GradScaler clip and skip; with a learning rate that decays."""
     torch.manual_seed(0)
@@ -57,6 +34,7 @@ def test_it_is_bitwise_what_torchs_fused_adam_computes() -> None:
         gradients = torch.autograd.grad(loss, optimizer.parameters, retain_graph=True)
         reference.grad = torch.cat([g.flatten() for g in gradients])
         norm = optimizer.step(loss)
+        torch.testing.assert_close(norm, torch.linalg.vector_norm(reference.grad), equal_nan=True)
         hooks.grad_scale, hooks.found_inf = (norm / 0.5).clamp(min=1.0), (~(norm < 1e6)).float()
         adam.step()
         state = optimizer.state_dict()["adam"]
@@ -126,14 +104,8 @@ def test_it_goes_on_from_its_state() -> None:
     assert torch.equal(go_on((0.7, 0.95), 0.0), torch.cat([weight.flatten() for weight in weights.values()]))
 
 
-def test_a_state_without_moments_is_that_of_the_first_step() -> None:
-    """As in checkpoints of an earlier version, saved before the optimizer's first step."""
-    torch.manual_seed(0)
-    module = network()
-    optimizer = ClippedAdam(module, 1.0, lr=1e-2)
-    first = copy.deepcopy(optimizer.state_dict())
-    optimizer.step(module(torch.randn(4, 3)).square().sum())
-    optimizer.load_state_dict(first | {"adam": {}})
-    assert_same(optimizer.state_dict(), first)
+def test_moments_of_another_shape_are_refused() -> None:
+    optimizer = ClippedAdam(network(), 1.0)
+    state = optimizer.state_dict()
     with pytest.raises(ValueError, match="the state of an optimizer"):
-        optimizer.load_state_dict(first | {"adam": {0: first["adam"][0] | {"exp_avg": torch.zeros(3)}}})
+        optimizer.load_state_dict(state | {"adam": {0: state["adam"][0] | {"exp_avg": torch.zeros(3)}}})
