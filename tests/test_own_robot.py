@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from learners import ROOT, assert_same, refusal
+from learners import ROOT, refusal
 
 import diffsim
 import ppo_baseline
@@ -119,22 +119,6 @@ def test_from_another_directory(
     assert "has --env examples/own_robot.py, not ant" in line
 
 
-def test_shac_trains_evaluates_and_resumes_an_own_task(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A run that is stopped and resumed ends as one that is not; the file is given in another way each time."""
-    monkeypatch.chdir(home / "examples")
-    common = ["--iterations", "3", "--num-envs", "4", *FEW, "--quiet"]
-    shac.main(["--env", "own_robot.py:RunForward", *common, "--run-dir", str(tmp_path / "whole")])
-    path = tmp_path / "part" / "checkpoint.pt"
-    shac.main(["--env", "own_robot.py", *common, "--stop-after", "2", "--run-dir", str(path.parent)])
-    shac.main(["--resume", str(path), "--env", str(home / "examples" / "own_robot.py"), *FEW, "--quiet"])
-    ends = [checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("whole", "part")]
-    assert_same(ends[0]["modules"], ends[1]["modules"])
-    shac.main(["--evaluate", str(path), *FEW])
-    assert (path.parent / "evaluation.json").is_file()
-
-
 def test_flags_of_an_own_task(home: Path) -> None:
     env = ["--env", str(home / "examples" / "own_robot.py")]
     args = parse(shac.Args, env)
@@ -143,10 +127,3 @@ def test_flags_of_an_own_task(home: Path) -> None:
     assert (args.contact, args.integrator, args.substeps, args.horizon) == ("soft", "semi_implicit", 16, 32)
     args = parse(shac.Args, ["--env", "hopper"])
     assert (args.contact, args.integrator) == ("soft", "semi_implicit")
-
-
-def test_help_says_that_contact_depends_on_the_task(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        shac.main(["--help"])
-    words = " ".join(re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
-    assert "docs/transfer.md; per task" in words and "my_task.py:Class" in words
