@@ -392,9 +392,9 @@ class Search:
         """Trajectories of a policy, --samples of them; those without a source do not join S."""
         count = self.args.samples
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
-        return self.roll_out(self.system, theta, noise, self.starts(count, source), source)
+        return self.roll_out(self.system, theta, noise, self.starts(count), source)
 
-    def starts(self, count: int, source: int) -> Tensor:
+    def starts(self, count: int) -> Tensor:
         """(count, nx) near the guides' start. They have no part in the importance weights."""
         system, x = self.system, torch.cat([guide.x[:-1] for guide in self.guides])
         if not self.args.perturb:

@@ -199,7 +199,7 @@ class Search(gps.Search):
         if not kinds:
             return super().draw(theta, source)
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
-        start = self.starts(count, source)
+        start = self.starts(count)
         system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
         return self.roll_out(system, theta, noise, start, source)
 

@@ -9,13 +9,7 @@ from typing import Any
 import pytest
 import torch
 from learners import assert_resumes, read_progress, refusal
-from problems import (
-    Problem,
-    assert_bandit_learnt,
-    assert_soft_updates,
-    assert_squashed_gaussian,
-    assert_system_controlled,
-)
+from problems import Problem, assert_soft_updates, assert_squashed_gaussian, assert_system_controlled
 from test_scripts import Waits
 from torch import Tensor
 from torch.distributions import Normal
@@ -96,12 +90,12 @@ def test_one_model_alone_predicts() -> None:
         part()
 
 
-def learner_of(bandit: bool, flags: str) -> mbpo.MBPO:
+def learner_of(flags: str) -> mbpo.MBPO:
     torch.manual_seed(0)
     common = "--hidden 32 32 --model-hidden 32 32 --num-envs 20 --steps 8 --batch-size 128 --actor-lr 3e-3"
     common += " --gamma 0.9 --temperature-lr 1e-12 --tau 0.05 --model-lr 3e-3 --model-updates 20"
     common += " --model-batch-size 64 --branches 50"
-    learner = build(*common.split(), *flags.split(), env=Problem(bandit, 20))
+    learner = build(*common.split(), *flags.split(), env=Problem(20))
     for _ in range(10):
         learner.explore()
     return learner
@@ -109,7 +103,7 @@ def learner_of(bandit: bool, flags: str) -> mbpo.MBPO:
 
 def test_a_linear_system_is_identified() -> None:
     """Its two coefficients, its noise, its cost; and the error on held-out transitions is the noise's share."""
-    learner = learner_of(False, "--model-updates 60")
+    learner = learner_of("--model-updates 60")
     for _ in range(15):
         learner.explore()
         found = learner.fit()
@@ -131,7 +125,7 @@ def test_a_linear_system_is_identified() -> None:
 
 
 def test_the_best_on_held_out_transitions_become_elites(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = learner_of(False, "--elites 3 --model-updates 40")
+    learner = learner_of("--elites 3 --model-updates 40")
     for _ in range(5):
         learner.fit()
     last, step = learner.models.ensemble.layers[-1], learner.model_optimizer.step
@@ -166,7 +160,7 @@ def test_held_out_environments_are_not_learnt_from() -> None:
 
 def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Real states are -1; each step adds 1; what passes 2 has failed; the length rises over half of the iterations."""
-    learner = learner_of(False, "--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
+    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
     learner.real.rows[:, 0] = -1.0
     learner.env.task.terminated = lambda obs: obs[:, 0] > 2.5
     monkeypatch.setattr(learner.models, "predict", lambda obs, action: (torch.ones(250, 1), action[:, 0]))
@@ -183,7 +177,7 @@ def test_rollouts_branch_from_real_states_and_end(monkeypatch: pytest.MonkeyPatc
 
 
 def test_without_early_termination_no_rollout_fails() -> None:
-    learner = learner_of(False, "--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
+    learner = learner_of("--rollout-lengths 2 6 --iterations 8 --retain 1 --elites 5")
     learner.env.task.terminated = lambda obs: torch.ones_like(obs[:, 0], dtype=torch.bool)
     for early in (True, False):
         learner.args.early_termination = early
@@ -192,7 +186,7 @@ def test_without_early_termination_no_rollout_fails() -> None:
 
 
 def test_an_update_has_its_share_of_real_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner, seen = learner_of(False, "--real-ratio 0.25 --updates 1"), list[Transition]()
+    learner, seen = learner_of("--real-ratio 0.25 --updates 1"), list[Transition]()
     learner.real.rows[:, 2], learner.imagined.rows[:, 2] = 1.0, 2.0
     learner.imagined.count.fill_(100)
     monkeypatch.setattr(learner, "update_critics", lambda batch, *_: (seen.append(batch), {})[1])
@@ -275,25 +269,17 @@ def test_targets_and_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_soft_updates(build(), monkeypatch)
 
 
-def learnt(bandit: bool, temperature: float, iterations: int) -> mbpo.MBPO:
+def test_a_linear_quadratic_system_is_controlled() -> None:
     """From rollouts of the models alone, which have learnt from random actions."""
-    learner = learner_of(bandit, "--real-ratio 0 --updates 10 --model-updates 80")
-    learner.temperature["log"].data.fill_(math.log(temperature))
+    learner = learner_of("--real-ratio 0 --updates 10 --model-updates 80")
+    learner.temperature["log"].data.fill_(math.log(0.1))
     for _ in range(10):
         learner.explore()
         learner.fit()
-    for _ in range(iterations):
+    for _ in range(80):
         learner.imagine()
         learner.update()
-    return learner
-
-
-def test_a_bandit_is_learnt_with_its_noise() -> None:
-    assert_bandit_learnt(learnt(True, 0.05, 60).actor, 0.05, 0.05)
-
-
-def test_a_linear_quadratic_system_is_controlled() -> None:
-    assert_system_controlled(learnt(False, 0.1, 80).policy)
+    assert_system_controlled(learner.policy)
 
 
 # Runs -----------------------------------------------------------------------------------------------------------------
