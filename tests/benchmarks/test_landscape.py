@@ -28,11 +28,11 @@ def test_losses_along_the_steepest_weight(look: landscape.Look) -> None:
     weights = list(look.actor.parameters())
     before, alone = [w.detach().clone() for w in weights], [look.loss("bptt").item(), look.loss("shac").item()]
     largest = max(g.abs().max().item() for g in torch.autograd.grad(look.loss("shac"), weights) if g.ndim == 2)
-    rows = [{name: float(str(x)) for name, x in row.items()} for row in look.along_a_weight(401)]
+    rows = [{name: float(str(x)) for name, x in row.items()} for row in look.along_a_weight(41)]
     assert all(torch.equal(w, old) for w, old in zip(weights, before, strict=True))
-    middle, after = rows[200], rows[201]
+    middle, after = rows[20], rows[21]
     assert [middle["bptt"], middle["shac"]] == pytest.approx(alone, rel=1e-5)
-    assert (after["shac"] - rows[199]["shac"]) / 1e-2 == pytest.approx(middle["shac_gradient"], rel=2e-2)
+    assert (after["shac"] - rows[19]["shac"]) / 0.1 == pytest.approx(middle["shac_gradient"], rel=5e-2)
     assert abs(middle["shac_gradient"]) == pytest.approx(largest, rel=1e-4)
     assert middle["bptt"] != middle["shac"]  # from other states, and without a value
 
