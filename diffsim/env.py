@@ -172,19 +172,15 @@ class DiffEnv(VectorEnv):
             ValueError: action of the wrong shape, dtype or device; an ActionError on the CPU if it is not a number.
             RuntimeError: more than `horizon` differentiable steps without `detach`.
         """
-        _, reward, terminated, truncated, info = self._advance(action)
+        _, reward, terminated, truncated, info = self.advance(action)
         if self._time == self.horizon:
             self._starts, self._time = self._draw(self.horizon), 0
         self._begin(info["_final_obs"], self._starts[self._time])
         self._time += 1
         return self._obs.clone(), reward, terminated, truncated, info
 
-    @in_plain_mode
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """`step` without the reset: obs is info["final_obs"], and what has ended waits for `reset`."""
-        return self._advance(action)
-
-    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
@@ -203,7 +199,7 @@ class DiffEnv(VectorEnv):
         if self.task.num_memory:
             noise = self._uniform(self.num_envs, self.task.num_noise)
             self.memory = self.task.remember(self.memory, action, noise)
-        self._obs = obs = self._observe(self.qpos, self.qvel, action)
+        self._obs = obs = self.observe(self.qpos, self.qvel, action)
         reward = self.task.reward(obs, action).masked_fill(nonfinite, 0.0)
         with torch.no_grad():
             self.episode_step += 1
@@ -312,15 +308,11 @@ class DiffEnv(VectorEnv):
             if not bool(torch.isfinite(value.detach()).all()):
                 raise ValueError(f"{name} holds numbers that are not finite")
         self.qpos, self.qvel = qpos.clone(), qvel.clone()
-        self._obs = self._observe(self.qpos, self.qvel, self._no_action)
+        self._obs = self.observe(self.qpos, self.qvel, self._no_action)
         return self._obs.clone()
 
-    @in_plain_mode
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         """What the task observes (N, obs_dim) of states, with its memory."""
-        return self._observe(qpos, qvel, action)
-
-    def _observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         if self._elevation is not None:
             qpos = self._elevation.lower(qpos)
         return self.task.observe_with(qpos, qvel, action, self.memory)
@@ -338,12 +330,10 @@ class DiffEnv(VectorEnv):
         own = self.state_dict()
         if state.keys() != own.keys():
             raise ValueError(f"the state has {', '.join(state)}; that of an environment has {', '.join(own)}")
-        theirs, ours = (f"{len(x['qpos'])} x {x['task']} in {x['qpos'].dtype}" for x in (state, own))
-        if theirs != ours:
-            raise ValueError(f"the state is of {theirs}; this environment is {ours}")
         for name, value in own.items():
-            if isinstance(value, Tensor) and value.shape != state[name].shape:
-                raise ValueError(f"the state's {name} has shape {tuple(state[name].shape)}, not {tuple(value.shape)}")
+            theirs, ours = (f"{tuple(x.shape)} {x.dtype}" if isinstance(x, Tensor) else x for x in (state[name], value))
+            if theirs != ours:
+                raise ValueError(f"the state's {name} is {theirs}; this environment's is {ours}")
         state = {"memory": self.memory} | state
         self._put(state[name].to(self.device, copy=True) for name in ("qpos", "qvel", "obs", "memory"))
         self.episode_step.copy_(state["episode_step"])

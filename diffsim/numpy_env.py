@@ -11,6 +11,7 @@ from gymnasium.vector import VectorWrapper
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.env import DiffEnv, check_seed
+from diffsim.sim.modes import in_plain_mode
 
 Array = NDArray[np.floating[Any]]
 Info = dict[str, Any]
@@ -35,6 +36,7 @@ class NumpyEnv(gymnasium.Env[Array, Array]):
         super().reset(seed=None if seed is None else check_seed(seed))
         return to_numpy(self.env.reset(seed=seed)[0])[0], {}
 
+    @in_plain_mode
     @torch.no_grad()
     def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, Info]:
         """One control step; as of DiffEnv.step, for action (nu,). info["nonfinite"]: the simulation blew up."""
