@@ -65,7 +65,9 @@ def test_a_checkpoint_names_no_code_to_run(
     name, *flags = words.split()
     given = [*flags, "policy.pt"] if name != "export" else ["policy.pt", *flags]
     call = functools.partial(view.main, given) if name == "view" else functools.partial(command.main, [name, *given])
-    assert refusal(call, capsys).endswith("task of yours: name the file, which is run, by --env task.py")
+    assert refusal(call, capsys).endswith(
+        "task of yours: give its file, which is run, by --env task.py (drive: as robot)"
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.pt", "task.py"]
     with pytest.raises(ValueError, match="by --env task.py"):
         make_policy_env(load_policy("policy.pt"), 1)

@@ -66,7 +66,7 @@ class SavedPolicy:
         Raises ValueError if the policy was trained on a file's task, and none is given.
         """
         if given is None and FILE.fullmatch(trained := self.args["env"]):
-            fail(f"the policy was trained on a task of yours: name the file, which is run, by --env {trained}")
+            fail(f"the policy is of a task of yours: give its file, which is run, by --env {trained} (drive: as robot)")
         return given or self.args["env"]
 
 
