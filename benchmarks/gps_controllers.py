@@ -49,14 +49,7 @@ TERRAINS: dict[str, tuple[str, Sequence[float]]] = {  # names as named_terrains 
     "rough, 2 m (degrees)": ("rough:{size:g}:2:{seed}:{start}", (5.0, 10.0)),
 }
 RUNNING = (0.05, 0.1, 0.2), (3.0, 5.0, 10.0)  # a humanoid's perturbed starts, and degrees of rough ground
-GROUNDS = {  # the walker's training
-    "feedback-short": "level",
-    "feedback-slope": "one slope",
-    "feedback-rough": "rough",
-    "feedback-guides": "11 terrains",
-    "feedback-practice": "level, random",
-    "feedback-terrain": "11 terrains, random",
-}
+GROUNDS = {"feedback-short": "level", "feedback-slope": "one slope", "feedback-guides": "11 terrains"}  # of training
 
 
 def load_search(path: Path) -> gps.Search:

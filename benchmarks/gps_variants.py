@@ -1,7 +1,7 @@
 """Guided policy search as the paper compares it (Figure 2), and over terrains, with a plan and guides on each.
 
     python benchmarks/gps_variants.py --case dagger --env hopper --demonstration benchmarks/plans/hopper_500.npz
-    python benchmarks/gps_variants.py --env walker --horizon 160 --terrain level incline:10 step:-5 --practice rough:10
+    python benchmarks/gps_variants.py --env walker --horizon 160 --terrain level incline:10 step:-5
 
 Takes the flags of gps.py, too. --resume and --evaluate take the checkpoints of this script. A plan.npz of several
 terrains is a demonstration for each of them; on another terrain, planning starts with the first window of its first
@@ -41,21 +41,16 @@ MAKERS: dict[str, Callable[..., Array]] = {
     "rough": lambda degrees, segment=1.0, seed=0.0, start=1.0: rough(seed, segment, degrees, start=start),
 }
 USAGE = "level, incline:DEGREES[:START], step:CENTIMETRES[:START] or rough:DEGREES[:SEGMENT[:SEED[:START]]]"
-KINDS = {("incline", 1), ("step", 1), ("rough", 1), ("rough", 2)}  # of practice, and how many numbers each has
 
 
 @dataclass
 class VariantArgs(gps.Args):
     """What differs from gps.py."""
 
-    MAY_CHANGE = (*gps.Args.MAY_CHANGE, "practice")
-
     case: Case = "guided"
     """the search of gps.py, or a variant of the paper's algorithm"""
     terrain: tuple[str, ...] = ("level",)
     """train on each, with its own guides: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
-    practice: tuple[str, ...] = ()
-    """the policy's trajectories each go over a random terrain of these kinds, up to that size, not over --terrain"""
 
     def task_defaults(self) -> dict[str, Any]:
         paper = {} if self.case == "guided" else {"variant": "full", "perturb": 0.0}
@@ -71,7 +66,7 @@ class VariantArgs(gps.Args):
                 fail(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
         if self.adaptive and len(self.terrain) > 1:
             fail("--adaptive takes one --terrain")
-        named_terrains(*self.terrain, *(random_terrain(kind, torch.Generator()) for kind in self.practice))
+        named_terrains(*self.terrain)
 
 
 # Terrains by their names ----------------------------------------------------------------------------------------------
@@ -97,23 +92,6 @@ def named_terrains(*names: str) -> Array:
         more = p[-1] + np.arange(1, most - len(p) + 1)[:, None] * (p[-1] - p[-2])
         profiles[i] = np.concatenate((p, more))
     return np.stack(profiles)
-
-
-def random_terrain(kind: str, rng: torch.Generator) -> str:
-    """The name of a terrain drawn from those of a kind, a name without place or seed, up to its size up and down.
-
-    It begins between x = 0.5 and 1.5 m.
-    """
-    name, *numbers = kind.split(":")
-    if (name, len(numbers)) not in KINDS:
-        usage = "incline:DEGREES, step:CENTIMETRES or rough:DEGREES[:SEGMENT]"
-        raise TerrainError(f"kind of terrain {kind!r} must be {usage}")
-    named_terrains(kind)  # the steepest or highest one
-    size, place = torch.rand(2, generator=rng, dtype=torch.float64).tolist()
-    if name == "rough":
-        seed = int(torch.randint(2**31, (1,), generator=rng))
-        return ":".join((name, *numbers, *["1"] * (2 - len(numbers)), f"{seed}", f"{0.5 + place:.4f}"))
-    return f"{name}:{(2 * size - 1) * float(numbers[0]):.6g}:{0.5 + place:.4f}"
 
 
 # Planning over them ---------------------------------------------------------------------------------------------------
@@ -167,7 +145,7 @@ class Ground(System):
 
 
 class Search(gps.Search):
-    """Plans and guides on each of --terrain; the policy's trajectory i goes over number i % n, or a random one."""
+    """Plans and guides on each of --terrain; the policy's trajectory i goes over number i % n."""
 
     args: VariantArgs
 
@@ -193,15 +171,6 @@ class Search(gps.Search):
             x, u = (torch.stack([getattr(plan, part)[0] for plan in plans]) for part in "xu")
             save_demonstration(self.system, x, u, file(), terrain=args.terrain[: len(plans)])
         return plans
-
-    def draw(self, theta: Tensor, source: int = -1) -> gps.Samples:
-        count, kinds = self.args.samples, self.args.practice
-        if not kinds:
-            return super().draw(theta, source)
-        self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
-        start = self.starts(count)
-        system = self.over(*(random_terrain(kinds[i % len(kinds)], self.rng) for i in range(count)))
-        return self.roll_out(system, theta, noise, start, source)
 
     def evaluate(self) -> Evaluation:
         found = super().evaluate()

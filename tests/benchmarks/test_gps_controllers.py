@@ -92,7 +92,7 @@ def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
     rows = [
         dict(env="walker", variant=case, seed=str(seed), kind="step (cm)", size=size, controller=name)
         | dict(kept="", walked=str(share), seconds="")
-        for case, shares in (("feedback-terrain", (1.0, 0.0, 0.5)), ("feedback-slope", (0.5, 0.25, 1.0)))
+        for case, shares in (("feedback-guides", (1.0, 0.0, 0.5)), ("feedback-slope", (0.5, 0.25, 1.0)))
         for size in ("5", "-5")
         for name, share in zip(controllers.CONTROLLERS, shares, strict=True)
         for seed in (1, 2)
@@ -102,7 +102,7 @@ def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
     assert not tables["gps generalisation"] and not tables["gps humanoid"]
     up, _, everywhere = tables["gps terrain"]
     assert up["one slope"] == everywhere["one slope"] == "50% / 25% / 100%"
-    assert up["11 terrains, random"] == "100% / 33% / 67%" and everywhere["11 terrains, random"] == "100% / 20% / 60%"
+    assert up["11 terrains"] == "100% / 33% / 67%" and everywhere["11 terrains"] == "100% / 20% / 60%"
 
 
 def test_pages_have_the_tables_of_the_csv_file() -> None:

@@ -11,7 +11,7 @@ import gps_variants
 import numpy as np
 import pytest
 import torch
-from gps_variants import Ground, named_terrains, random_terrain
+from gps_variants import Ground, named_terrains
 from learners import assert_same, read_progress, refusal, run
 from planning.systems import jacobian_errors
 from scenes import task_scene
@@ -85,20 +85,6 @@ def test_terrains_in_one_array_keep_their_heights() -> None:
         assert one.abs().max() > 0.25
 
 
-def test_random_terrains_are_of_their_kind() -> None:
-    """Uniform in both directions up to the size; each begins at its own place, and rough ground has its own seed."""
-    rng = torch.Generator().manual_seed(1)
-    names = [random_terrain("step:5", rng).split(":") for _ in range(200)]
-    sizes, starts = (np.array([float(name[i]) for name in names]) for i in (1, 2))
-    assert {name for name, _, _ in names} == {"step"} and abs(np.corrcoef(sizes, starts)[0, 1]) < 0.2
-    assert -5 < sizes.min() < -4.5 and 4.5 < sizes.max() < 5 and abs(sizes.mean()) < 1
-    assert 0.5 < starts.min() < 0.55 and 1.45 < starts.max() < 1.5
-    for kind, segment in (("rough:10", "1"), ("rough:10:2", "2")):
-        drawn = [random_terrain(kind, rng) for _ in range(20)]
-        assert all(name.startswith(f"rough:10:{segment}:") for name in drawn)
-        assert len({name.split(":")[3] for name in drawn}) == len({name.split(":")[4] for name in drawn}) == 20
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -107,11 +93,8 @@ def test_random_terrains_are_of_their_kind() -> None:
         ("--terrain rough:1:2:3:4:5", "must be level, incline:DEGREES"),
         ("--terrain rough:ten", "could not convert string to float: 'ten'"),
         ("--terrain level step:0", "terrain 'step:0': height is 0.0"),
+        ("--terrain incline:100", "terrain 'incline:100': degrees is 100.0"),
         ("--terrain", "--terrain needs at least one name: level, incline:DEGREES"),
-        ("--practice incline:100", "terrain 'incline:100': degrees is 100.0"),  # whatever is drawn
-        ("--practice rough:10 step:nan", "terrain 'step:nan': height is nan"),
-        ("--practice incline:10:1", "kind of terrain 'incline:10:1' must be incline:DEGREES"),
-        ("--practice level", "kind of terrain 'level' must be incline:DEGREES"),
         ("--terrain level step:1 step:2 --samples 2", "--samples must be at least 3, not 2"),
         ("--terrain level step:1 --adaptive 1", "--adaptive takes one --terrain"),
     ],
@@ -217,25 +200,9 @@ def test_a_search_on_several_terrains(tmp_path: Path, monkeypatch: pytest.Monkey
         np.testing.assert_allclose(films[-1][0, :3], named_terrains(name)[0])
 
 
-def test_practice_on_random_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each trajectory has its own, drawn anew of the kinds in turn; a resumed run draws the same."""
-    kinds, drawn = ("incline:20", "rough:10:2"), list[str]()
-
-    def draw(kind: str, rng: torch.Generator) -> str:
-        drawn.append(kind)
-        return f"incline:{40 * torch.rand(1, generator=rng).item() - 20}:-1"
-
-    monkeypatch.setattr(gps_variants, "random_terrain", draw)
-    arguments = [*SMALL, "--practice", *kinds]
-    whole = run(gps_variants, tmp_path / "whole", *arguments)
-    assert drawn[: len(kinds)] == list(kinds) and drawn[len(kinds) :] == list(kinds) * ((len(drawn) - 2) // 2)
-    start, S = whole["modules"]["learner"]["guides"][0][0][0], whole["modules"]["S"]
-    own = S["samples"][0][S["samples"][5] > 0]
-    assert len(own) >= 6 and len(own[:, 1].unique(dim=0)) == len(own) and (own[:, 0] == start).all()
-    search = restored(tmp_path / "whole")
-    monkeypatch.setattr(search, "noise", lambda count: torch.zeros(count, 8, 3).double())
-    assert len(search.draw(search.network.theta).x[:, 1].unique(dim=0)) == 6
-    run(gps_variants, tmp_path / "parts", *arguments, "--stop-after", 1)
+def test_a_resumed_search_is_the_same(tmp_path: Path) -> None:
+    whole = run(gps_variants, tmp_path / "whole", *SMALL, "--terrain", *SLOPES[:2])
+    run(gps_variants, tmp_path / "parts", *SMALL, "--terrain", *SLOPES[:2], "--stop-after", 1)
     gps_variants.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
     parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
     assert_same(parts["modules"], whole["modules"])
