@@ -54,6 +54,7 @@ def make(
     integrator: str | None = None,
     theta: float | None = None,
     passes: int | None = None,
+    tolerance: float | None = None,
     touchdown: bool | None = None,
     accuracy: Accuracy = "default",
     contact: Contact | None = None,
@@ -72,7 +73,7 @@ def make(
         seed, horizon: see DiffEnv.
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
             docs/accuracy.md has what each costs and how much it errs.
-        substeps, integrator, theta, passes, touchdown: each in place of the preset's, if given.
+        substeps, integrator, theta, passes, tolerance, touchdown: each in place of the preset's, if given.
         contact: "soft" (the paper's springs) or "mujoco" (MuJoCo's own constraints, see Integration): the laws of
             contact and limits and how they are integrated; docs/transfer.md has what policies keep of their speed.
             Default the task's: soft for those of the papers, mujoco for go1, go2, g1 and tasks of your own.
@@ -105,7 +106,7 @@ def make(
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
     scene = task.load_robot()
-    asked = dict(substeps=substeps, theta=theta, passes=passes, touchdown=touchdown)
+    asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance, touchdown=touchdown)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
     if penalty and integration.constrained:
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")

@@ -40,7 +40,7 @@ BASES = "floating", "fixed", "planar", "ball"
 SLOW = pytest.mark.slow  # for its kernels, which no other test needs
 TREES = [pytest.param(base, seed, marks=[SLOW] * (seed > 0 or base == "planar")) for base in BASES for seed in range(3)]
 H = 1 / 240  # s, of a substep
-PASSES = 40  # Newton's method has converged by then
+PASSES, TOLERANCE = 60, 1e-11  # to rounding
 STATES = {"satisfied": 0, "quadratic": 1, "linear_neg": 2, "linear_pos": 3, "cone": 4}  # MuJoCo's mjtConstraintState
 
 
@@ -114,11 +114,11 @@ def in_mujoco(scene, qpos, qvel, ctrl, steps=1, substeps=1):
     return *map(np.array, zip(*ends, strict=True)), kinds
 
 
-def step(scene, states, passes=PASSES, substeps=1, **options):
+def step(scene, states, passes=PASSES, substeps=1, tolerance=TOLERANCE, **options):
     """qpos, qvel and the residual after a control step."""
     options = {"dtype": torch.float64} | options
     factors = options.pop("factors", None)
-    integration, given = Integration("mujoco", substeps, passes=passes), factors is not None
+    integration, given = Integration("mujoco", substeps, passes=passes, tolerance=tolerance), factors is not None
     sim = Simulator(scene, len(states[0]), integration, substeps * H, factors=given, **options)
     sim.factors = factors if given else sim.factors
     with torch.no_grad():
@@ -142,7 +142,7 @@ def check_step(scene, states, enough):
 def test_task_steps_are_mujocos(name, rng):
     """Pressed into the ground and beyond limits, at rest and in motion; joint damping included."""
     scene = task_scene(name)
-    assert check_step(scene, acting_states(scene, 64, rng), 0.95) >= {
+    assert check_step(scene, acting_states(scene, 64, rng), 1.0) >= {
         STATES[k] for k in ("satisfied", "quadratic", "cone")
     }
 
@@ -151,7 +151,7 @@ def test_task_steps_are_mujocos(name, rng):
 def test_tree_steps_are_mujocos(base, seed, rng):
     """solref of both forms, solimp, margins, impratio, priorities, frictionless geoms, dry friction on every joint."""
     scene, states = tree_states(base, seed, 32, rng)
-    assert check_step(scene, states, 0.97) == set(STATES.values())
+    assert check_step(scene, states, 1.0) == set(STATES.values())
 
 
 def test_pairs_and_meshes_touch_as_in_mujoco(rng):
@@ -170,7 +170,7 @@ def test_pairs_and_meshes_touch_as_in_mujoco(rng):
     qpos, qvel, ctrl = free_states(scene, 64, rng)
     qpos[:, 2] -= [reference.contacts(scene, *state)[0].min() + 0.02 for state in zip(qpos, qvel, strict=True)]
     qpos[:, 2] += 0.04 * rng.random(64)
-    check_step(scene, (qpos, 0.3 * qvel, ctrl), 0.9)
+    check_step(scene, (qpos, 0.3 * qvel, ctrl), 1.0)
 
 
 @pytest.mark.parametrize("mjcf", [pytest.param(FREE_SERVOS, marks=SLOW), BOUNDED_SERVOS])
@@ -182,30 +182,12 @@ def test_servos_are_damped_as_by_implicitfast(mjcf, rng):
     check_gradients(scene, states, rng, enough=1.0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["ant", "humanoid"])
-def test_four_passes_suffice_in_gaits(name):
-    """And in random motion, the second half of the robots."""
-    env = diffsim.make(name, 16, seed=0, contact="mujoco", threads=1)
-    policy = load_policy(Path(diffsim.__file__).parent / "policies" / f"{name}.pt").network
-    generator, states, obs = torch.Generator().manual_seed(0), [], env.reset(seed=0)[0]
-    for _ in range(50):
-        with torch.no_grad():
-            action = policy(obs).clamp(-1, 1)
-            action[8:] = torch.rand(8, env.scene.nu, generator=generator) * 2 - 1
-            states.append([x.double().numpy().copy() for x in (env.qpos, env.qvel, action)])
-            obs = env.step(action)[0]
-    states = [np.concatenate(x) for x in zip(*states, strict=True)]
-    (_, four, _), (_, many, residual) = step(task_scene(name), states, 4), step(task_scene(name), states)
-    error = abs(four - many).max(1) / (abs(many - states[1]).max(1) + H)
-    assert np.median(error) < 1e-9
-    assert (error[residual < 1e-10] > 0.01).mean() < 0.04
-
-
 @pytest.mark.parametrize("name", ["hopper", "ant"])
 def test_control_steps_stay_with_mujoco(name, rng):
     """A hundred, of four substeps, of a trained policy's actions."""
-    env = diffsim.make(name, 4, seed=0, dtype=torch.float64, contact="mujoco", passes=PASSES, threads=1)
+    env = diffsim.make(
+        name, 4, seed=0, dtype=torch.float64, contact="mujoco", passes=PASSES, tolerance=TOLERANCE, threads=1
+    )
     policy = load_policy(Path(diffsim.__file__).parent / "policies" / f"{name}.pt").network.double()
     obs = env.reset(seed=0)[0]
     start, actions = [x.numpy().copy() for x in (env.qpos, env.qvel)], []
@@ -224,7 +206,7 @@ def test_control_steps_stay_with_mujoco(name, rng):
 
 def check_gradients(scene, states, rng, optional=None, enough=0.5):
     """Against differences, in the states where Newton's method has converged, and does in their neighbourhood."""
-    integration, w = Integration("mujoco", 4, passes=PASSES, touchdown=False), weights(scene, rng)
+    integration, w = Integration("mujoco", 4, passes=PASSES, tolerance=TOLERANCE, touchdown=False), weights(scene, rng)
     given = {name: torch.tensor(x) for name, x in (optional or {}).items()}
     beside = [[x + scale * rng.normal(size=x.shape) for x in states] for scale in (0.0, 1e-7, 1e-6, 1e-5)]
     residual = np.max([step(scene, near, substeps=4, **given)[2] for near in beside], axis=0)

@@ -54,7 +54,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         t.Link,
     )
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
-    Load = t.Load
+    Load, Lane = t.Load, t.Lane
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
     @wp.func
@@ -149,31 +149,88 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return p, jar, vec4(D, state[1], state[2], state[3]), of
 
     @wp.func
-    def add_contacts(m: Model, law: Law, k: int, link: Link, A: vec6, B: vec6, height: T, stuck: T, load: Load):
-        """The load of link k with its contacts, linear about A; stuck as of cone."""
+    def touch(m: Model, law: Law, here: Lane, links: t.Links, height: T, touches: t.Touches):
+        """The contacts of a lane at the start of a substep."""
+        first = m.contact_begin[here.at]
+        for i in range(here.n):
+            for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
+                centre, distance, on = place(m, c, links[i], height)
+                touches[c - first].known = on * touches[c - first].on
+                touches[c - first].on = on
+                if block.any_of(on):
+                    p, jar, state, of = contact_state(m, law, c, centre, distance, on, links[i].V, vec6())
+                    touches[c - first].p = p
+                    touches[c - first].bias = jar
+                    touches[c - first].D = state[0]
+
+    @wp.func
+    def friction(m: Model, law: Law, c: int):
+        if wp.static(VARIED):
+            return law.mu * T(m.contact_numbers[c][2])
+        return T(m.contact_numbers[c][2])
+
+    @wp.func
+    def add_contacts(
+        m: Model,
+        law: Law,
+        here: Lane,
+        k: int,
+        A: vec6,
+        B: vec6,
+        step: vec6,  # of the link's twist, that led here
+        passes: int,  # so far
+        touches: t.Touches,
+        load: Load,
+    ):
+        """The load of link k with its contacts, linear about A, and their part of what newton.constrain returns.
+
+        The first pass has the forces of the last substep, and takes what did not touch there for sticking.
+        """
+        found = vec3()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on = place(m, c, link, height)
-            if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, B)
-                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, stuck)
+            s = c - m.contact_begin[here.at]
+            if block.any_of(touches[s].on):
+                p = touches[s].p
+                D = touches[s].D
+                jar = point_velocity(B, p) + touches[s].bias
+                mu = friction(m, law, c)
+                squash = T(m.contact_numbers[c][3])
+                by = point_velocity(step, p)
+                was_at = jar - by  # where the last pass is linear about
+                stuck = T(0.0)
+                if passes < 2:
+                    stuck = T(1.0) - touches[s].known
+                    for r in range(3):
+                        was_at[r] = pick(T(0.0), stuck, was_at[r], touches[s].jar[r])
+                f, H = cone(D, mu, squash, was_at, stuck)
+                if passes == 0:
+                    f = f + H * (was_at - jar)
+                else:
+                    Hs = H * by
+                    less = f + H * (was_at - jar)
+                    f, H = cone(D, mu, squash, jar, T(0.0))
+                    less = less - f
+                    away = T(m.contact_numbers[c][4]) * less
+                    found = found + vec3(wp.dot(by, less), wp.dot(by, Hs), wp.dot(away, away))
+                    touches[s].jar = jar
                 PH = wp.skew(p) * H
                 load.a = load.a - PH * wp.skew(p)
                 load.b = load.b + PH
                 load.d = load.d + H
                 load.f = load.f - force_at(p, f + H * point_velocity(A, p))
-        return load
+        return load, found
 
     @wp.func
-    def contacts_along(m: Model, law: Law, k: int, link: Link, B: vec6, height: T, step: vec6, part: T):
-        """Of the contacts of link k after a part of a step of its twist: step . f and step . H step."""
-        found = vec2()
+    def contacts_along(m: Model, law: Law, here: Lane, k: int, B: vec6, step: vec6, part: T, touches: t.Touches):
+        """Of the contacts of link k after a part of a step of its twist: step . f."""
+        found = T(0.0)
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on = place(m, c, link, height)
-            if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, B)
-                by = point_velocity(step, p)
-                f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar + part * by, T(0.0))
-                found = found + vec2(wp.dot(by, f), wp.dot(by, H * by))
+            s = c - m.contact_begin[here.at]
+            if block.any_of(touches[s].on):
+                by = point_velocity(step, touches[s].p)
+                jar = point_velocity(B, touches[s].p) + touches[s].bias + part * by
+                f, _H = cone(touches[s].D, friction(m, law, c), T(m.contact_numbers[c][3]), jar, T(0.0))
+                found = found + wp.dot(by, f)
         return found
 
     @wp.func
@@ -281,4 +338,4 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
         return gain
 
-    return by_name(add_contacts, contacts_along, add_contacts_adjoint, joint_constraint, joint_gain)
+    return by_name(touch, add_contacts, contacts_along, add_contacts_adjoint, joint_constraint, joint_gain)

@@ -236,6 +236,10 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     if spec.damped:
         Node, Adjoint = Node | {"D": vec6, "W1": vec6}, Adjoint | {"d": vec6, "w1": vec6}
     Node, Adjoint = struct("Node", Node), struct("Adjoint", Adjoint)
+    Iterate = struct(
+        "Iterate", dict.fromkeys(("rate", "step", "force", "held", "firm"), T) | {"B": vec6, "twist": vec6}
+    )
+    Touch = struct("Touch", {"p": vec3, "bias": vec3, "D": T, "on": T, "known": T, "jar": vec3})
     constants = dict.fromkeys("h theta k_n k_d k_t mu k_limit d_limit mass motor".split(), T)
     return SimpleNamespace(
         T=T,
@@ -281,6 +285,13 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         Adjoints=wp.array(dtype=Adjoint),
         # gradients of a floating base's position, turn and velocities, its linear velocity and acceleration
         Base=struct("Base", dict.fromkeys("gp gr gv gw v vdot".split(), vec3)),
+        # of a joint in Newton's method: its acceleration, the last step of that, the force on it without constraints,
+        # theirs and minus its slope; and of its link the twist if rates were accelerations, and the last step of that
+        Iterate=Iterate,
+        Iterates=wp.array(dtype=Iterate),
+        # where a contact is, jar without acceleration, D, whether it touches, did so in the last substep, and jar there
+        Touch=Touch,
+        Touches=wp.array(dtype=Touch),
         vec6s=wp.array(dtype=vec6),
         quats=wp.array(dtype=quat),
     )

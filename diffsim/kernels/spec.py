@@ -31,6 +31,7 @@ class KernelSpec:
     slots: int
     inert: int  # slots after the fixed base whose links carry nothing, so that their own inertia need not be computed
     constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
+    spheres: int = 0  # with constraints, the most contact spheres of a lane
 
     @property
     def floating(self) -> bool:
@@ -74,5 +75,6 @@ def kernel_spec(scene: Scene, division: Division, dtype: type, forced: bool = Fa
         dtype=dtype,
         forced=scene.nbody if forced else 0,
         inert=min(scene.inert, division.trunk) if limbs else scene.inert,
+        spheres=max(map(len, division.spheres)) if asked.get("constrained") else 0,
         **asked,
     )

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 INTEGRATORS = ("semi_implicit", "implicit", "extrapolated", "mujoco")
 MOST_SUBSTEPS, MOST_PASSES = 1_000_000, 1000
-PASSES = 4  # at four substeps MuJoCo's own acceleration, to rounding in most states: docs/physics.md
+PASSES, TOLERANCE = 30, 1e-4  # as measured in docs/physics.md
 
 
 class Integration(NamedTuple):
@@ -20,7 +20,8 @@ class Integration(NamedTuple):
             of springs and dampers).
         substeps: integration steps in one control step; even if extrapolated.
         theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); 0 unless implicit.
-        passes: of Newton's method on MuJoCo's constraints, in each substep; not read by the other integrators.
+        passes: of Newton's method on MuJoCo's constraints in each substep, at most; not read by the other integrators.
+        tolerance: of the residual that ends them, see Simulator.residual; not read by the other integrators.
         touchdown: whether gradients count that such a contact begins with a jump, sooner or later as the state changes:
             docs/physics.md; not read by the other integrators.
     """
@@ -29,6 +30,7 @@ class Integration(NamedTuple):
     substeps: int = 16
     theta: float = 0.0
     passes: int = PASSES
+    tolerance: float = TOLERANCE
     touchdown: bool = True
 
     @classmethod
@@ -58,6 +60,8 @@ class Integration(NamedTuple):
             raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
         if self.theta and self.integrator != "implicit":
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
+        if not is_real(self.tolerance) or not 0 < self.tolerance < 1:
+            raise ValueError(f"tolerance is {self.tolerance!r}, must lie between 0 and 1")
         if not isinstance(self.touchdown, bool):
             raise ValueError(f"touchdown is {self.touchdown!r}, must be True or False")
         return self._replace(substeps=substeps, passes=check_count("passes", self.passes, MOST_PASSES))

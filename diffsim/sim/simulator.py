@@ -55,8 +55,11 @@ class Simulator:
             step is differentiable in them too. (N, 0, 6) without the argument.
         nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s. Their
             state is returned as it was before that step, its gradient is zero; other environments are not touched.
-        residual: (N,) how far the last pass of the integrator mujoco moved the acceleration, relative to its norm + 1,
-            in that substep of the last step where it is largest; zeros with other integrators.
+        residual: (N,) with the integrator mujoco, by how much the constraints' forces differ after the last pass of
+            Newton's method from those that it counted on, as accelerations relative to sqrt(1 + |qacc|^2), in that
+            substep of the last step where it is largest; 1 where that pass went a part of its way; else zeros.
+        passes: (N,) how many Newton's method took in the last step, mean over its substeps.
+        unconverged: (N,) int32, how many control steps ended with a residual above the tolerance.
         nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
     """
 
@@ -88,7 +91,10 @@ class Simulator:
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
-        self._end_widths = (scene.nq, scene.nv + int(how.constrained))  # with constraints a column for the residual
+        self._end_widths = (
+            scene.nq,
+            scene.nv + 2 * how.constrained,
+        )  # with constraints columns for residual and passes
         check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
         if how.constrained:
             scene = constrained(scene, control_dt / how.substeps)
@@ -99,7 +105,7 @@ class Simulator:
         self._start, self._g_start = self._zeros(slots, n, sum(self._widths)), self._zeros(n, sum(self._widths))
         self._end, self._g_end = self._zeros(n, sum(self._end_widths)), self._zeros(n, scene.nq + scene.nv)
         self._nonfinite = self._zeros(slots, n, dtype=torch.bool)
-        self.nonfinite_gradients = self._zeros(n, dtype=torch.int32)
+        self.nonfinite_gradients, self.unconverged = self._zeros(2, n, dtype=torch.int32)
         self._rows: Any = None  # what backward needs of each substep, of all slots
         self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
         self._slot, self._last = 0, horizon  # of the next differentiable step, of the last step
@@ -127,7 +133,11 @@ class Simulator:
 
     @property
     def residual(self) -> torch.Tensor:
-        return self._end[:, self.nq + self.nv :].sum(1)
+        return self._end[:, self.nq + self.nv :][:, :1].sum(1)
+
+    @property
+    def passes(self) -> torch.Tensor:
+        return self._end[:, self.nq + self.nv :][:, 1:].sum(1) / self.integration.substeps
 
     @property
     def factors(self) -> torch.Tensor:
@@ -243,9 +253,9 @@ class Simulator:
         )
         real, nonfinite = self._launcher.spec.dtype, wp.from_torch(self._nonfinite[slot])
         scalars = [real(self.control_dt / how.substeps), real(how.theta), how.substeps]
+        missed, blown_up = wp.from_torch(self.unconverged), wp.from_torch(self.nonfinite_gradients)
         if kernel == "forward":
-            return [*scalars, how.passes, start, int(record), row0, rows, *end, nonfinite]
-        blown_up = wp.from_torch(self.nonfinite_gradients)
+            return [*scalars, how.passes, real(how.tolerance), start, int(record), row0, rows, *end, nonfinite, missed]
         return [*scalars, int(how.touchdown), row0, rows, start, nonfinite, *g_end, g_start, blown_up]
 
     def __reduce__(self) -> NoReturn:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
-from diffsim.sim.integration import Integration
+from diffsim.sim.integration import TOLERANCE, Integration
 from diffsim.tasks.mirror import Mirror
 
 Accuracy = Literal["fast", "default", "accurate"]
@@ -161,7 +161,8 @@ class Task:
         explicit = Integration.explicit(contact, cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt)))
         presets = {name: getattr(cls, name) for name in ("fast", "accurate") if hasattr(cls, name)}
         if explicit.constrained:
-            presets = {"fast": explicit, "accurate": explicit.replaced(substeps=4 * explicit.substeps)}
+            presets["fast"] = explicit.replaced(tolerance=10 * TOLERANCE)
+            presets["accurate"] = explicit.replaced(substeps=4 * explicit.substeps, tolerance=TOLERANCE / 10)
         presets["default"] = explicit
         if accuracy not in presets:
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose from {', '.join(presets)}")

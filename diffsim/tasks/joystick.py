@@ -119,9 +119,9 @@ class Joystick(Task):
 
     @classmethod
     def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
-        """See Task. Newton's method takes longer with dry friction in every joint."""
+        """See Task."""
         found = super().integration(accuracy, contact)
-        return found._replace(passes=6, touchdown=cls.touchdown) if found.constrained else found
+        return found._replace(touchdown=cls.touchdown) if found.constrained else found
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)

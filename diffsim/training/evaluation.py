@@ -33,7 +33,7 @@ SEED = 1_000_000  # of the start states: the same for every policy, and far from
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
 ENOUGH = 0.97  # of the return, kept there
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
-OPTIONS = {*"integrator substeps theta passes touchdown contact early_termination clip control_dt".split()}
+OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination clip control_dt".split()}
 SETTINGS = OPTIONS | {"env", "penalty", "device", "eval_episodes"}
 
 
@@ -125,6 +125,7 @@ def kept(own: float, finer: float) -> float:
 @torch.no_grad()
 def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED) -> Evaluation:
     """The first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu)."""
+    env.sim.unconverged.zero_()
     obs, _ = env.reset(seed=seed)
     alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     returns, lengths = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long)
@@ -141,7 +142,9 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
     if forward is not None:
         distance = path[..., forward].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, forward]
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
-    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt)
+    missed = env.sim.unconverged.sum().item()
+    others = {"unconverged": missed} if missed else {}  # control steps, of Newton's method
+    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt, others)
 
 
 def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 
 import tyro
 
-from diffsim.sim.integration import PASSES
+from diffsim.sim.integration import PASSES, TOLERANCE
 from diffsim.tasks import FILE, Contact, HumanoidImitation, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
@@ -72,7 +72,7 @@ class Flags(RunFlags):
 
     # What may change when a run goes on or is evaluated; the checkpoint decides everything else.
     MAY_CHANGE: ClassVar[tuple[str, ...]] = (
-        *("accuracy", "integrator", "substeps", "theta", "passes", "touchdown", "contact", "penalty"),
+        *("accuracy", "integrator", "substeps", "theta", "passes", "tolerance", "touchdown", "contact", "penalty"),
         *("early_termination", "threads"),
         *(field.name for field in dataclasses.fields(RunFlags) if field.name != "seed"),
     )
@@ -88,7 +88,9 @@ class Flags(RunFlags):
     theta: Fraction = 0.0
     """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
     passes: Count = PASSES
-    """of Newton's method on the constraints in each substep, with --integrator mujoco"""
+    """of Newton's method on the constraints in each substep, at most, with --integrator mujoco"""
+    tolerance: Fraction = TOLERANCE
+    """residual that ends these passes (per --accuracy)"""
     touchdown: bool = True
     """with --integrator mujoco, gradients count that a contact begins with a jump (docs/physics.md)"""
     contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"

@@ -34,6 +34,10 @@ L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
+TOLD = {  # totals, and how a message tells that they have doubled
+    "grad/skipped": "updates skipped so far for their gradients",
+    "sim/unconverged": "control steps so far in which Newton's method did not converge",
+}
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 RANK_SEED = 1_000_003  # between the seeds of two ranks
 LOG_EVERY = 10  # iterations between two at whose end a GPU is waited for, to write all of them
@@ -109,7 +113,7 @@ class Run:
         self._evaluation: tuple[int, Evaluation] | None = None
         self._scalars: dict[str, float] = {}  # that were written last
         self._monitor: Monitor | None = None
-        self._told = 0.0  # how many skipped updates a message told
+        self._told = dict.fromkeys(TOLD, 0.0)  # by messages
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
         self._stopping = False
@@ -280,16 +284,17 @@ class Run:
         scalars = dict(zip(record.names, numbers, strict=True)) | record.scalars | times
         if "episodes" in scalars:
             self._episodes.add(*(ranks * scalars.pop(name) for name in ("episodes", "return", "length")))
-            for name in TOTALS:
-                self._totals[f"sim/{name}"] += round(ranks * scalars.pop(name))
+            for name in (*TOTALS, *({"unconverged"} & scalars.keys())):
+                self._totals[f"sim/{name}"] = self._totals.get(f"sim/{name}", 0) + round(ranks * scalars.pop(name))
             scalars |= self._totals
             if self._episodes.windows:
                 scalars["charts/episodic_return"], scalars["charts/episodic_length"] = self._episodes.means()
         scalars["charts/SPS"] = record.steps / times["time/total"]
         self._scalars = scalars
-        if (skipped := scalars.get("grad/skipped", 0.0)) > 2 * self._told:
-            self._told = skipped
-            self.message(f"iteration {record.iteration}: updates skipped so far for their gradients: {skipped:.0f}")
+        for name, text in TOLD.items():
+            if (total := scalars.get(name, 0.0)) > 2 * self._told[name]:
+                self._told[name] = total
+                self.message(f"iteration {record.iteration}: {text}: {total:.0f}")
         if self._log is not None:
             with self._writing():
                 self._log.write(record.iteration, self.control_steps, self.seconds, scalars)
