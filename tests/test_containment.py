@@ -242,12 +242,21 @@ def test_overwritten_checkpoint_is_noticed(rng):
         torch.autograd.grad(first, states)
 
 
-def test_steps_without_gradient_leave_checkpoints_alone(rng):
+@pytest.mark.parametrize("integrator", ["semi_implicit", "extrapolated"])
+def test_steps_without_gradient_and_jacobians_leave_checkpoints_alone(integrator, rng):
+    """Jacobians take the next one of a window, for as long as they need it."""
     scene = task_scene("hopper")
-    sim = Simulator(scene, 2)
+    sim = Simulator(scene, 2, Integration(integrator), horizon=2)
     states = leaves(*acting_states(scene, 2, rng))
     total = sim.step(*states)[0].sum()
     expected = torch.autograd.grad(total, states, retain_graph=True)
     with torch.no_grad():
         sim.step(*(x + 0.1 for x in states))
-    torch.testing.assert_close(torch.autograd.grad(total, states), expected, rtol=0, atol=0)
+    with torch.inference_mode():
+        A, B = sim.jacobians(*states)
+    torch.testing.assert_close(torch.autograd.grad(total, states, retain_graph=True), expected, rtol=0, atol=0)
+    total = total + sim.step(*states)[0].sum()  # in the same window
+    again = torch.autograd.grad(total, states)
+    torch.testing.assert_close(again, tuple(2 * x for x in expected), rtol=0, atol=0)
+    torch.testing.assert_close(A[:, :6].sum(1), torch.cat(expected[:2], 1), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(B[:, :6].sum(1), expected[2], rtol=1e-4, atol=1e-4)

@@ -209,28 +209,31 @@ class Simulator:
         bad = self.nonfinite.unsqueeze(1)
         return torch.where(bad, start[0].detach(), qpos), torch.where(bad, start[1].detach(), qvel)
 
+    @in_plain_mode
     def jacobians(
         self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """A (N, 2 nv, 2 nv) and B (N, 2 nv, nu) of one control step: dx' = A dx + B dctrl, by 2 nv backward passes.
 
         x is qpos, then qvel, and differences of qpos are those of MuJoCo's mjd_transitionFD: a free joint's rotation,
-        and a ball joint's, changes by a rotation vector in the body's frame. Factors and forces are those of a step.
-        The arguments are a step's, and so is the checkpoint that it takes; nonfinite environments have zeros.
+        and a ball joint's, changes by a rotation vector in the body's frame. Arguments, factors and forces are those of
+        a step; in a full window of differentiable steps it takes the oldest one's checkpoint. `nonfinite` environments
+        have zeros.
         """
-        leaves = [part.detach().requires_grad_() for part in (qpos, qvel, ctrl)]
+        leaves, slot = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._slot
         with torch.enable_grad():
             end = torch.cat(self.step(*leaves), dim=1)
         cotangents = self.tangent.left_inverse(end.detach()).unbind(1)
         rows = [torch.autograd.grad(end, leaves, row, retain_graph=True) for row in cotangents]
+        self.rewind(slot)
         g_qpos, g_qvel, B = (torch.stack(part, dim=1) for part in zip(*rows, strict=True))
         return torch.cat((g_qpos, g_qvel), dim=2) @ self.tangent.basis(torch.cat(leaves[:2], dim=1).detach()), B
 
-    def rewind(self) -> None:
-        """Let the next differentiable step use the first checkpoint: the start of a new window."""
-        self._slot = 0
+    def rewind(self, slot: int = 0) -> None:
+        """Let the next differentiable step use a checkpoint, by default the first: the start of a new window."""
+        self._slot = slot
         if self._coarse is not None:
-            self._coarse.rewind()
+            self._coarse.rewind(slot)
 
     def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
         key = (kernel, slot)
