@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from diffsim import DiffEnv
-from diffsim.planning import Dynamics
+from diffsim.planning import System
 from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, evaluate, fail, script
 from diffsim.training.ensemble import Ensemble
@@ -236,8 +236,7 @@ class MBPO:
         buffers = (ReplayBuffer(size, obs_dim, action_dim) for size in (args.buffer_size, held_out, imagined))
         self.real, self.unseen, self.imagined = (buffer.to(env.device) for buffer in buffers)
         if args.sample_enhance:
-            integration, threads = env.sim.integration, args.threads or None
-            self.dynamics = Dynamics(env.scene, integration, env.control_dt, env.device, threads)
+            self.system = System(env, args.threads or None)
 
     # Real transitions ------------------------------------------------------------------------------------------------
 
@@ -262,7 +261,7 @@ class MBPO:
             seen = Transition(*(x[self.held_out :] for x in made))
             self.real.add(seen)
             if state is not None:
-                self.real.add(enhance(self, self.dynamics, state[self.held_out :], seen))
+                self.real.add(enhance(self, state[self.held_out :], seen))
             self.actor.normalizer.update(obs)
             self.models.target.update(changes(seen))
             obs = next_obs
@@ -368,7 +367,7 @@ def q_values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
 # SE-MBPO --------------------------------------------------------------------------------------------------------------
 
 
-def nearby(dynamics: Dynamics, x: Tensor, action: Tensor, samples: int, scale: float) -> tuple[Tensor, ...]:
+def nearby(system: System, x: Tensor, action: Tensor, samples: int, scale: float) -> tuple[Tensor, ...]:
     """Steps near those from states x (n, nx) with actions (n, nu), to first order; all in float64.
 
     x + d -> f(x, u) + J d, where u = artanh(action), so no action leaves its bounds, and d is a random tangent vector.
@@ -377,20 +376,20 @@ def nearby(dynamics: Dynamics, x: Tensor, action: Tensor, samples: int, scale: f
         States, actions and next states (samples, n, ...); whether the given steps are finite (n,).
     """
     u = action.clamp(-1 + 1e-6, 1 - 1e-6).atanh()
-    following, _, finite = dynamics.rollout(x, 1, lambda *_: u)
+    following, _, finite = system.rollout(x, 1, lambda *_: u)
     following = following[:, 1]
-    change = dynamics.difference(following, x).square().mean(0).sqrt()  # of a control step: a scale for each number
-    d = scale * torch.randn(samples, len(x), dynamics.nd + dynamics.nu, dtype=x.dtype, device=x.device)
-    d[..., : dynamics.nd] *= change
-    end = (dynamics.jacobians(x, u) @ d.unsqueeze(-1)).squeeze(-1)
-    start, push = d.split((dynamics.nd, dynamics.nu), -1)
-    return dynamics.retract(x, start), (u + push).tanh(), dynamics.retract(following, end), finite[:, 0]
+    change = system.difference(following, x).square().mean(0).sqrt()  # of a control step: a scale for each number
+    d = scale * torch.randn(samples, len(x), system.nd + system.nu, dtype=x.dtype, device=x.device)
+    d[..., : system.nd] *= change
+    end = (system.jacobians(x, u) @ d.unsqueeze(-1)).squeeze(-1)
+    start, push = d.split((system.nd, system.nu), -1)
+    return system.retract(x, start), (u + push).tanh(), system.retract(following, end), finite[:, 0]
 
 
-def enhance(mbpo: MBPO, dynamics: Dynamics, state: Tensor, made: Transition) -> Transition:
+def enhance(mbpo: MBPO, state: Tensor, made: Transition) -> Transition:
     """Transitions near those made from states (n, nx), observed and rewarded as the task does (Qiao et al. 2021)."""
-    args, task, nq = mbpo.args, mbpo.env.task, dynamics.nq
-    *near, finite = nearby(dynamics, state.double(), made.action.double(), args.sample_enhance, args.enhance_scale)
+    args, task, nq = mbpo.args, mbpo.env.task, mbpo.system.nq
+    *near, finite = nearby(mbpo.system, state.double(), made.action.double(), args.sample_enhance, args.enhance_scale)
     start, action, end = (x.to(state.dtype) for x in near)
 
     def observe(x: Tensor, action: Tensor) -> Tensor:

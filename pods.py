@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.planning import REAL, AfterStep, Cost, Dynamics, Sum, System, ilqr
+from diffsim.planning import REAL, AfterStep, Cost, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, evaluate, fail, script
@@ -185,7 +185,7 @@ def steepest_ascent(
 
 
 def gauss_newton(
-    system: Dynamics, cost: Cost, reward: Cost, x: Tensor, u: Tensor, iterations: int, mu: float
+    system: System, cost: Cost, reward: Cost, x: Tensor, u: Tensor, iterations: int, mu: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Iterations of iLQR on each sequence u (N, T, nu) from states x (N, nx).
 

@@ -16,7 +16,7 @@ from torch.distributions import Normal
 
 import diffsim
 import mbpo
-from diffsim.planning import Dynamics
+from diffsim.planning import System
 from diffsim.training import Transition, parse
 
 FLAGS = (
@@ -204,18 +204,18 @@ def test_enhanced_steps_are_those_of_the_simulator_to_second_order(env: str) -> 
     made = diffsim.make(env, num_envs=6, seed=0)
     for _ in range(30):
         made.step(0.5 * torch.randn(6, made.scene.nu))
-    dynamics = Dynamics(made.scene, made.sim.integration, made.control_dt, threads=1)
+    system = System(made, threads=1)
     x, action = torch.cat((made.qpos, made.qvel), 1).double(), torch.rand(6, made.scene.nu).double() - 0.5
     errors = []
     for scale in (2e-4, 1e-4):
         torch.manual_seed(1)
-        start, pushed, end, finite = mbpo.nearby(dynamics, x, action, 3, scale)
+        start, pushed, end, finite = mbpo.nearby(system, x, action, 3, scale)
         assert finite.all() and pushed.abs().max() < 1
-        again = dynamics.rollout(start.flatten(0, 1), 1, lambda *_, u=pushed: u.flatten(0, 1).atanh())[0][:, 1]
-        errors.append(dynamics.difference(end.flatten(0, 1), again).norm(dim=1))
+        again = system.rollout(start.flatten(0, 1), 1, lambda *_, u=pushed: u.flatten(0, 1).atanh())[0][:, 1]
+        errors.append(system.difference(end.flatten(0, 1), again).norm(dim=1))
         distance = (pushed - action).norm(dim=-1)
         assert 0.2 * scale < distance.mean() < 3 * scale * made.scene.nu and (start - x).norm(dim=-1).min() > 0
-        assert errors[-1].max() < 1e-2 * dynamics.difference(again, x.repeat(3, 1)).norm(dim=1).max()
+        assert errors[-1].max() < 1e-2 * system.difference(again, x.repeat(3, 1)).norm(dim=1).max()
     ratios = errors[0] / errors[1]
     assert ratios.median().item() == pytest.approx(4, rel=0.1), ratios
 
@@ -237,7 +237,7 @@ def test_enhanced_transitions_are_observed_and_rewarded_as_the_task_does() -> No
     state = torch.cat((env.qpos, env.qvel), 1)[1:].clone()
     obs, action = env.detach()[1:], torch.rand(3, 8)
     learner.args.enhance_scale, learner.args.sample_enhance = 0.1, 50
-    near = mbpo.enhance(learner, learner.dynamics, state, Transition(obs, action, *[torch.zeros(3)] * 3))
+    near = mbpo.enhance(learner, state, Transition(obs, action, *[torch.zeros(3)] * 3))
     spread = near.action.view(50, 3, 8).atanh() - action.atanh()
     assert spread.std().item() == pytest.approx(0.1, rel=0.1)
     torch.testing.assert_close(near.obs[:, -8:], obs[:, -8:].repeat(50, 1))
@@ -252,9 +252,7 @@ def test_an_enhanced_transition_that_falls_has_failed() -> None:
     qpos, qvel = env.qpos[1:].clone(), env.qvel[1:].clone()
     qpos[0, 2], qvel[0, 2] = 0.28, -6.0
     obs = env.task.observe(qpos, qvel, torch.zeros(3, 8))
-    near = mbpo.enhance(
-        learner, learner.dynamics, torch.cat((qpos, qvel), 1), Transition(obs, torch.zeros(3, 8), *[torch.zeros(3)] * 3)
-    )
+    near = mbpo.enhance(learner, torch.cat((qpos, qvel), 1), Transition(obs, torch.zeros(3, 8), *[torch.zeros(3)] * 3))
     assert near.terminated.tolist() == [1, 0, 0] * 2
 
 

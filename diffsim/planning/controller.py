@@ -8,9 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffsim.planning.dynamics import REAL, Dynamics
 from diffsim.planning.ilqr import Cost, Plan, backward_pass, step_jacobian, symmetric
-from diffsim.planning.system import System
+from diffsim.planning.system import REAL, System
 
 
 def gaussian_log_prob(u: Tensor, mean: Tensor, sigma: Tensor) -> Tensor:
@@ -33,20 +32,20 @@ class LinearGaussian(NamedTuple):
         """Its first steps."""
         return self._replace(x=self.x[: steps + 1], u=self.u[:steps], K=self.K[:steps], L=self.L[:steps])
 
-    def mean(self, system: Dynamics, t: int | slice, x: Tensor) -> Tensor:
+    def mean(self, system: System, t: int | slice, x: Tensor) -> Tensor:
         """(..., nu) at states x (..., nx) of step t, or (..., steps, nx) of a slice of steps."""
         tangent = system.difference(x, self.x[t])
         return self.u[t] + (self.K[t] @ tangent.unsqueeze(-1)).squeeze(-1)
 
-    def log_prob(self, system: Dynamics, x: Tensor, u: Tensor) -> Tensor:
+    def log_prob(self, system: System, x: Tensor, u: Tensor) -> Tensor:
         """(m, T) log q(u_t | x_t) of anyone's trajectories x (m, T + 1, nx), u (m, T, nu)."""
         error = (u - self.mean(system, slice(0, u.shape[1]), x[:, :-1])).unsqueeze(-1)
         e = torch.linalg.solve_triangular(self.L, error, upper=False).squeeze(-1)
         log_det = self.L.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return -0.5 * e.square().sum(-1) - log_det - 0.5 * u.shape[-1] * math.log(2 * math.pi)
 
-    def sample(self, system: Dynamics, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Closed-loop rollouts with standard normal noise (m, T, nu); see Dynamics.rollout."""
+    def sample(self, system: System, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Closed-loop rollouts with standard normal noise (m, T, nu); see System.rollout."""
 
         def act(t: int, x: Tensor) -> Tensor:
             return self.mean(system, t, x) + (self.L[t] @ noise[:, t].unsqueeze(-1)).squeeze(-1)
@@ -88,7 +87,7 @@ def nearest_feedback(
 
 @torch.no_grad()
 def maximum_entropy_controllers(
-    system: Dynamics, cost: Cost, plan: Plan, sigma: Tensor, spread: float
+    system: System, cost: Cost, plan: Plan, sigma: Tensor, spread: float
 ) -> list[LinearGaussian]:
     """The I-projections of exp(-cost / eta) about R optimised trajectories (Levine and Koltun 2013, section 4.1).
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from diffsim.planning.controller import gaussian_log_prob
-from diffsim.planning.dynamics import Dynamics
 from diffsim.planning.ilqr import Cost, symmetric
+from diffsim.planning.system import System
 
 
 def _jacobian(y: Tensor, d: Tensor) -> Tensor:
@@ -21,7 +21,7 @@ def _jacobian(y: Tensor, d: Tensor) -> Tensor:
 class AfterStep(NamedTuple):
     """A loss of each action and the state that it led to, e.g. minus a reward."""
 
-    system: Dynamics
+    system: System
     loss: Callable[[Tensor, Tensor], Tensor]  # (...) of x_{t+1} (..., nx), u_t (..., nu)
 
     def value(self, x: Tensor, u: Tensor) -> Tensor:
@@ -46,7 +46,7 @@ class AfterStep(NamedTuple):
 class Tracking(NamedTuple):
     """The weighted squared deviation from an example's states and actions."""
 
-    system: Dynamics
+    system: System
     x: Tensor  # (R, T + 1, nx)
     u: Tensor  # (R, T, nu)
     weight: float
@@ -65,7 +65,7 @@ class Tracking(NamedTuple):
 class Surprisal(NamedTuple):
     """The weighted negative log density of the actions under a policy of the states, normal about its mean."""
 
-    system: Dynamics
+    system: System
     mean: Callable[[Tensor], Tensor]  # (..., nu) of x (..., nx)
     sigma: Tensor  # (nu,)
     weight: float

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from diffsim.planning.cost import Tracking
-from diffsim.planning.dynamics import REAL, Dynamics
 from diffsim.planning.ilqr import backward_pass, follow, step_jacobian
+from diffsim.planning.system import REAL, System
 
 PERIOD = 1 / 60  # s: the control step of a file that does not tell it
 
 
-def load_demonstration(system: Dynamics, path: Path, steps: int, row: int = 0) -> tuple[Tensor, Tensor]:
+def load_demonstration(system: System, path: Path, steps: int, row: int = 0) -> tuple[Tensor, Tensor]:
     """States (steps + 1, nx) and actions (steps, nu) of an .npz of qpos, qvel and action in [-1, 1], a row a step.
 
     Of a file of several trajectories, which has a first dimension for them, number `row`.
@@ -50,7 +50,7 @@ def load_demonstration(system: Dynamics, path: Path, steps: int, row: int = 0) -
     return x.to(system.device), u.to(system.device)
 
 
-def save_demonstration(system: Dynamics, x: Tensor, u: Tensor, path: Path, **others: Any) -> None:
+def save_demonstration(system: System, x: Tensor, u: Tensor, path: Path, **others: Any) -> None:
     """Write a trajectory x (T + 1, nx), u (T, nu), or several with a first dimension, for load_demonstration."""
     qpos, qvel = (part.numpy(force=True) for part in x.split((system.nq, system.nv), -1))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def save_demonstration(system: Dynamics, x: Tensor, u: Tensor, path: Path, **oth
     np.savez_compressed(path, qpos=qpos, qvel=qvel, action=action, control_dt=period, **others)
 
 
-def follow_demonstration(system: Dynamics, x: Tensor, u: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def follow_demonstration(system: System, x: Tensor, u: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """A trajectory x (1, T + 1, nx), u (1, T, nu) that tracks an example x (T + 1, nx), u (T, nu); see Tracking.
 
     Raises:

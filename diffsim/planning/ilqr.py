@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from diffsim.planning.dynamics import REAL, Dynamics
+from diffsim.planning.system import REAL, System
 
 Show = Callable[[int, Tensor], None]  # (iteration, costs (R,))
 ALPHAS = 0.5 ** torch.arange(11, dtype=REAL)  # step sizes of the line search
@@ -86,7 +86,7 @@ class Plan(NamedTuple):
     cost: Tensor  # (R,)
 
 
-def follow(system: Dynamics, x: Tensor, u: Tensor, gains: Gains, alphas: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def follow(system: System, x: Tensor, u: Tensor, gains: Gains, alphas: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rollouts (R, A, ...) of R plans under their gains with A step sizes each, in one batch."""
     R, A = len(x), len(alphas)
 
@@ -99,14 +99,14 @@ def follow(system: Dynamics, x: Tensor, u: Tensor, gains: Gains, alphas: Tensor)
     return xs.view(R, A, *xs.shape[1:]), us.view(R, A, *us.shape[1:]), finite.view(R, A, -1)
 
 
-def step_jacobian(system: Dynamics, x: Tensor, u: Tensor) -> Tensor:
+def step_jacobian(system: System, x: Tensor, u: Tensor) -> Tensor:
     """f_z (R, T, 2nv, 2nv + nu) of trajectories x (R, T + 1, nx), u (R, T, nu)."""
     f_z = system.jacobians(x[:, :-1].flatten(0, 1), u.flatten(0, 1))
     return f_z.view(*u.shape[:2], system.nd, -1)
 
 
 def line_search(
-    system: Dynamics, cost: Cost, x: Tensor, u: Tensor, total: Tensor, gains: Gains, moving: Tensor
+    system: System, cost: Cost, x: Tensor, u: Tensor, total: Tensor, gains: Gains, moving: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The largest step that wins at least a hundredth of what the quadratic model promises, for each trajectory.
 
@@ -139,7 +139,7 @@ def change_mu(mu: Tensor, delta: Tensor, more: Tensor, less: Tensor) -> tuple[Te
 
 @torch.no_grad()
 def ilqr(
-    system: Dynamics, cost: Cost, x: Tensor, u: Tensor, iterations: int, mu: float = 1.0, show: Show | None = None
+    system: System, cost: Cost, x: Tensor, u: Tensor, iterations: int, mu: float = 1.0, show: Show | None = None
 ) -> Plan:
     """Optimises R trajectories of the system, x (R, T + 1, nx) and u (R, T, nu), side by side.
 

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from diffsim.planning.dynamics import REAL, Dynamics
 from diffsim.planning.ilqr import Cost, Show, ilqr
+from diffsim.planning.system import REAL, System
 
 
 def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Generator) -> Tensor:
@@ -30,7 +30,7 @@ def starting_actions(count: int, steps: int, nu: int, dt: float, rng: torch.Gene
 
 
 def best_of_random_starts(
-    system: Dynamics, cost: Cost, start: Tensor, actions: Tensor, keep: int, iterations: int, show: Show | None = None
+    system: System, cost: Cost, start: Tensor, actions: Tensor, keep: int, iterations: int, show: Show | None = None
 ) -> tuple[Tensor, Tensor]:
     """Optimises trajectories from one state (nx,), side by side and for a few iterations; see ilqr.
 
@@ -53,7 +53,7 @@ def best_of_random_starts(
 
 
 def receding_horizon(
-    system: Dynamics, cost: Cost, x: Tensor, u: Tensor, steps: int, advance: int, iterations: int, rng: torch.Generator
+    system: System, cost: Cost, x: Tensor, u: Tensor, steps: int, advance: int, iterations: int, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Continues optimised first windows x (R, W + 1, nx), u (R, W, nu) to x (R, T + 1, nx), u (R, T, nu), T = steps.
 

@@ -19,7 +19,7 @@ def normal(rng: np.random.Generator, *shape: int) -> Tensor:
 
 
 class Linear:
-    """x' = A x + B u with a quadratic loss of (x', u), in the interface of Dynamics."""
+    """x' = A x + B u with a quadratic loss of (x', u), in the interface of System."""
 
     def __init__(self, rng: np.random.Generator, nx: int = 3, nu: int = 2) -> None:
         self.nd, self.nu = nx, nu
