@@ -29,7 +29,8 @@ from diffsim.kernels.wide import blocks
 @cache
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
-    T, vec3, vec4, vec6, mat3, Model, Law, Link = t.T, t.vec3, t.vec4, t.vec6, t.mat3, t.Model, t.Law, t.Link
+    T, vec3, vec4, Model, Law, Link = t.T, t.vec3, t.vec4, t.Model, t.Law, t.Link
+    Node, Adjoint, Array = t.Node, t.Adjoint, t.array
     Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
     sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, VARIED = spec.implicit, spec.varied
@@ -102,8 +103,8 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         return vec4(g_kn, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
     @wp.func
-    def add_contacts(m: Model, law: Law, k: int, link: Link, place: Place, Ia: mat3, Ib: mat3, Id: mat3, F: vec6):
-        """Inertia blocks and bias force of link k with its contacts added."""
+    def add_contacts(m: Model, law: Law, k: int, link: Link, place: Place, load: t.Load):
+        """The load of link k with its contacts."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
                 p, v, depth, E, _ = sphere_on_terrain(m, law, c, link, place)
@@ -125,22 +126,15 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                         f = f - wp.cw_mul(B, vec3(m.gravity))
                         D = wp.diag(B)
                     PB = wp.skew(p) * D
-                    Ia = Ia - PB * wp.skew(p)
-                    Ib = Ib + PB
-                    Id = Id + D
-                F = F - force_at(p, f)
-        return Ia, Ib, Id, F
+                    load.a = load.a - PB * wp.skew(p)
+                    load.b = load.b + PB
+                    load.d = load.d + D
+                load.f = load.f - force_at(p, f)
+        return load
 
     @wp.func
     def add_contacts_adjoint(
-        m: Model,
-        law: Law,
-        k: int,
-        link: Link,
-        node: t.Node,
-        place: Place,
-        adj: t.Adjoint,
-        adj_factors: t.array,
+        m: Model, law: Law, k: int, link: Link, node: Node, place: Place, adj: Adjoint, adj_factors: Array
     ):
         """The adjoints of link k with its contacts' part of phi added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):

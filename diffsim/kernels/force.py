@@ -25,6 +25,7 @@ from diffsim.kernels.wide import blocks
 def external_force(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
     T, vec3, Model, Lane, block = t.T, t.vec3, t.Model, t.Lane, blocks(spec)
+    Links, Nodes, Adjoints = t.Links, t.Nodes, t.Adjoints
     join, force_at, point_velocity, read = sp.join, sp.force_at, sp.point_velocity, block.read
     FIRST, SLOTS = 0 if spec.floating else 1, spec.slots  # a fixed base feels no force
 
@@ -37,7 +38,7 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
         return f, force_at(p, f) + join(torque, vec3())
 
     @wp.func
-    def add_forces(m: Model, here: Lane, forces: t.array2, links: t.Links, loads: t.Loads):
+    def add_forces(m: Model, here: Lane, forces: t.array2, links: Links, loads: t.Loads):
         """Adds the forces to the links' bias forces."""
         for i in range(FIRST, here.n):
             for entry in range(m.body_begin[here.at + i], m.body_begin[here.at + i + 1]):
@@ -48,15 +49,9 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_forces_adjoint(
-        m: Model,
-        here: Lane,
-        forces: t.array2,
-        links: t.Links,
-        nodes: t.Nodes,
-        adj: t.Adjoints,
-        adj_forces: t.vec6s,  # of each body, (force, torque)
+        m: Model, here: Lane, forces: t.array2, links: Links, nodes: Nodes, adj: Adjoints, adj_forces: t.vec6s
     ):
-        """Adds the forces' part of phi to the links' adjoints."""
+        """Adds the forces' part of phi to the links' adjoints; adj_forces: of each body, (force, torque)."""
         for i in range(FIRST, here.n):
             for entry in range(m.body_begin[here.at + i], m.body_begin[here.at + i + 1]):
                 body = m.body[entry]

@@ -16,7 +16,8 @@ from diffsim.kernels.spec import KernelSpec
 @cache
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
-    T, vec3, mat3, Model, Law, Link, Adjoint = t.T, t.vec3, t.mat3, t.Model, t.Law, t.Link, t.Adjoint
+    T, vec3, mat3, Model, Law, Link = t.T, t.vec3, t.mat3, t.Model, t.Law, t.Link
+    Node, Adjoint, Array = t.Node, t.Adjoint, t.array
     momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
     LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
@@ -36,37 +37,33 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def link_inertia(m: Model, law: Law, k: int, link: Link, place: Place):
-        """Inertia blocks [[Ia, Ib], [Ib', Id]] and bias force of one link, contacts included."""
+        """What link k alone weighs, contacts included."""
         com, inertia = mass_of(m, k, link)
         V = link.V
         mass = T(m.mass[k])
         if wp.static(VARIED):
             inertia = law.mass * inertia
             mass = law.mass * mass
-        Ib = mass * wp.skew(com)
-        Ia = inertia - Ib * wp.skew(com)
-        Id = wp.diag(vec3(mass, mass, mass))
-        F = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
+        load = Load()
+        load.b = mass * wp.skew(com)
+        load.a = inertia - load.b * wp.skew(com)
+        load.d = wp.diag(vec3(mass, mass, mass))
+        load.f = wp.spatial_cross_dual(V, momentum(mass, com, inertia, V))
         if wp.static(LIFT):
             _p, _f, up = lift(m, k, link)
             if wp.static(VARIED):
                 up = law.mass * up
-            F = F - up
+            load.f = load.f - up
         if wp.static(DAMPED):
-            F = F + T(m.base_damping[k]) * V
+            load.f = load.f + T(m.base_damping[k]) * V
         if wp.static(DRAG):
-            F = F - drag.drag_wrench(m, k, link.R, com, V)
+            load.f = load.f - drag.drag_wrench(m, k, link.R, com, V)
         if wp.static(CONTACT):
-            Ia, Ib, Id, F = contact.add_contacts(m, law, k, link, place, Ia, Ib, Id, F)
-        load = Load()
-        load.a = Ia
-        load.b = Ib
-        load.d = Id
-        load.f = F
+            load = contact.add_contacts(m, law, k, link, place, load)
         return load
 
     @wp.func
-    def link_adjoint(m: Model, law: Law, k: int, link: Link, node: t.Node, place: Place, adj_factors: t.array):
+    def link_adjoint(m: Model, law: Law, k: int, link: Link, node: Node, place: Place, adj_factors: Array):
         """The adjoints of one link's part of phi, all about the carrier's position.
 
         adj_factors, here and in all laws, are written if varied only.

@@ -30,7 +30,7 @@ SHORTEST = 1e-6  # m
 def muscle_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
     T, vec3, vec6, Model, Law, Lane, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.Lane, t.array
-    join, point_velocity = sp.join, sp.point_velocity
+    Links, Nodes, Adjoints, join, point_velocity = t.Links, t.Nodes, t.Adjoints, sp.join, sp.point_velocity
     VARIED, block = spec.varied, blocks(spec)
 
     @wp.func
@@ -60,7 +60,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
         return join(wp.transpose(R) * wp.spatial_top(v), wp.transpose(R) * point_velocity(v, x))
 
     @wp.func
-    def add_muscles(m: Model, here: Lane, pull: array, links: t.Links, loads: t.Loads):
+    def add_muscles(m: Model, here: Lane, pull: array, links: Links, loads: t.Loads):
         """Adds the muscles to the links' bias forces."""
         for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):
             i = m.pair_link[2 * pair]
@@ -83,7 +83,7 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_muscles_adjoint(
-        m: Model, here: Lane, pull: array, links: t.Links, nodes: t.Nodes, adj: t.Adjoints, adj_pull: array
+        m: Model, here: Lane, pull: array, links: Links, nodes: Nodes, adj: Adjoints, adj_pull: array
     ):
         """Adds the muscles' part of phi to the adjoints of the links and of pull."""
         for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):

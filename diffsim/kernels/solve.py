@@ -81,22 +81,14 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
 @cache
 def factor_solve(spec: KernelSpec) -> wp.Function:
     t, kin, base, sums = types(spec), kinematics(spec), base_inertia(spec), lane_sums(spec)
-    T, vec6, Model, Lane, load, link_of = t.T, t.vec6, t.Model, t.Lane, kin.load, kin.link_of
+    T, vec6, load, link_of = t.T, t.vec6, kin.load, kin.link_of
+    Model, Law, Lane, Ck, Links, Nodes = t.Model, t.Law, t.Lane, t.Checkpoint, t.Links, t.Nodes
     FLOATING, SLOTS = spec.floating, spec.slots
     THREADS_PER_ENV, SHARERS, TRUNK = spec.threads_per_env, spec.sharers, spec.trunk
 
     @wp.func
-    def solve(
-        m: Model,
-        law: t.Law,
-        here: Lane,
-        ck: t.Checkpoint,
-        row: int,
-        links: t.Links,
-        nodes: t.Nodes,
-        g_base: vec6,  # read of a floating base
-    ):
-        """lambda = -M^-1 h g and the twists W under it, into nodes.
+    def solve(m: Model, law: Law, here: Lane, ck: Ck, row: int, links: Links, nodes: Nodes, g_base: vec6):
+        """lambda = -M^-1 h g and the twists W under it, into nodes; g_base is a floating base's.
 
         On the way in, W holds the articulated bias force.
         """
