@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pytest
 import reference
 import torch
 from numpy.typing import NDArray
@@ -26,6 +27,12 @@ SOFT = [name for name, task in TASKS.items() if task.contact == "soft"]  # on th
 ROBOTS = [name for name in SOFT if TASKS[name].asset == f"{name}.xml"]  # one task of each
 # Together these have every feature of a task's robot: a kernel takes seconds to compile.
 DISTINCT = ("half_cheetah", "humanoid", "humanoid_mtu", "swimmer")
+INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]  # and theta
+DISTINCT_CASES = [
+    pytest.param(name, *how, marks=[pytest.mark.slow] * (name != "half_cheetah" and how[0] == "implicit"))
+    for how in INTEGRATORS
+    for name in DISTINCT
+]
 
 # A free sphere of 2 kg; it falls, rolls, slides and rests.
 BALL = """
@@ -37,19 +44,6 @@ BALL = """
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1"/>
     <body pos="0 0 1"> <freejoint/> <geom type="sphere" size="0.1" mass="2"/> </body>
-  </worldbody>
-</mujoco>"""
-
-# A free box of 1 kg that slides on its lower corners.
-BLOCK = """
-<mujoco>
-  <custom>
-    <numeric name="k_n" data="1e4"/> <numeric name="k_d" data="1e4"/> <numeric name="k_t" data="200"/>
-    <numeric name="mu" data="0.5"/>
-  </custom>
-  <worldbody>
-    <geom name="floor" type="plane" size="1 1 1"/>
-    <body> <freejoint/> <geom type="box" size="0.2 0.2 0.02" mass="1"/> </body>
   </worldbody>
 </mujoco>"""
 

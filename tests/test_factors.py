@@ -9,6 +9,7 @@ import reference
 import torch
 import warp as wp
 from scenes import (
+    INTEGRATORS,
     acceleration,
     free_states,
     grounded_states,
@@ -21,7 +22,7 @@ from scenes import (
 )
 from test_accuracy import source
 from test_dynamics import mujoco_acceleration, relative_error
-from test_gradient import INTEGRATORS, check_gradients
+from test_gradient import check_gradients
 
 import diffsim
 from diffsim.kernels.lanes import divide

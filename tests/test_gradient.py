@@ -11,8 +11,9 @@ from scenes import (
     BALL,
     BOUNDED_SERVOS,
     COMPENSATED,
-    DISTINCT,
+    DISTINCT_CASES,
     HINGE,
+    INTEGRATORS,
     SHOULDER,
     SOFT,
     acting_states,
@@ -35,8 +36,6 @@ from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
 
-INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]
-LARGE = "humanoid", "humanoid_mtu", "swimmer"  # whose implicit kernels no other test needs
 ONE = Integration(substeps=1)
 STEPS = {"factors": 1e-5, "forces": 1e-2}  # of differences
 
@@ -91,14 +90,7 @@ def check_gradients(scene, states, rng, optional=None, **simulator):
             assert (error <= 1e-6 * size).all() and size.any(), f"gradient with respect to {name}"
 
 
-@pytest.mark.parametrize(
-    "name, integrator, theta",
-    [
-        pytest.param(name, *how, marks=[pytest.mark.slow] * (name in LARGE and how[0] == "implicit"))
-        for how in INTEGRATORS
-        for name in DISTINCT
-    ],
-)
+@pytest.mark.parametrize("name, integrator, theta", DISTINCT_CASES)
 def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
     scene = task_scene(name)
     states = acting_states(scene, 8, rng)
@@ -172,52 +164,6 @@ def test_float32_gradient_is_that_of_float64(name, rng):
     single, double = (gradients(scene, states, w, dtype, **simulator) for dtype in (torch.float32, torch.float64))
     errors = [np.linalg.norm(a - b, axis=-1) / np.linalg.norm(b, axis=-1) for a, b in zip(single, double, strict=True)]
     assert np.median(errors) < 1e-4 and np.max(errors) < 1e-2
-
-
-def close(value, expected):
-    return all(np.allclose(a, b, rtol=1e-4, atol=1e-4) for a, b in zip(value, expected, strict=True))
-
-
-@pytest.mark.parametrize("integrator, theta", [("semi_implicit", 0.0), ("implicit", 0.5)])
-def test_gradient_where_contact_has_corners(integrator, theta):
-    """At zero slip friction is smooth; at depth exactly 0 the gradient is that of one side."""
-    scene, weights = parse(BALL), [np.arange(1.0, 8.0), np.arange(1.0, 7.0)]
-
-    def at(depth, velocity):
-        qpos = np.array([[0.0, 0.0, scene.contact_radius[0] - depth, 1.0, 0.0, 0.0, 0.0]])
-        states = [qpos, np.array([[*velocity, 0.0, 0.0, 0.0]]), np.zeros((1, 0))]
-        return gradients(scene, states, weights, integration=Integration(integrator, 1, theta))
-
-    sticking, falling = [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]
-    assert close(at(1e-3, sticking), at(1e-3, [1e-9, 1e-9, 0.0]))
-    assert close(at(0.0, falling), at(1e-9, falling)) or close(at(0.0, falling), at(-1e-9, falling))
-    assert not close(at(1e-3, falling), at(-1e-3, falling))
-
-
-def test_gradient_where_a_limit_is_exactly_met():
-    """It is that of one side."""
-    scene, weights = parse(HINGE), [np.array([1.0]), np.array([2.0])]
-
-    def at(angle):
-        return gradients(scene, [np.array([[x]]) for x in (angle, 0.3 * np.sign(angle), 0.1)], weights, integration=ONE)
-
-    for bound in (scene.lower[1], scene.upper[1]):
-        assert close(at(bound), at(bound + 1e-9)) or close(at(bound), at(bound - 1e-9))
-        assert not close(at(bound + 1e-3), at(bound - 1e-3))
-
-
-def test_limit_force_in_closed_form():
-    """One substep of a hinge beyond its bound, and its derivatives, by hand."""
-    scene, h = parse(HINGE), 1 / 60
-    inertia = scene.inertia[1][2, 2] + scene.armature[1]
-    q, v, u = 0.53, -0.4, 0.7
-    leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in (q, v, u)]
-    _, after = Simulator(scene, 1, ONE, dtype=torch.float64).step(*leaves)
-    firmness, depth = 300 + 200 * v, q - 0.5
-    torque = 3 * u - firmness * depth
-    np.testing.assert_allclose(after.item(), v + h * torque / inertia, rtol=1e-12)
-    slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
-    np.testing.assert_allclose(slopes, np.array([-firmness, inertia / h - 200 * depth, 3]) * h / inertia, rtol=1e-12)
 
 
 @pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 
 import mujoco
@@ -116,39 +115,6 @@ def test_a_level_terrain_is_the_plane(rng):
     plane, level = (run(scene, *states, 4, integration=IMPLICIT) for scene in (flat, flat.with_terrain(vertices)))
     for value, expected in zip(level, plane, strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-11, atol=1e-11)
-
-
-@pytest.mark.parametrize("degrees", [-25.0, 12.0])
-def test_an_incline_is_a_plane_under_tilted_gravity(degrees, rng):
-    """The same robot on the same ground, seen from axes that are turned about y."""
-    angle = np.radians(degrees)
-    turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
-    slope = [[0.0, 0.0], [np.cos(angle), np.sin(angle)]]
-    settings = {"ball": IMPLICIT, "hopper": Integration(substeps=8)}
-    for name, integration in settings.items():
-        flat = parse(BALL) if name == "ball" else task_scene(name)
-        tilted = dataclasses.replace(flat, gravity=turn.T @ flat.gravity)
-        states = acting_states(flat, 16, rng)
-        states[1][:] *= 0.2
-
-        def turned(qpos, qvel, name=name):
-            qpos, qvel = qpos.copy(), qvel.copy()
-            if name == "ball":
-                qpos[:, :3], qvel[:, :3] = qpos[:, :3] @ turn.T, qvel[:, :3] @ turn.T
-                half = np.array([np.cos(angle / 2), 0, -np.sin(angle / 2), 0])
-                qpos[:, 3:7] = [reference.quaternion_product(half, q) for q in qpos[:, 3:7]]
-            else:
-                up = [0.0, 1.25]  # where the root is at qpos 0
-                plane = turn[np.ix_([0, 2], [0, 2])]
-                qpos[:, :2] = (qpos[:, :2] + up) @ plane.T - up
-                qpos[:, 2] -= angle
-                qvel[:, :2] = qvel[:, :2] @ plane.T
-            return qpos, qvel
-
-        ends = run(flat.with_terrain(slope), *turned(*states[:2]), states[2], 6, integration=integration)
-        expected = turned(*run(tilted, *states, 6, integration=integration))
-        for value, end in zip(ends, expected, strict=True):
-            np.testing.assert_allclose(value, end, rtol=1e-8, atol=1e-8)
 
 
 def test_the_force_is_continuous_along_the_ground(ball):
