@@ -150,20 +150,6 @@ def test_tables_of_the_simulator_agree_with_their_files(page: Path) -> None:
     assert checked
 
 
-def test_the_table_of_sweeps_has_the_first_value_that_fails() -> None:
-    (table,) = (each for each in tables(ROOT / "docs" / "stability.md") if "sweep" in each.header)
-    measured = read_csv(ROOT / "results" / "cpu" / "stability_sweeps.csv")
-    shown = {tuple(row[:2]): row[2:] for row in table.rows}
-    failed = {(line["task"], line["sweep"]) for line in measured if "False" in line.values()}
-    assert failed == {*shown}
-    for (task, sweep), cells in shown.items():
-        for integrator, cell in zip(table.header[2:], cells, strict=True):
-            lines = [x for x in measured if (x["task"], x["sweep"], x["integrator"]) == (task, sweep, integrator)]
-            bad = [line for line in lines if "False" in (line["finite"], line["energy bounded"])]
-            how = bad and ("energy" if bad[0]["finite"] == "True" else "not finite")
-            assert cell == (f"{bad[0]['value']} ({how})" if bad else "-"), (task, sweep, integrator)
-
-
 def test_the_table_of_transfer_has_medians_over_seeds() -> None:
     (table,) = (each for each in tables(ROOT / "docs" / "transfer.md") if "worst" in each.header)
     measured = read_csv(ROOT / "results" / "cpu" / "transfer.csv")

@@ -126,7 +126,7 @@ def test_the_command_writes_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[
     ("arguments", "message"),
     [
         ("", "of what? give a checkpoint"),
-        ("cartpole.pt", "was trained on cartpole, which stands on no ground"),
+        ("cartpole.pt", "was trained on cartpole, whose episodes do not end with a fall"),
         ("half_cheetah.pt", "was trained on half_cheetah, whose episodes do not end with a fall"),
         ("hopper.pt --body hat", "--body: the robot has no 'hat'; choose from torso, thigh, leg, foot"),
     ],

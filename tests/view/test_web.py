@@ -168,14 +168,6 @@ def test_fine_meshes_keep_their_shape_and_a_page_its_size() -> None:
     assert len(mesh_of({"meshes": meshes}, 1)[1]) == 4
 
 
-def test_the_ground_is_the_profile(rng: np.random.Generator) -> None:
-    scene, qpos, dt, ctrl = motion_of("ant", 2, rng)
-    hills = np.stack([terrain.rough(seed, length=5.0) for seed in (1, 2)])
-    motion = web.describe(scene.with_terrain(hills), qpos, dt, ctrl)
-    np.testing.assert_allclose(motion["ground"], hills[0], atol=1e-5)
-    assert len(motion["geoms"]) == scene.mj_model.ngeom - 1
-
-
 TOUCH = """<script>
 const key = name => dispatchEvent(new KeyboardEvent("keydown", { key: name, cancelable: true }));
 setTimeout(() => {
