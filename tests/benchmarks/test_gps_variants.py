@@ -56,20 +56,15 @@ def restored(path: Path) -> gps_variants.Search:
 # Names ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "profile"),
-    [
-        ("level", incline(0.0)),
-        ("incline:-10", incline(-10.0)),
-        ("incline:5:1.4", incline(5.0, start=1.4)),
-        ("step:-5", step(-0.05)),
-        ("step:2:0.7", step(0.02, start=0.7)),
-        ("rough:8", rough(0, degrees=8.0)),
-        ("rough:8:2:7:0.5", rough(7, 2.0, 8.0, start=0.5)),
-    ],
-)
-def test_terrains_by_their_names(name: str, profile: np.ndarray) -> None:
-    np.testing.assert_array_equal(named_terrains(name), profile[None])
+def test_terrains_by_their_names() -> None:
+    for name, profile in {
+        "level": incline(0.0),
+        "incline:5:1.4": incline(5.0, start=1.4),
+        "step:-5": step(-0.05),
+        "rough:8": rough(0, degrees=8.0),
+        "rough:8:2:7:0.5": rough(7, 2.0, 8.0, start=0.5),
+    }.items():
+        np.testing.assert_array_equal(named_terrains(name), profile[None])
 
 
 def test_terrains_in_one_array_keep_their_heights() -> None:
