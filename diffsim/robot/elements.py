@@ -96,4 +96,5 @@ def mass_matrix(m: mujoco.MjModel) -> Array:
     for dof, parent in enumerate(m.dof_parentid.tolist()):
         ways.append(np.append(ways[parent], dof) if parent >= 0 else np.array([dof]))
         matrix[dof, ways[dof]] += data.cdof[ways[dof]] @ force[dof]
-    return np.tril(matrix) + np.tril(matrix, -1).T
+        matrix[ways[dof], dof] = matrix[dof, ways[dof]]
+    return matrix

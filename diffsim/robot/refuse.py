@@ -129,14 +129,17 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
 
 
 def _inertia(m: mujoco.MjModel) -> Iterator[Row]:
-    matrix = mass_matrix(m)
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    scaled, idle = matrix / np.outer(scale, scale), np.zeros(m.nv, bool)
-    try:
-        np.linalg.cholesky(scaled - 1e-7 * np.eye(m.nv))  # in a fraction of the time of eigenvalues
-    except np.linalg.LinAlgError:
-        values, shapes = np.linalg.eigh(scaled)
-        idle |= np.abs(shapes[:, values < 1e-7]).max(1, initial=0.0) > 0.1
+    matrix, idle = mass_matrix(m), np.zeros(m.nv, bool)
+    for tree in range(m.ntree):
+        dofs = np.flatnonzero(m.dof_treeid == tree)
+        part = matrix[np.ix_(dofs, dofs)]
+        scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
+        part = part / np.outer(scale, scale)
+        try:
+            np.linalg.cholesky(part - 1e-7 * np.eye(len(dofs)))  # in a fraction of the time of eigenvalues
+        except np.linalg.LinAlgError:
+            values, shapes = np.linalg.eigh(part)
+            idle[dofs] = np.abs(shapes[:, values < 1e-7]).max(1, initial=0.0) > 0.1
     yield "joint", np.isin(range(m.njnt), m.dof_jntid[idle]), "they have a motion without inertia"
 
 
