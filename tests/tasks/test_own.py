@@ -14,7 +14,6 @@ from torch import Tensor
 import diffsim
 from diffsim.tasks import TASKS, Task, TaskError, find_task
 from diffsim.tasks.base import way_forward
-from diffsim.training import evaluate
 from diffsim.training.evaluation import fitting
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_robot.xml"
@@ -296,30 +295,6 @@ def test_forward_is_along_x(joints: str, turn: str, column: int | None) -> None:
 def test_the_shipped_robots_move_along_their_first_coordinate() -> None:
     found = {name: way_forward(task.load_robot()) for name, task in TASKS.items()}
     assert found == {name: None if name == "cartpole" else 0 for name in TASKS}
-
-
-def test_a_speed_is_that_of_the_way_forward() -> None:
-    """A sled that glides at 2 m/s along x, its second joint, just above the ground."""
-
-    class Glide(Bare):
-        asset = mujoco.MjSpec.from_string(
-            SLIDES.format(joints=Z + X, turn="").replace("<worldbody>", "<option gravity='0 0 0'/><worldbody>")
-        )
-        episode_length = 90
-        start = (-0.89, 0.0, 0.0, 0.0, 2.0, 0.0)
-
-    class Sideways(Glide):
-        forward_column = 0
-
-    class Nowhere(Glide):
-        forward_column = None
-
-    results = [
-        evaluate(diffsim.make(kind, num_envs=2, dtype=torch.float64), lambda obs: obs[:, :0])
-        for kind in (Glide, Sideways, Nowhere)
-    ]
-    assert results[0].speed == pytest.approx(2.0, rel=1e-6) and results[2].speed is None
-    assert results[1].speed is not None and abs(results[1].speed) < 1e-6
 
 
 # Contact --------------------------------------------------------------------------------------------------------------
