@@ -157,7 +157,7 @@ def test_a_step_is_mujocos_or_the_file_says_why_not(place: str, text: str) -> No
         states.append((qpos, 0.5 * rng.normal(size=m.nv)))
     qpos, qvel = (torch.tensor(np.array(x)) for x in zip(*states, strict=True))
     with startup.quick_kernels(), torch.no_grad():
-        sim = Simulator(scene, 12, Integration("mujoco", 1, passes=300), H, 1, dtype=torch.float64)
+        sim = Simulator(scene, 12, Integration("mujoco", 1, passes=300, tolerance=1e-12), H, 1, dtype=torch.float64)
         found = sim.step(qpos, qvel, torch.full((12, m.nu), 0.3, dtype=torch.float64))[1].numpy()
     low, high = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, (-1.0, 1.0)).T
     data, errors = mujoco.MjData(m), []
