@@ -42,17 +42,18 @@ def explicit(substeps, integrator="semi_implicit", dtype=torch.float64):
 
 def test_errors_fall_with_the_order_of_the_integrator(motion):
     truth = Reference(motion, explicit(512))
-    euler = [Reference(motion, explicit(n)).row(truth) for n in (4, 8)]
+    euler = [Reference(motion, explicit(n)).errors(truth) for n in (4, 8)]
     second_truth = Reference(motion, explicit(512, "extrapolated"))
-    second = [Reference(motion, explicit(n, "extrapolated")).row(second_truth) for n in (4, 8)]
-    for span in (0.1, 0.5):
-        assert euler[0].state[span] / euler[1].state[span] == pytest.approx(2, rel=0.15)
-        assert second[0].state[span] / second[1].state[span] == pytest.approx(4, rel=0.5)
-    assert euler[0].gradient[32] / euler[1].gradient[32] == pytest.approx(2, rel=0.2)
-    assert euler[0].cosine[8] == pytest.approx(1, abs=1e-3)
-    assert second[1].error < euler[1].error / 5
-    again = Reference(motion, explicit(512)).row(truth)
-    assert again.error == again.gradient[8] == again.drift == 0 and again.cosine[32] == pytest.approx(1)
+    second = [Reference(motion, explicit(n, "extrapolated")).errors(second_truth) for n in (4, 8)]
+    for column in ("state 0.1 s", "state 0.5 s"):
+        assert euler[0][column] / euler[1][column] == pytest.approx(2, rel=0.15)
+        assert second[0][column] / second[1][column] == pytest.approx(4, rel=0.5)
+    assert euler[0]["gradient 32"] / euler[1]["gradient 32"] == pytest.approx(2, rel=0.2)
+    assert euler[0]["cosine 8"] == pytest.approx(1, abs=1e-3)
+    assert second[1]["state 0.5 s"] < euler[1]["state 0.5 s"] / 5
+    again = Reference(motion, explicit(512)).errors(truth)
+    assert again["state 0.5 s"] == again["gradient 8"] == again["energy drift"] == 0
+    assert again["cosine 32"] == pytest.approx(1)
 
 
 def test_start_states_lie_on_the_motion_and_actions_lead_on(motion, pendulum):
@@ -69,7 +70,8 @@ def test_start_states_lie_on_the_motion_and_actions_lead_on(motion, pendulum):
 
 def row(substeps, cost, error, gradient=None, contained=0.0):
     gradient = error if gradient is None else gradient
-    return Row(explicit(substeps), cost, 0.0, {0.5: error}, {8: gradient}, {8: 1.0}, contained=contained)
+    numbers = {"us with gradient": cost, "state 0.5 s": error, "gradient 8": gradient, "contained": contained}
+    return Row(explicit(substeps), numbers)
 
 
 def test_the_fastest_setting_that_is_good_enough_is_chosen():

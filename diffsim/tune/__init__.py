@@ -154,19 +154,17 @@ def draw(path: Path, rows: Sequence[Row], best: Row | None, default: Row, title:
         print("no picture: pip install matplotlib")
         return
     figure = Figure(figsize=(9, 4), layout="constrained")
-    panels = {
-        f"state after {SPANS[-1]} s [m, rad]": lambda r: r.error,
-        "gradient, 8 steps, relative": lambda r: r.gradient[8],
-    }
-    for axis, (name, value) in zip(figure.subplots(1, 2), panels.items(), strict=True):
-        for kind in dict.fromkeys(row.kind for row in rows):
-            own = [row for row in rows if row.kind == kind]
-            axis.loglog([row.cost for row in own], [value(row) for row in own], "o-", label=kind, markersize=4)
+    columns = {f"state {SPANS[-1]:g} s": "state's error [m, rad]", "gradient 8": "gradient's relative error, 8 steps"}
+    for axis, (column, label) in zip(figure.subplots(1, 2), columns.items(), strict=True):
+        for kind in dict.fromkeys(row.setting.kind for row in rows):
+            own = [row for row in rows if row.setting.kind == kind]
+            axis.loglog([r.cost for r in own], [r.numbers[column] for r in own], "o-", label=kind, markersize=4)
         for row, text in ((default, "default"), (best, "chosen")):
             if row:
-                axis.annotate(text, (row.cost, value(row)), textcoords="offset points", xytext=(6, 6))
+                place = row.cost, row.numbers[column]
+                axis.annotate(text, place, textcoords="offset points", xytext=(6, 6))
         axis.set_xlabel("us of a control step with gradient")
-        axis.set_ylabel(name)
+        axis.set_ylabel(label)
     figure.suptitle(title)
     figure.axes[0].legend(frameon=False, fontsize="small")
     with whole_file(path) as part:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,44 +23,25 @@ FACTORS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # substeps, in multiples of the def
 PASSES = (2, 4, 8)  # of Newton's method on MuJoCo's contact
 
 
-@dataclass
-class Row:
+class Row(NamedTuple):
     """What a setting costs and errs. Errors are medians over the start states."""
 
     setting: Setting
-    forward: float = math.nan  # us of a control step of one environment, without gradient
-    backward: float = math.nan  # us of its gradient: what a window of 8 steps takes beyond forward
-    state: dict[float, float] = field(default_factory=dict)  # root mean square over dofs [m, rad] after SPANS
-    gradient: dict[int, float] = field(default_factory=dict)  # relative error over HORIZONS
-    cosine: dict[int, float] = field(default_factory=dict)  # with the reference's
-    residual: float = 0.0  # of MuJoCo's constraints, see Simulator
-    drift: float = math.nan  # of the energy in a fall of 0.5 s, relative to the largest kinetic energy
-    contained: float = math.nan  # share of environments that did not stay finite
-
-    @property
-    def kind(self) -> str:
-        """What it shares with the settings of other substeps."""
-        (how, dtype), theta = self.setting, self.setting.integration.theta
-        words = (
-            f"{how.passes} passes" if how.constrained else f"theta {theta:g}" if how.integrator == "implicit" else ""
-        )
-        return " ".join((how.integrator, words, "float64" * (dtype == torch.float64))).strip()
+    # us of a control step of one environment, forward and with its gradient; root mean square over dofs [m, rad] after
+    # SPANS; relative error and cosine of gradients over HORIZONS; the largest residual of MuJoCo's constraints; drift
+    # of the energy in a fall, relative to the largest kinetic energy; share of environments that were contained
+    numbers: dict[str, float]
 
     @property
     def cost(self) -> float:
-        return self.forward + self.backward
+        return self.numbers["us with gradient"]
 
     @property
     def error(self) -> float:
-        return self.state.get(SPANS[-1], math.inf)
+        return self.numbers[f"state {SPANS[-1]:g} s"]
 
     def columns(self) -> dict[str, str]:
-        numbers = {"us forward": self.forward, "us with gradient": self.cost}
-        numbers |= {f"state {span:g} s": value for span, value in self.state.items()}
-        numbers |= {f"gradient {h}": value for h, value in self.gradient.items()}
-        numbers |= {f"cosine {h}": value for h, value in self.cosine.items()}
-        numbers |= {"residual": self.residual, "energy drift": self.drift, "contained": self.contained}
-        return {"setting": self.setting.flags} | {name: f"{value:.3g}" for name, value in numbers.items()}
+        return {"setting": self.setting.flags} | {name: f"{value:.3g}" for name, value in self.numbers.items()}
 
 
 def settings(task: type[Task], contact: str) -> list[Setting]:
@@ -87,22 +67,21 @@ class Reference:
         self.gradients = motion.gradients(setting)
         self.energies = motion.fall(setting)[0]
 
-    def row(self, truth: Reference) -> Row:
-        row = Row(self.setting, residual=self.residual, contained=self.contained)
-        for span, qpos in self.states.items():
-            row.state[span] = float(np.median(apart(self.motion.scene.mj_model, qpos, truth.states[span])))
-        for horizon, found in self.gradients.items():
-            expected = truth.gradients[horizon]
-            row.gradient[horizon] = ((found - expected).norm(dim=1) / expected.norm(dim=1)).median().item()
-            row.cosine[horizon] = F.cosine_similarity(found, expected, dim=1).median().item()
-        gained = truth.energies[..., 0].max(0)
-        row.drift = float(np.median(abs(self.energies - truth.energies)[..., 1].max(0) / gained))
-        return row
+    def errors(self, truth: Reference) -> dict[str, float]:
+        model, gained = self.motion.scene.mj_model, truth.energies[..., 0].max(0)
+        pairs = [(h, found, truth.gradients[h]) for h, found in self.gradients.items()]
+        drift = abs(self.energies - truth.energies)[..., 1].max(0) / gained
+        return (
+            {f"state {t:g} s": float(np.median(apart(model, q, truth.states[t]))) for t, q in self.states.items()}
+            | {f"gradient {h}": ((a - b).norm(dim=1) / b.norm(dim=1)).median().item() for h, a, b in pairs}
+            | {f"cosine {h}": F.cosine_similarity(a, b, dim=1).median().item() for h, a, b in pairs}
+            | {"residual": self.residual, "energy drift": float(np.median(drift)), "contained": self.contained}
+        )
 
 
-def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> list[tuple[float, float]]:
-    """Microseconds of a control step of one environment, without gradient and of the gradient: the least of `rounds`
-    turns of all simulators, in windows of 8 steps from the start states."""
+def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> list[list[float]]:
+    """Microseconds of a control step of one environment, forward and with its gradient: the least of `rounds` turns of
+    all simulators, in windows of 8 steps from the start states."""
     best = np.full((len(sims), 2), np.inf)
     for turn in range(rounds + 1):  # the first one compiles and warms up
         for row, sim in zip(best, sims, strict=True):
@@ -123,7 +102,7 @@ def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> li
                 spent.append((clock(sim) - start) / len(leaves) / sim.num_envs * 1e6)
             if turn:
                 row[:] = np.minimum(row, spent)
-    return [(forward, both - forward) for forward, both in best.tolist()]
+    return best.tolist()
 
 
 def measure(motion: Motion, found: list[Setting], device: str, rows: list[Row]) -> None:
@@ -132,10 +111,9 @@ def measure(motion: Motion, found: list[Setting], device: str, rows: list[Row]) 
     finest = found[0].integration._replace(substeps=FINER * most, passes=12)
     truth = Reference(motion, Setting(finest, torch.float64))
     times = timed([motion.simulator(setting, TIMED, device=device) for setting in found], motion)
-    for setting, (forward, backward) in zip(tqdm(found, "errors", leave=False, ncols=80), times, strict=True):
-        row = Reference(motion, setting).row(truth)
-        row.forward, row.backward = forward, backward
-        rows.append(row)
+    for setting, (forward, both) in zip(tqdm(found, "errors", leave=False, ncols=80), times, strict=True):
+        numbers = {"us forward": forward, "us with gradient": both}
+        rows.append(Row(setting, numbers | Reference(motion, setting).errors(truth)))
 
 
 def clock(sim: Simulator) -> float:
@@ -148,16 +126,16 @@ def front(rows: Iterable[Row]) -> list[Row]:
     """The rows that no other one beats in cost, and in the error of the state or of the gradient; the fastest first."""
 
     def beaten(row: Row, other: Row) -> bool:
-        errors = [(r.cost, r.error, r.gradient.get(HORIZONS[0], math.inf)) for r in (other, row)]
-        return all(a <= b for a, b in zip(*errors, strict=True)) and errors[0] != errors[1]
+        mine, its = ((r.cost, r.error, r.numbers[f"gradient {HORIZONS[0]}"]) for r in (row, other))
+        return all(a <= b for a, b in zip(its, mine, strict=True)) and its != mine
 
-    rows = [row for row in rows if math.isfinite(row.cost)]
+    rows = [*rows]
     return sorted((row for row in rows if not any(beaten(row, other) for other in rows)), key=lambda row: row.cost)
 
 
 def choice(rows: Iterable[Row], error: float) -> Row | None:
     """The fastest of those with at most that error of the state after 0.5 s, and no environment contained."""
-    enough = (row for row in rows if row.error <= error and not row.contained)
+    enough = (row for row in rows if row.error <= error and not row.numbers["contained"])
     return min(enough, key=lambda row: row.cost, default=None)
 
 
@@ -173,11 +151,11 @@ def costs(motion: Motion, setting: Setting, device: str) -> dict[str, float]:
     parts = [part for part in COSTS if part in features]
     scenes = {part: without(motion.scene, part) for part in parts}
     sims = [sim, *(motion.simulator(setting, TIMED, scene, device=device) for scene in scenes.values())]
-    whole, *others = (sum(times) for times in timed(sims, motion))
+    whole, *others = (both for _, both in timed(sims, motion))
     return {"all": whole} | {part: whole - other for part, other in zip(parts, others, strict=True)}
 
 
 def batches(motion: Motion, setting: Setting, device: str) -> dict[int, float]:
     """Microseconds of a control step of one environment with its gradient, for numbers of environments per call."""
     sims = [motion.simulator(setting, n, device=device) for n in BATCHES]
-    return {n: sum(times) for n, times in zip(BATCHES, timed(sims, motion, rounds=3), strict=True)}
+    return {n: both for n, (_, both) in zip(BATCHES, timed(sims, motion, rounds=3), strict=True)}

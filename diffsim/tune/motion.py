@@ -32,6 +32,13 @@ class Setting(NamedTuple):
     dtype: torch.dtype = torch.float32
 
     @property
+    def kind(self) -> str:
+        """What it shares with the settings of other substeps."""
+        how = self.integration
+        of = {"mujoco": f" {how.passes} passes", "implicit": f" {how.theta:g}"}.get(how.integrator, "")
+        return how.integrator + of + " float64" * (self.dtype == torch.float64)
+
+    @property
     def flags(self) -> str:
         """What a script is given to use it."""
         how = self.integration
