@@ -29,6 +29,7 @@ from scenes import (
 from test_gradient import differences, gradients, weights
 
 import diffsim
+from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS, SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -315,6 +316,68 @@ def test_gradients_know_that_a_lower_ball_lands_earlier():
     assert (errors[0] < (0.3, 0.3, 4.0)).all() and (errors[1] > (2.0, 2.0, 9.0)).all(), errors
 
 
+# Tolerance
+
+
+def sliding_ant(friction, speed, rng, count=32):
+    """An ant on ground of that friction, and states in which it slides, or hits the ground at that speed."""
+    model = mujoco.MjModel.from_xml_path(task_scene("ant").path)
+    model.geom_friction[:, 0] = friction
+    scene = load_scene(model)
+    qpos, qvel, ctrl = acting_states(scene, count, rng)
+    qvel[:, :2] += speed * rng.normal(size=(count, 2))
+    qvel[:, 2] -= speed * rng.random(count)
+    return scene, (qpos, qvel, ctrl)
+
+
+@pytest.mark.parametrize("friction, speed", [(0.3, 2.0), (0.05, 2.0), (1.0, 10.0)])
+def test_slips_and_impacts_converge_to_mujocos(friction, speed, rng):
+    """With the default's tolerance and at most as many passes."""
+    scene, states = sliding_ant(friction, speed, rng)
+    _, expected, kinds = in_mujoco(scene, *states)
+    assert STATES["cone"] in kinds
+    _, qvel, residual = step(scene, states, Integration().passes, tolerance=Integration().tolerance)
+    assert residual.max() <= Integration().tolerance
+    assert (abs(qvel - expected).max(1) / abs(expected - states[1]).max(1)).max() < 1e-3
+    check_gradients(scene, [x[:8] for x in states], rng, enough=0.9)
+
+
+def test_gradient_at_the_tolerance_is_near_that_of_the_solution(rng):
+    scene, states = sliding_ant(0.3, 2.0, rng)
+    w, parts = weights(scene, rng), []
+    for tolerance in (1e-4, TOLERANCE):
+        how = Integration("mujoco", 1, passes=PASSES, tolerance=tolerance, touchdown=False)
+        parts.append(np.concatenate(gradients(scene, states, w, integration=how, control_dt=H), axis=1))
+    error = np.linalg.norm(parts[0] - parts[1], axis=1) / np.linalg.norm(parts[1], axis=1)
+    assert 0 < error.max() < 1e-2
+
+
+def test_neighbours_do_not_change_where_an_environment_converges(rng):
+    """Bit for bit, beside those that take one pass and those that take many, in states and gradients."""
+    scene, states = sliding_ant(0.3, 2.0, rng, 16)
+    states[0][::2, 2] += 1.0  # in the air
+    found, sim = [], Simulator(scene, 16, Integration("mujoco", 4), 4 * H, block=16)
+    for order in (np.arange(16), np.full(16, 3), np.roll(np.arange(16), 5)):
+        start = [torch.tensor(x[order], dtype=torch.float32, requires_grad=True) for x in states]
+        sim.rewind()
+        end = torch.cat(sim.step(*start), 1)
+        all_of = torch.cat((end, *torch.autograd.grad(end.square().sum(), start)), 1)
+        found.append((all_of[list(order).index(3)], sim.passes[list(order).index(3)]))
+        if len(found) == 1:
+            assert sim.passes.min() < 2 and sim.passes.max() > 5
+    assert all(torch.equal(a, found[0][0]) and b == found[0][1] for a, b in found)
+
+
+def test_steps_that_do_not_converge_are_counted():
+    """Each environment's, whose last pass is not enough; statistics take the count and begin anew."""
+    env = diffsim.make("ant", 8, seed=0, contact="mujoco", passes=1, threads=1)
+    env.reset(seed=0)
+    action = torch.zeros(8, env.scene.nu)
+    wrong = sum((env.step(action), env.sim.residual > env.sim.integration.tolerance)[1].int() for _ in range(20))
+    assert wrong.sum() > 0 and torch.equal(env.sim.unconverged, wrong.int())
+    assert env.take_statistics()["unconverged"] == wrong.sum() and not env.sim.unconverged.any()
+
+
 # Single precision, metrics, bad input
 
 
@@ -339,6 +402,7 @@ def test_blocks_in_single_precision_are_close(rng):
     "scene, integration, why",
     [
         (pendulum(), Integration("mujoco", 4, passes=0), "passes is 0, must be an integer of at least 1"),
+        (pendulum(), Integration("mujoco", 4, tolerance=0), "tolerance is 0, must lie between 0 and 1"),
         (pendulum(), Integration("mujoco", 4, theta=0.5), "only the implicit integrator has a theta"),
         (
             pendulum('frictionloss="1"'),

@@ -46,7 +46,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
-    SPHERES = max(spec.spheres, 1)
+    SPHERES, PATIENT = max(spec.spheres, 1), PATIENCE["frictionloss" in spec.features]
 
     Load, Link, Iterate, Touch = t.Load, t.Link, t.Iterate, t.Touch
 
@@ -175,7 +175,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 solve = int(0)  # passes so far
                 going = T(1.0)  # 1 for environments that have not converged, else 0
                 off = T(0.0)  # square of the residual
-                size = T(1.0)
+                size = T(1.0)  # 1 + the acceleration squared
+                moved = T(0.0)  # the step squared
                 wdot = vec3()
                 vdot = vec3()
                 turning_up = vec3()
@@ -210,7 +211,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                             if solve > 1 and again <= SEARCHES:
                                 if again == 1:
                                     found[0] = pick(T(tolerance) * T(tolerance), off, going * found[0], T(0.0))
-                                patience = T(wp.where(solve < PATIENCE, T(1.0), T(NEAR)))
+                                patience = T(wp.where(solve < PATIENT, 1.0, NEAR))
                                 part, bracket = newton.search(
                                     m, here, iterates, free_loads, part, bracket, patience, found
                                 )
@@ -229,7 +230,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                             else:
                                 again = 0
                         if solve > 0:
-                            off = pick(part, T(1.0), T(1.0), off)  # nobody knows where a part of a step leads
+                            off = off + (T(1.0) - part) * (T(1.0) - part) * moved / size  # what was not taken
                             going = pick(T(tolerance) * T(tolerance), off, going, T(0.0))
                         if solve == passes or not block.any_of(going):
                             residual = wp.max(residual, off)
@@ -326,6 +327,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                     if wp.static(CONSTRAINED):
                         if phase == NEWTON:
                             size = T(0.0)
+                            moved = T(0.0)
                             if wp.static(FLOATING):
                                 turning_up = newton.going_on(going, turning_up - wdot)
                                 speeding_up = newton.going_on(going, speeding_up - vdot)
@@ -333,6 +335,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                                 vdot = vdot + speeding_up
                                 iterates[0].twist = join(links[0].R * turning_up, speeding_up)
                                 size = T(m.carried[at]) * (wp.length_sq(wdot) + wp.length_sq(vdot))
+                                moved = wp.length_sq(turning_up) + wp.length_sq(speeding_up)
+                                moved = T(m.carried[at]) * moved
                             for i in range(1, n):
                                 step = pick(T(0.0), going, u[i] - iterates[i].rate, T(0.0))
                                 rate = iterates[i].rate + step
@@ -340,8 +344,10 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                                 iterates[i].rate = rate
                                 iterates[i].twist = iterates[m.parent[at + i]].twist + links[i].S * step
                                 size = size + T(m.carried[at + i]) * rate * rate
+                                moved = moved + T(m.carried[at + i]) * step * step
                             if wp.static(THREADS_PER_ENV > 1):
                                 size = sums.add(size)
+                                moved = sums.add(moved)
                             size = size + T(1.0)
                         if phase == SOLVE:
                             for i in range(1, n):

@@ -19,9 +19,10 @@ from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
-SEARCHES = 3  # evaluations of a line search
-NEAR = 0.1  # its end: the slope in multiples of the first one
-PATIENCE = 6  # passes for which a whole step may end in a slope as large as the first one
+SEARCHES = 6  # evaluations of a line search
+EDGE = 0.1  # least distance of a trial from the ends of its bracket, in multiples of its width
+NEAR = 0.05  # its end: the slope in multiples of the first one
+PATIENCE = 6, 2  # passes, and with dry friction, for which a whole step may end in a slope as large as the first one
 
 
 @cache
@@ -132,7 +133,10 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             bracket[1] = pick(T(0.0), short, slope, bracket[1])
             bracket[2] = pick(T(0.0), long, part, bracket[2])
             bracket[3] = pick(T(0.0), long, slope, bracket[3])
-            secant = bracket[0] - (bracket[2] - bracket[0]) * bracket[1] / (bracket[3] - bracket[1])
+            width = bracket[2] - bracket[0]
+            secant = bracket[0] - width * bracket[1] / (bracket[3] - bracket[1])
+            # Where the slope has a kink, secants come from one side only.
+            secant = wp.max(wp.min(secant, bracket[2] - T(EDGE) * width), bracket[0] + T(EDGE) * width)
             part = pick(T(0.0), long + short, secant, part)
         return part, bracket
 
