@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
 from diffsim.training.flags import ParallelFlags
+from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
 
 # Windows: section 4.2 of the SHAC paper; everything else: its authors' released settings.
@@ -91,10 +92,11 @@ def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Seque
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state; or of its mean alone."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.mean = mlp(obs_dim, args.hidden, action_dim, orthogonal=args.deterministic_policy)
+        network = mlp(seen or obs_dim, args.hidden, action_dim, orthogonal=args.deterministic_policy)
+        self.mean = seeing(seen, network)
         log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
         self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)
 
@@ -131,7 +133,7 @@ class BPTT:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
         # However large a gradient is, it is clipped and followed: chaos is what the comparison is about.
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas, skip_norm=math.inf)

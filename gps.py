@@ -131,6 +131,8 @@ class Args(Flags):
             fail("trains in one process; start it without torchrun")
         if find_task(self.env).num_memory:
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
+        if (seen := find_task(self.env).actor_dim) is not None:
+            fail(f"{self.env} shows its actor the first {seen} numbers of an observation, and this policy takes all")
         if self.reward == "target" and self.env not in TARGETS:
             fail(f"--reward target is known of {', '.join(TARGETS)}; {self.env} has --reward native")
         most = max(2, self.guides)

@@ -28,7 +28,7 @@ from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, evaluate, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer
+from diffsim.training.layers import ObsNormalizer, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Few, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -142,10 +142,10 @@ def mlp(inputs: int, hidden: Widths, outputs: int | None, activation: type[nn.Mo
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = mlp(obs_dim, args.hidden, None, nn.ReLU)
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -220,7 +220,7 @@ class MBPO:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.held_out = -(-args.num_envs // HELD_OUT)
-        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         critics = [mlp(obs_dim + action_dim, args.hidden, 1, nn.ReLU) for _ in range(2)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)

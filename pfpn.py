@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import Run, distributed, evaluate, fail, script
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, moments
+from diffsim.training.layers import Likeliest, ObsNormalizer, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Fraction, Natural, NonNegative, Positive, Repeats, Several, SomeWidths
 
@@ -230,10 +230,10 @@ def mlp(inputs: int, hidden: SomeWidths) -> nn.Sequential:
 class Actor(nn.Module):
     """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = mlp(obs_dim, args.hidden)
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden))
         self.head = Head(args, args.hidden[-1], action_dim)
         self.value = nn.Linear(args.hidden[-1], 1)
 
@@ -352,7 +352,7 @@ class PPO:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        self.actor = Actor(args, env.task.obs_dim, env.scene.nu).to(env.device)
+        self.actor = Actor(args, env.task.obs_dim, env.scene.nu, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
         self.return_normalizer = ObsNormalizer().to(env.device)

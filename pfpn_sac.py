@@ -25,7 +25,7 @@ from diffsim import DiffEnv
 from diffsim.training import Run, distributed, evaluate, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer
+from diffsim.training.layers import Likeliest, ObsNormalizer, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -194,10 +194,10 @@ def mlp(inputs: int, hidden: SomeWidths, outputs: int | None = None) -> nn.Seque
 class Actor(nn.Module):
     """pi(a|s), of normalized observations."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = mlp(obs_dim, args.hidden)
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden))
         self.head = Head(args, args.hidden[-1], action_dim)
 
     def forward(self, obs: Tensor) -> Mixture:
@@ -295,7 +295,7 @@ class SAC:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor = Actor(args, obs_dim, action_dim).to(env.device)
+        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
         critics = [mlp(obs_dim + action_dim, args.critic_hidden, 1) for _ in range(2)]

@@ -25,6 +25,7 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, evaluate, fail, script
 from diffsim.training.flags import Flags
+from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
 
 # fmt: off
@@ -104,14 +105,14 @@ class Args(Flags):
 class Actor(nn.Module):
     """The deterministic policy a = tanh(u(s))."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
+    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        layers, inputs = list[nn.Module](), obs_dim
+        layers, inputs = list[nn.Module](), seen or obs_dim
         for width in args.hidden:
             layers += [nn.Linear(inputs, width), nn.ELU(), nn.LayerNorm(width)]
             inputs = width
-        self.mean = nn.Sequential(*layers, nn.Linear(inputs, action_dim))
+        self.mean = seeing(seen, nn.Sequential(*layers, nn.Linear(inputs, action_dim)))
 
     def forward(self, obs: Tensor) -> Tensor:
         """u (..., action_dim), the action before tanh."""
@@ -218,7 +219,7 @@ class PODS:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        self.actor = Actor(args, env.task.obs_dim, env.scene.nu).to(env.device)
+        self.actor = Actor(args, env.task.obs_dim, env.scene.nu, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.lr)
         self.control_steps = 0  # of the iteration

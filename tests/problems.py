@@ -24,7 +24,9 @@ class Problem:
 
     def __init__(self, num_envs: int) -> None:
         self.num_envs, self.x = num_envs, torch.zeros(num_envs, 1)
-        self.task = SimpleNamespace(obs_dim=1, terminated=lambda obs: torch.zeros(len(obs), dtype=torch.bool))
+        self.task = SimpleNamespace(
+            obs_dim=1, actor_dim=None, terminated=lambda obs: torch.zeros(len(obs), dtype=torch.bool)
+        )
         self.sim = SimpleNamespace(nonfinite_gradients=torch.zeros(num_envs, dtype=torch.int32))
 
     def detach(self) -> Tensor:

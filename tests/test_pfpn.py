@@ -258,7 +258,7 @@ class Problem:
 
     device, episode_length = torch.device("cpu"), 10**9
     scene = SimpleNamespace(nu=1)
-    task = SimpleNamespace(obs_dim=1)
+    task = SimpleNamespace(obs_dim=1, actor_dim=None)
 
     def __init__(self, num_envs: int, reward: Callable[[Tensor, Tensor], Tensor], steps: int = 1) -> None:
         self.num_envs, self.reward, self.steps, self.t = num_envs, reward, steps, 0
