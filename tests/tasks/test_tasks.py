@@ -176,6 +176,16 @@ def test_observation_reward_and_end(name: str, rng: np.random.Generator) -> None
     torch.testing.assert_close(task.reward(one, action[0, 0]), reward[0, 0])
 
 
+def test_swimmer_and_walker(rng: np.random.Generator) -> None:
+    for name, speed, height, v_x in (("swimmer", 2.0, None, 3), ("walker", 1.2, 0, 8)):
+        task, nv = TASKS[name](dtype=torch.float64), load(name).nv
+        q, v, a = (torch.tensor(rng.normal(size=n)) for n in (nv, nv, load(name).nu))
+        obs = task.observe(q, v, a)
+        assert obs.tolist() == [*q[2 if name == "swimmer" else 1 :].tolist(), *v.tolist()]
+        cost = (v[0] - speed) ** 2 + 1e-4 * (a**2).sum() + (0 if height is None else 10 * q[1] ** 2)
+        assert task.reward(obs, a).item() == pytest.approx(-cost.item()) and obs[v_x] == v[0]
+
+
 @pytest.mark.parametrize("name, level", [("hopper", -0.3), ("humanoid", 0.84), ("humanoid_mtu", 0.51)])
 def test_height_reward_at_its_corners(name: str, level: float) -> None:
     """Eqs. 16-17, 21-22, 24-25: parabola, line and the two clips; the gradient at the corner is the line's."""
