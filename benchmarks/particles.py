@@ -41,7 +41,7 @@ class Bandit:
     """An environment whose episodes are one action: 1 / (d + 0.1), of the distance d to the nearest peak."""
 
     num_envs, device = 256, torch.device("cpu")
-    scene, task = SimpleNamespace(nu=1), SimpleNamespace(obs_dim=1)
+    scene, task = SimpleNamespace(nu=1), SimpleNamespace(obs_dim=1, actor_dim=None)
 
     def detach(self) -> Tensor:
         return torch.zeros(256, 1)
