@@ -44,6 +44,8 @@ def records(env, actions):
 def test_spaces(name):
     env = diffsim.make(name, num_envs=3, seed=0)
     sizes = env.task.obs_dim, env.scene.nu
+    others = {"humanoid_imitation": (57, 21), "go1": (108, 12), "go2": (108, 12), "g1": (227, 29)}
+    assert others.get(name, sizes) == sizes  # the other tasks' are in tasks/test_tasks.py
     assert (env.single_observation_space.shape, env.single_action_space.shape) == (sizes[:1], sizes[1:])
     assert env.observation_space.shape == (3, sizes[0]) and env.action_space.shape == (3, sizes[1])
     assert (env.single_action_space.low == -1).all() and (env.single_action_space.high == 1).all()
