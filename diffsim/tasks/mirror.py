@@ -6,6 +6,7 @@ it keeps y and turns x and z round. Left and right joints, motors and muscles ch
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -99,18 +100,10 @@ def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Seque
 
 def _partners(names: Sequence[str], sides: Sides) -> list[int]:
     """Where the other side's name of each is; its own place if it is of no side."""
-    images = [_image(name, sides) for name in names]
+    other = {side: pair[1 - k] for pair in sides for k, side in enumerate(pair)}
+    ends = "|".join(other)
+    images = [re.sub(f"^({ends})|({ends})$", lambda side: other[side[0]], name, count=1) for name in names]
     for name, image in zip(names, images, strict=True):
         if image not in names:
             raise ValueError(f"{name!r} has no mirror image: there is no {image!r}")
     return [names.index(image) for image in images]
-
-
-def _image(name: str, sides: Sides) -> str:
-    for pair in sides:
-        for side, other in (pair, pair[::-1]):
-            if name.startswith(side):
-                return other + name.removeprefix(side)
-            if name.endswith(side):
-                return name.removesuffix(side) + other
-    return name
