@@ -22,8 +22,6 @@ TASKS: dict[str, type[Task]] = {
         *(Go1, Go2, G1),
     )
 }
-# Those of the SHAC paper, which have presets of every accuracy
-SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
 
 
 def find_task(name: str | type[Task]) -> type[Task]:
@@ -35,4 +33,4 @@ def find_task(name: str | type[Task]) -> type[Task]:
     return TASKS.get(name) or task_of_file(name)
 
 
-__all__ = ["FILE", "SHAC_TASKS", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task", "TaskError", "find_task"]
+__all__ = ["FILE", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task", "TaskError", "find_task"]
