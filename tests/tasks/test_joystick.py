@@ -94,42 +94,25 @@ def test_memory_holds_command_clock_actions_and_noise() -> None:
     torch.testing.assert_close(after[:, 4 + 2 * n :], (0.5 * task._noise).expand(500, -1))
 
 
-def test_observation_of_a_turned_robot() -> None:
-    """Velocity and gravity are in the body's frame; noise is the actor's alone."""
-    task, n = task_of("go2"), 12
-    rand = some(task, 3)
-    (qpos, qvel), memory = task.reset(rand), task.begin(rand)
-    half = np.sqrt(0.5)
-    qpos[:, 3:7] = torch.tensor([half, 0, 0, half])  # the body's x is the world's y
-    qvel[:, :3] = torch.tensor([0.0, 2.0, 0.5])
-    memory[:, -9 - 2 * n :] = 0.01
-    obs = task.observe_with(qpos, qvel, torch.zeros(3, n, dtype=REAL), memory)
-    assert obs.shape == (3, task.obs_dim)
-    np.testing.assert_allclose(obs[:, :3] - 0.01, np.tile([2.0, 0, 0.5], (3, 1)), atol=1e-12)
-    np.testing.assert_allclose(obs[:, 6:9] - 0.01, np.tile([0, 0, -1.0], (3, 1)), atol=1e-12)
-    private = obs[:, task.actor_dim :]
-    torch.testing.assert_close(obs[:, : 9 + 2 * n], private[:, : 9 + 2 * n] + 0.01)
-    torch.testing.assert_close(obs[:, 9 + 3 * n : 12 + 3 * n], memory[:, :3])
-    torch.testing.assert_close(private[:, 9 + 2 * n], qpos[:, 2])
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
+    """Of a robot whose x is the world's y: velocity and gravity are in its frame; the noise is the actor's alone."""
     task, n = task_of(name), len(TASKS[name].robot.joints)  # type: ignore[attr-defined]
     names, sizes = zip(*task.obs_parts, strict=True)
     qpos, qvel = torch.rand(3, 7 + n, dtype=REAL), torch.rand(3, 6 + n, dtype=REAL)
-    qpos[:, 3:7] = torch.tensor([1.0, 0, 0, 0])
+    qpos[:, 3:7] = np.sqrt(0.5) * torch.tensor([1.0, 0, 0, 1])
+    velocity = torch.stack((qvel[:, 1], -qvel[:, 0], qvel[:, 2]), 1)
     memory = torch.rand(3, task.num_memory, dtype=REAL)
     command, clock, last, before, noise = memory.split((3, 1, n, n, 9 + 2 * n), dim=-1)
     obs = dict(zip(names, task.observe_with(qpos, qvel, last, memory).split(sizes, dim=-1), strict=True))
     down, joints = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3), qpos[:, 7:] - task._home
-    sensed = dict(zip(names[:5], (qvel[:, :3], qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
+    sensed = dict(zip(names[:5], (velocity, qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
     rest = dict(last_action=last, command=command, height=qpos[:, 2:3], action_change=last - before)
     rest |= dict(clock_sin=(2 * torch.pi * clock).sin(), clock_cos=(2 * torch.pi * clock).cos())
     rest |= dict(joints_from_reference=qpos[:, 7:] - task.reference(command, clock))
     rest |= {f"true_{part}": value for part, value in sensed.items()}
     rest |= {part: sensed[part] + each for part, each in zip(sensed, noise.split(sizes[:5], dim=-1), strict=True)}
-    assert obs.keys() == rest.keys()
+    assert obs.keys() == rest.keys() and sum(sizes[:9]) == task.actor_dim
     for part, value in rest.items():
         torch.testing.assert_close(obs[part], value)
     assert names[:5] == ("velocity", "angular_velocity", "gravity", "joints_from_home", "joint_rates_x0.1")
