@@ -26,10 +26,11 @@ COLUMNS = ("iteration", "control_steps", "seconds", "return", "length", "eval_re
 def check_writable(directory: Path) -> None:
     """End the script if nothing can be written to a directory, which need not exist; leaves nothing behind."""
     try:
+        str(directory).encode()  # tensorboard writes it
         existing = next(path for path in (directory, *directory.absolute().parents) if path.exists())
         tempfile.TemporaryFile(dir=existing).close()
-    except OSError as error:
-        fail(f"cannot write to run directory {directory}: {error.strerror}")
+    except (OSError, UnicodeError) as error:
+        fail(f"cannot write to run directory {directory}: {getattr(error, 'strerror', 'its name is not UTF-8')}")
 
 
 def make_unused(wanted: Path) -> Path:
@@ -71,10 +72,12 @@ class ProgressFile:
 
     def __init__(self, path: Path, iteration: int) -> None:
         self.path, self.columns = path, list(COLUMNS)
-        self._begin(self._rows(iteration) if iteration > 0 and path.is_file() else [])
+        self._begin(self._rows(iteration) if iteration > 0 else [])
 
     def _rows(self, last: float = math.inf) -> list[dict[str, str]]:
         """Up to an iteration. A crash may leave rows of later ones, and half of a line."""
+        if not self.path.is_file():
+            return []
         with self.path.open(newline="") as file:
             reader = csv.DictReader(file)
             self.columns = list(reader.fieldnames or COLUMNS)
@@ -82,6 +85,7 @@ class ProgressFile:
 
     def _begin(self, rows: list[dict[str, str]]) -> None:
         """Replace the file in one step, and go on at its end."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         temporary = self.path.with_suffix(".csv.tmp")
         with temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self.columns, restval="")

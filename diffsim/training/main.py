@@ -65,8 +65,9 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
         finally:
             threading.excepthook = report
             try:
-                sys.stdout.flush()
-            except BrokenPipeError:  # and no complaint when Python flushes once more at its end
+                if sys.stdout is not None:  # closed from the start
+                    sys.stdout.flush()
+            except OSError:  # and no complaint when Python flushes once more at its end
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     return run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import signal
 import sys
 import time
@@ -13,10 +14,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from diffsim.env import ActionError, DiffEnv
 from diffsim.sim.options import check_device
@@ -27,6 +28,7 @@ from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_wri
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import FINER, Evaluation, make_env, write_evaluation
 from diffsim.training.flags import Flags, ParallelFlags
+from diffsim.training.layers import ObsNormalizer
 from diffsim.training.monitor import STEPS, Monitor
 from diffsim.training.variation import Variation, parse_ranges
 
@@ -38,7 +40,7 @@ TOLD = {  # totals, and how a message tells that they have doubled
     "grad/skipped": "updates skipped so far for their gradients",
     "sim/unconverged": "control steps so far in which Newton's method did not converge",
 }
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 RANK_SEED = 1_000_003  # between the seeds of two ranks
 LOG_EVERY = 10  # iterations between two at whose end a GPU is waited for, to write all of them
 RUNS = Path("runs")  # where runs are that are given no directory
@@ -71,7 +73,7 @@ class Record:
     iteration: int
     steps: int  # control steps that it took
     names: list[str]
-    numbers: Tensor  # of the names, then how many signals have arrived
+    numbers: Tensor  # of the names, then of all that was observed, then how many signals have arrived
     scalars: dict[str, float]  # that are known already
     times: dict[str, tuple[Mark, Mark]]  # begin and end, by name
 
@@ -91,6 +93,8 @@ class Run:
         self._state = checkpoint.load(args.resume, args.script()) if args.resume else None
         if self.writes:
             self._check_directory()
+        if torch.get_default_dtype() != torch.float32:
+            fail(f"training computes in float32: torch's default dtype must be that, not {torch.get_default_dtype()}")
         try:
             self.device = check_device(args.device)
         except ValueError as error:
@@ -106,6 +110,7 @@ class Run:
         self._variation: Variation | None = None
         self._samples = 0  # control steps of an iteration, of all ranks
         self._learner: Learner | None = None
+        self._normalizers: list[ObsNormalizer] = []  # of observations
         self._log: ProgressLog | None = None
         self._records: list[Record] = []
         self._times: dict[str, tuple[Mark, Mark]] = {}
@@ -116,6 +121,7 @@ class Run:
         self._told = dict.fromkeys(TOLD, 0.0)  # by messages
         self._signals: list[int] = []
         self._handlers: dict[int, Any] = {}
+        self._opened = False
         self._stopping = False
 
     # Setting up ------------------------------------------------------------------------------------------------------
@@ -153,12 +159,17 @@ class Run:
         All ranks start with equal weights; from here on they draw different random numbers.
         """
         self._learner, rank = learner, distributed.rank()
+        modules = (
+            module for part in vars(learner).values() if isinstance(part, nn.Module) for module in part.modules()
+        )
+        self._normalizers = [m for m in modules if isinstance(m, ObsNormalizer) and m.size is not None]
         if rank > 0:
             torch.manual_seed(self.args.seed + rank * RANK_SEED)
         if state := self._state:
-            own = state["ranks"][rank]
-            checkpoint.restore(learner, state, (self._env, own["env"]) if self._env is not None else None)
-            self._random_numbers().set_state(own["rng"])
+            own = state["ranks"][rank]  # None of a rank that was lost, which begins new episodes
+            checkpoint.restore(learner, state, (self._env, own["env"]) if own and self._env is not None else None)
+            if own:
+                self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]
             self._totals |= state["totals"]
@@ -173,9 +184,10 @@ class Run:
         def timed() -> Metrics:
             begin = Mark(self.device)
             try:
-                metrics = call()
+                with self._together():
+                    metrics = call()
             except ActionError:
-                self._check_weights()  # they say more
+                self._check_learner()  # they say more
                 raise
             self._times[f"time/{function.__name__}"] = begin, Mark(self.device)
             return metrics
@@ -188,7 +200,7 @@ class Run:
     def evaluation_due(self) -> bool:
         """Whether this iteration ends with an evaluation, on the rank that evaluates."""
         if due := self.writes and self._evaluates():
-            self._check_weights()
+            self._check_learner()
         return due
 
     def _evaluates(self) -> bool:
@@ -224,7 +236,9 @@ class Run:
             tensors |= self._env.take_statistics()
             scalars |= self._watch(self._env)
         signals = torch.full((), float(len(self._signals)), device=self.device)
-        numbers = distributed.average(torch.stack([*tensors.values(), signals]))
+        seen = sum((normalizer.mean.sum() for normalizer in self._normalizers), torch.zeros_like(signals))
+        with self._together():
+            numbers = distributed.average(torch.stack([*tensors.values(), seen, signals]))
         steps, begin, self._mark = control_steps or self._samples, self._mark, Mark(self.device)
         times = self._times | {"time/total": (begin, self._mark)}
         self._records.append(Record(self.iteration, steps, list(tensors), numbers, scalars, times))
@@ -270,19 +284,25 @@ class Run:
                 self._write(record)
             self._records.clear()
         if saving or self._stopping:
-            self._save()
+            with self._together():
+                self._save(distributed.gather(self._own_state()))
         if pausing:
             self._mark = Mark(self.device)
 
     def _write(self, record: Record) -> None:
         """Wait until the device has finished an iteration, and write it."""
-        ranks, (*numbers, signals) = distributed.size(), record.numbers.tolist()
+        ranks, (*numbers, seen, signals) = distributed.size(), record.numbers.tolist()
+        if not math.isfinite(seen):
+            self._check_observations()
         self._stopping = self._stopping or signals > 0
         times = {name: end.since(begin) for name, (begin, end) in record.times.items()}
         self.seconds += times["time/total"]
         self.control_steps += record.steps
         scalars = dict(zip(record.names, numbers, strict=True)) | record.scalars | times
         if "episodes" in scalars:
+            if not math.isfinite(scalars["return"]):
+                self._check_observations()  # they say more
+                self._fail(f"a reward of {self.args.env} is not finite")
             self._episodes.add(*(ranks * scalars.pop(name) for name in ("episodes", "return", "length")))
             for name in (*TOTALS, *({"unconverged"} & scalars.keys())):
                 self._totals[f"sim/{name}"] = self._totals.get(f"sim/{name}", 0) + round(ranks * scalars.pop(name))
@@ -316,10 +336,12 @@ class Run:
 
     def _open(self) -> None:
         """Begin to write and to receive signals, once."""
-        if self._handlers:
+        if self._opened:
             return
+        self._opened = True
         for number in SIGNALS:
-            self._handlers[number] = signal.signal(number, self._receive)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup asks for
+                self._handlers[number] = signal.signal(number, self._receive)
         if not self.writes:
             return
         directory, args = self.directory, self.args
@@ -351,23 +373,47 @@ class Run:
         path = (self.args.run_dir or RUNS) / "checkpoint.pt"
         return f"{path} is of iteration {self._saved}" if path.is_file() else "no checkpoint was saved"
 
-    def _check_weights(self) -> None:
+    def _check_learner(self) -> None:
         """End the script where training has diverged."""
+        self._check_observations()
         if self._learner is not None and (name := checkpoint.find_nonfinite(self._learner)):
-            fail(f"iteration {self.iteration}: weight {name} is not finite; {self._kept()}")
+            self._fail(f"weight {name} is not finite")
+
+    def _check_observations(self) -> None:
+        seen = [normalizer.mean.unsqueeze(0) for normalizer in self._normalizers]
+        seen += [self._env.state_dict()["obs"]] if self._env is not None else []
+        for obs in seen:
+            if columns := (~obs.isfinite()).any(0).nonzero().flatten().tolist():
+                self._fail(f"observation {columns[0]} of {self.args.env} is not finite")
+
+    def _fail(self, message: str) -> NoReturn:
+        fail(f"iteration {self.iteration}: {message}; {self._kept()}")
 
     def _random_numbers(self) -> torch.Generator:
         if self.device.type == "cuda":
             return torch.cuda.default_generators[self.device.index]
         return torch.default_generator
 
-    def _save(self) -> None:
-        assert self._learner is not None
+    def _own_state(self) -> dict[str, Any]:
+        """What this rank alone has."""
         env = self._env.state_dict() if self._env is not None else None
-        ranks = distributed.gather({"env": env, "rng": self._random_numbers().get_state()})
+        return {"env": env, "rng": self._random_numbers().get_state()}
+
+    @contextmanager
+    def _together(self) -> Iterator[None]:
+        """Around what all ranks do: where one is lost, the first one saves what it has before the script ends."""
+        try:
+            yield
+        except distributed.LostRankError as error:
+            self.iteration -= 1  # which is not whole
+            self._save([self._own_state() if k == distributed.rank() else None for k in range(distributed.size())])
+            fail(f"{error}; {self._kept()}")
+
+    def _save(self, ranks: list[dict[str, Any] | None]) -> None:
+        assert self._learner is not None
         if not self.writes:
             return
-        self._check_weights()
+        self._check_learner()
         args = {k: None if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.args).items()}
         args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
