@@ -6,6 +6,7 @@ import functools
 import gc
 import os
 import re
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -63,6 +64,8 @@ def command(main: Callable[P, None]) -> Callable[P, None]:
             size = f" for {float(wanted[1]) / 1e9:,.1f} GB more" if wanted else ""
             _end(f"not enough memory{size}: choose smaller sizes", 2)
         finally:
+            if main.__module__ == "__main__":
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process ends, and has nothing to stop
             threading.excepthook = report
             try:
                 if sys.stdout is not None:  # closed from the start
