@@ -94,7 +94,6 @@ def save(path: Path, script: str, learner: Learner, state: Mapping[str, Any]) ->
 def _write(path: Path, content: Mapping[str, Any]) -> None:
     buffer = io.BytesIO()  # torch.save to a full disk raises what says nothing of it
     torch.save(content, buffer)
-    path.parent.mkdir(parents=True, exist_ok=True)  # someone may have moved the directory
     temporary = path.with_name(f"{path.name}.tmp")
     try:
         temporary.write_bytes(buffer.getbuffer())

@@ -85,7 +85,6 @@ class ProgressFile:
 
     def _begin(self, rows: list[dict[str, str]]) -> None:
         """Replace the file in one step, and go on at its end."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         temporary = self.path.with_suffix(".csv.tmp")
         with temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self.columns, restval="")
@@ -145,6 +144,7 @@ class ProgressLog:
         self.bar: tqdm[NoReturn] | None = None
 
     def write(self, iteration: int, control_steps: int, seconds: float, scalars: Mapping[str, float]) -> None:
+        self.file.path.parent.mkdir(parents=True, exist_ok=True)  # someone may have moved it
         for key, value in scalars.items():
             self.tensorboard.add_scalar(key, value, control_steps)
         row = {"iteration": iteration, "control_steps": control_steps, "seconds": round(seconds, 3)}

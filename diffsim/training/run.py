@@ -28,6 +28,7 @@ from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_wri
 from diffsim.training.errors import fail
 from diffsim.training.evaluation import FINER, Evaluation, make_env, write_evaluation
 from diffsim.training.flags import Flags, ParallelFlags
+from diffsim.training.graph import Mark
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.monitor import STEPS, Monitor
 from diffsim.training.variation import Variation, parse_ranges
@@ -48,22 +49,6 @@ RUNS = Path("runs")  # where runs are that are given no directory
 
 def is_due(iteration: int, every: int) -> bool:
     return every > 0 and iteration % every == 0
-
-
-class Mark:
-    """A moment in a device's work, which goes on."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.time, self.event = time.perf_counter(), None
-        if device.type == "cuda":
-            self.event = torch.cuda.Event(enable_timing=True)
-            self.event.record(torch.cuda.current_stream(device))
-
-    def since(self, earlier: Mark) -> float:
-        """Seconds from an earlier mark to this one, whose work is done."""
-        if self.event is not None and earlier.event is not None:
-            return earlier.event.elapsed_time(self.event) / 1e3
-        return self.time - earlier.time
 
 
 @dataclass

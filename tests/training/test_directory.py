@@ -10,7 +10,15 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from diffsim.training.directory import COLUMNS, EpisodeStatistics, ProgressFile, ProgressLog, column
+from diffsim.training import UsageError
+from diffsim.training.directory import (
+    COLUMNS,
+    EpisodeStatistics,
+    ProgressFile,
+    ProgressLog,
+    check_writable,
+    column,
+)
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -139,3 +147,8 @@ def test_log(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: py
     ]
     (text,) = events.Tensors("hyperparameters/text_summary")[:1]
     assert text.tensor_proto.string_val[0].decode() == "|name|value|\n|-|-|\n|gamma|0.99|\n|hidden|(64, 64)|"
+
+
+def test_a_name_that_is_no_text_is_refused() -> None:
+    with pytest.raises(UsageError, match="cannot write to run directory .*: its name is not UTF-8"):
+        check_writable(Path("bad\udcff"))

@@ -95,6 +95,7 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(
         ("--device cuda", "device 'cuda' asked for, but PyTorch sees 0 CUDA GPUs here; choose cpu"),
         ("--run-dir {file}", "cannot write to run directory {file}: Not a directory"),
         ("--run-dir {file}/deeper", "cannot write to run directory {file}/deeper: Not a directory"),
+        (f"--run-dir {300 * 'a'}", "File name too long"),
         ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
         ("--resume {file}.pt", "no such checkpoint: {file}.pt"),
         ("--evaluate {file}", "{file} is not a whole checkpoint of shac.py"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import re
@@ -21,9 +22,11 @@ from learners import ROOT, SMALL, assert_same, read_progress, refusal, run
 from torch import Tensor, nn
 
 import bptt
+import diffsim
 import shac
 from diffsim.env import DiffEnv
-from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, evaluate, load_policy, parse
+from diffsim.tasks.cartpole import CartPole
+from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, distributed, evaluate, load_policy, parse
 from diffsim.training.directory import COLUMNS
 
 # Iterations of a few milliseconds.
@@ -73,16 +76,18 @@ def test_schedule(
     assert f"evaluation of iteration {evaluated[-1]}, 1 episodes: return median" in out
 
 
-def test_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The first one lets the iteration end, saved; the same a second time has its usual effect."""
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    raised = []
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
+def test_signals(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first one lets the iteration end, saved; the same a second time ends it at once. nohup's ignores SIGHUP."""
+    before, raised = signal.getsignal(number), []
 
     def interrupted(count: int) -> Any:
         def loss(*arguments: Any) -> Tensor:
             for _ in range(count if not raised else 0):
-                raised.append(signal.SIGINT)
-                signal.raise_signal(signal.SIGINT)
+                raised.append(number)
+                signal.raise_signal(number)
             return original(*arguments)
 
         return loss
@@ -92,8 +97,7 @@ def test_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     monkeypatch.setattr(bptt, "bptt_loss", interrupted(1))
     with pytest.raises(SystemExit) as exit:
         run(bptt, tmp_path / "once", *arguments)
-    assert exit.value.code == 128 + signal.SIGINT
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert exit.value.code == 128 + number and signal.getsignal(number) is before
     assert checkpoint.load(tmp_path / "once" / "checkpoint.pt")["iteration"] == 1
     assert len(read_progress(tmp_path / "once")) == 1
     assert "stopped early" in capsys.readouterr().out
@@ -140,6 +144,109 @@ def test_weights_that_make_actions_nan_are_named(
     argv = [*TINY, "--iterations", "5", "--quiet", "--run-dir", str(tmp_path)]
     error = refusal(lambda: bptt.main(argv), capsys)
     assert error == "bptt.py: iteration 2: weight actor.log_std is not finite; no checkpoint was saved"
+
+
+class Gone:
+    """A stdout that nobody reads any more."""
+
+    def write(self, _: str) -> int:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    def isatty(self) -> bool:
+        return False
+
+    flush = fileno = write
+
+
+@pytest.mark.parametrize("stdout", [None, Gone()], ids=["closed", "broken"])
+def test_a_training_goes_on_without_its_reader(
+    stdout: Gone | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", stdout)
+        train = shac.script(bptt.Args, bptt.train).__wrapped__  # type: ignore[attr-defined]
+        train([*TINY, "--iterations", "3", "--eval-every", "1", "--run-dir", str(tmp_path)])
+    assert checkpoint.load(tmp_path / "checkpoint.pt")["iteration"] == 3
+    assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["iteration"] == 3
+
+
+def test_a_directory_that_is_moved_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def moved(*arguments: Any) -> Any:
+        if not (tmp_path / "moved").exists() and read_progress(tmp_path / "run"):
+            (tmp_path / "run").rename(tmp_path / "moved")
+        return original(*arguments)
+
+    original = bptt.bptt_loss
+    monkeypatch.setattr(bptt, "bptt_loss", moved)
+    assert run(bptt, tmp_path / "run", *TINY, "--iterations", 3, "--quiet")["iteration"] == 3
+    assert len(read_progress(tmp_path / "moved")) == 3
+
+
+def test_what_a_rank_has_is_saved_when_another_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the third iteration. A rank whose state is not there begins new episodes."""
+    calls, path, average = [], tmp_path / "checkpoint.pt", distributed.average
+
+    def all_reduce(_: Tensor) -> None:
+        raise RuntimeError("Connection closed by peer")  # gloo's
+
+    def lost(tensor: Tensor) -> Tensor:
+        calls.append(1)
+        if len(calls) > 6:
+            monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+        return average(tensor)
+
+    argv = [*TINY, "--iterations", "5", "--quiet", "--run-dir", str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr("torch.distributed.all_reduce", all_reduce)
+        patch.setattr("torch.distributed.destroy_process_group", lambda: None)
+        patch.setattr("torch.distributed.get_rank", lambda: 0)
+        patch.setattr("torch.distributed.get_world_size", lambda: 1)
+        patch.setattr(distributed, "average", lost)
+        error = refusal(lambda: bptt.main(argv), capsys)
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "argv", ["bptt.py"])
+    state = checkpoint.load(path)
+    assert error == f"bptt.py: another process of this training is gone; {path} is of iteration {state['iteration']}"
+    assert 1 <= state["iteration"] < 5
+    torch.save(state | {"ranks": [None]}, path)
+    bptt.main(["--resume", str(path)])
+    assert checkpoint.load(path)["iteration"] == 5
+
+
+@pytest.mark.parametrize("part", ["reward", "observation 2"])
+def test_the_first_number_of_a_task_that_is_none_is_named(
+    part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Faulty(CartPole):
+        """Its numbers are NaN where the cart is fast."""
+
+        name = "faulty"
+
+        def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+            obs = super().observe(qpos, qvel, action)
+            column = obs[..., 2].where(qvel[..., 0] < 2.0, math.nan) if part != "reward" else obs[..., 2]
+            return torch.cat((obs[..., :2], column.unsqueeze(-1), obs[..., 3:]), -1)
+
+        def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+            return super().reward(obs, action).where((obs[..., 1] < 2.0) | (part != "reward"), math.nan)
+
+    monkeypatch.setitem(diffsim.TASKS, "faulty", Faulty)
+    argv = [*TINY, "--env", "faulty", "--iterations", "60", "--quiet", "--run-dir", str(tmp_path)]
+    error = refusal(lambda: bptt.main(argv), capsys)
+    first = len(read_progress(tmp_path)) + 1
+    name = "a reward" if part == "reward" else part
+    assert error == f"bptt.py: iteration {first}: {name} of faulty is not finite; no checkpoint was saved"
+
+
+def test_another_default_dtype_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        error = refusal(lambda: bptt.main([*TINY, "--run-dir", str(tmp_path)]), capsys)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert error.endswith("float32: torch's default dtype must be that, not torch.bfloat16")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no limit")
