@@ -101,3 +101,16 @@ def test_no_script_imports_another() -> None:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             assert not scripts.keys() & {part.partition(".")[0] for part in names}, name
+
+
+def test_imports_go_down_the_drawing() -> None:
+    """CONTRIBUTING.md draws the floors of the package. What a module imports when it is itself imported lies below."""
+    floors = ("robot startup", "kernels terrain", "sim", "tasks", "env", "planning training view", "tune")
+    floor = {name: height for height, names in enumerate(floors) for name in names.split()}
+    package = Path(diffsim.__file__).parent
+    for path in package.rglob("*.py"):
+        own = path.relative_to(package).with_suffix("").parts[0]
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("diffsim.") and own in floor:
+                other = str(node.module).split(".")[1]
+                assert own == other or floor[other] < floor[own], f"{path} imports {node.module}"
