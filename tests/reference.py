@@ -118,6 +118,7 @@ def joint_forces(
 ) -> tuple[Array, Array]:
     """Motors, springs, dampers and limits (Eq. 4) at zero acceleration, and their (nv,) resistance to it."""
     force, resistance, motors = np.zeros(scene.nv), np.zeros(scene.nv), np.zeros(scene.nlink)
+    resistance[: 6 * scene.floating] = h * scene.base_damping[0]
     for motor, link in enumerate(scene.motor_link):
         if link > 0:  # else it is a muscle
             motors[link] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]

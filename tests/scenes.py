@@ -141,7 +141,7 @@ COMPENSATED = """
     <body gravcomp="0.5">
       <joint type="free" armature="0.7" damping="0.4"/> <inertial pos="0.1 0 -0.3" mass="2" diaginertia=".1 .1 .1"/>
       <body pos="0 0 -0.5">
-        <joint axis="1 0 1"/> <inertial pos="0.1 0 -0.1" mass="1" diaginertia=".1 .2 .1"/>
+        <joint axis="1 0 1" damping="0.2"/> <inertial pos="0.1 0 -0.1" mass="1" diaginertia=".1 .2 .1"/>
         <body pos="0.2 0 0" quat="1 2 3 4" gravcomp="1.5">
           <inertial pos="0 .1 -.2" mass="1" diaginertia=".1 .1 .2"/>
         </body>

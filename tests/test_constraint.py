@@ -137,6 +137,17 @@ def check_step(scene, states, enough):
     return kinds
 
 
+def test_a_free_joints_damping_is_implicit_as_mujocos(rng):
+    """So hard that an explicit step would blow up, as a default for all joints reaches the free one too."""
+    hinge = '<joint axis="0 1 0"/> <geom type="capsule" size=".015" fromto="0 0 0 .05 0 -.12" mass=".2"/>'
+    body = f'<joint type="free"/> <geom type="box" size=".08 .05 .03" mass="1.5"/> <body pos=".08 0 0"> {hinge} </body>'
+    default = '<default> <joint damping="800" armature=".002"/> </default>'
+    scene = parse(f"<mujoco> {default} <worldbody> <body> {body} </body> </worldbody> </mujoco>")
+    states = free_states(scene, 8, rng)
+    assert 800 * H / 1.7 > 1 and scene.base_damping[0] == 800
+    check_step(scene, states, 1.0)
+
+
 @pytest.mark.parametrize(
     "name", ["hopper", "ant", *(pytest.param(name, marks=SLOW) for name in ("half_cheetah", "humanoid"))]
 )

@@ -137,8 +137,9 @@ def test_bounds_of_actuators_are_mujocos(rng):
 
 def test_gravity_compensation_and_a_free_joints_inertia_are_mujocos(rng):
     scene = parse(COMPENSATED)
-    assert scene.features == {"floating", "hinge", "slide", "gravcomp", "base_damping"}
+    assert scene.features == {"floating", "hinge", "slide", "gravcomp", "damping", "base_damping"}
     check_against_mujoco(scene, torch.float64, rng)
+    check_against_reference(scene, *free_states(scene, 4, rng), "implicit", 4)
 
 
 def test_muscles_pull_as_mujocos(rng):

@@ -51,6 +51,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         name in spec.features for name in ("contact", "motor", "clamp", "muscle", "limit")
     )
     LIMIT = LIMIT and not spec.constrained  # the penalty law
+    BASE_DAMPED = "base_damping" in spec.features
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     read, write, pick = block.read, block.write, block.pick
@@ -171,6 +172,8 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(FLOATING):
             g_base = join(links[0].R * base.gw, base.gv)
         for s in range(SOLVES):
+            if wp.static(DAMPED and BASE_DAMPED):
+                g_base = g_base + T(s) * T(m.base_damping) * nodes[0].W
             for i in range(here.n):
                 nodes[i].g = nodes[i].gqd
                 if wp.static(DAMPED):
@@ -287,7 +290,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 nodes[i + k].gq = nodes[i + k].gq + lb[k]
 
     @wp.func
-    def base_inward(link: Link, own: Node, adj: Adjoint, base: Base):
+    def base_inward(m: Model, link: Link, own: Node, adj: Adjoint, base: Base):
         """The floating base is a translation, whose "parent" twists are pure linear ones, then a ball joint."""
         vp = join(vec3(), base.v)
         wl = join(vec3(), wp.spatial_bottom(own.W))
@@ -305,6 +308,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         base.gr = base.gr + wp.transpose(link.R) * wp.spatial_top(tq)
         base.gv = base.gv + wp.spatial_bottom(xv)
         base.gw = base.gw + wp.transpose(link.R) * wp.spatial_top(tw)
+        if wp.static(BASE_DAMPED):  # its force is one on v and w, wherever the base is
+            base.gv = base.gv + T(m.base_damping) * wp.spatial_bottom(own.W)
+            base.gw = base.gw + T(m.base_damping) * (wp.transpose(link.R) * wp.spatial_top(own.W))
         return base
 
     @wp.func
@@ -463,7 +469,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(BALL_SPRING):
                 ball_springs(m, here, links, nodes)
             if wp.static(FLOATING):
-                base = base_inward(links[0], nodes[0], adj[0], base)
+                base = base_inward(m, links[0], nodes[0], adj[0], base)
 
         # A gradient that left the finite numbers, or of a contained step, is zero.
         broken = broken_numbers(m, here, base, nodes, adj_pull, adj_factors, adj_forces)

@@ -43,10 +43,13 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     muscle, base, constraint, newton = muscle_law(spec), base_inertia(spec), constraint_law(spec), newton_method(spec)
     CONTACT, MOTOR, CLAMP, MUSCLE = (name in spec.features for name in ("contact", "motor", "clamp", "muscle"))
     NU, FLOATING, IMPLICIT, FORCED = spec.nu, spec.floating, spec.implicit, spec.forced > 0
-    # With MuJoCo's constraints a substep takes several solves.
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
-    NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
+    BASE_DAMPED, NV, VADR = (
+        "base_damping" in spec.features,
+        spec.nv,
+        spec.dof0 - 1,
+    )  # link i's joint in qvel is VADR + i
     NBALL, LIMIT = spec.nball, MAX_SPEED
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
     SPHERES, BALLS, PULLS = max(spec.spheres, 1), max(NBALL, 1), NU if MUSCLE else 1  # no array has none
@@ -199,6 +202,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     @wp.func
     def accelerate(
         m: Model,
+        law: Law,
         here: Lane,
         phase: int,
         factor_row: int,
@@ -215,6 +219,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             if phase == SOLVE:
                 motions[0].A = vec6()
         if wp.static(FLOATING):
+            if wp.static(BASE_DAMPED):
+                load = base.damp_base(m, law, phase == SOLVE, links[0], load, root)
             L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
             motions[0].A = a0
             root.turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
@@ -405,7 +411,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                                     motions[i].C = vec6()
                         keeps = record * wp.where(phase > NEWTON, 1, 0)
                         inward(m, law, here, phase, factor_row, keeps, ck, links, motions, loads)
-                        root = accelerate(m, here, phase, factor_row, keeps, ck, links, motions, loads[0], root)
+                        root = accelerate(m, law, here, phase, factor_row, keeps, ck, links, motions, loads[0], root)
                         if phase == NEWTON:
                             root, by = newton.step_on(m, here, links, motions, root, by)
                         else:
@@ -428,7 +434,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 root.turning_up = root.wdot + root.turning_up
             else:
                 inward(m, law, here, SOLVE, here.row, record, ck, links, motions, loads)
-                root = accelerate(m, here, SOLVE, here.row, record, ck, links, motions, loads[0], root)
+                root = accelerate(m, law, here, SOLVE, here.row, record, ck, links, motions, loads[0], root)
             # 3. the new state
             if record == 1:
                 record_rates(m, here, ck, 0, root.speeding_up, root.turning_up, motions)

@@ -20,7 +20,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
     Node, Adjoint, Array = t.Node, t.Adjoint, t.array
     momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
-    LIFT, DAMPED = "gravcomp" in spec.features, "base_damping" in spec.features
+    LIFT = "gravcomp" in spec.features
     DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
 
     @wp.func
@@ -54,8 +54,6 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             if wp.static(VARIED):
                 up = law.mass * up
             load.f = load.f - up
-        if wp.static(DAMPED):
-            load.f = load.f + T(m.base_damping[k]) * V
         if wp.static(DRAG):
             load.f = load.f - drag.drag_wrench(m, k, link.R, com, V)
         if wp.static(CONTACT):
@@ -89,9 +87,6 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             adj.v = law.mass * adj.v
             if wp.static(LIFT):
                 adj.p = law.mass * adj.p
-        if wp.static(DAMPED):
-            adj.w = adj.w + T(m.base_damping[k]) * V
-            adj.v = adj.v + T(m.base_damping[k]) * W
         if wp.static(DRAG):
             adj.w = adj.w - drag.drag_wrench(m, k, link.R, com, V)
             adj.v = adj.v + drag.drag_adjoint(m, k, link.R, com, V, W)

@@ -151,7 +151,7 @@ FIELDS: dict[str, Field] = {
     "inboard": ("ints", lambda n: n.slots_of(n.scene.parent[n.around_ball(0)])),
     "outboard": ("ints", lambda n: n.slots_of(n.around_ball(2))),
     "carried": ("ints", lambda n: n.carried),  # 1 on the one lane that has its mass
-    **_carried("reals", "mass lift base_damping"),  # lift: read with gravity compensation only
+    **_carried("reals", "mass lift"),  # lift: read with gravity compensation only
     **_carried("mat3s", "inertia"),
     **_links("vec3s", "com lift_position"),
     **_links("reals", "armature damping stiffness spring_ref lower upper k_limit d_limit"),
@@ -195,6 +195,7 @@ FIELDS: dict[str, Field] = {
     "carrier_along": ("real", lambda n: n.place[0]),  # x at q = 0
     # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
     "carrier_height": ("real", lambda n: n.place[2] - n.scene.ground_height),
+    "base_damping": ("real", lambda n: n.scene.base_damping[0]),
     **_scenes("vec3", "gravity"),
     **_scenes("real", "k_n k_d k_t mu"),
 }

@@ -8,15 +8,18 @@ import warp as wp
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import by_name, types
+from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 
 
 @cache
 def base_inertia(spec: KernelSpec) -> SimpleNamespace:
-    """Of the floating base: the Cholesky factor of its articulated inertia."""
+    """Of the floating base: the Cholesky factor of its articulated inertia, and its damping."""
     t, kin = types(spec), kinematics(spec)
-    T, vec6, mat3, mat6 = t.T, t.vec6, t.mat3, t.mat6
-    load, store = kin.load, kin.store
+    T, vec3, vec6, mat3, mat6 = t.T, t.vec3, t.vec6, t.mat3, t.mat6
+    load, store, join = kin.load, kin.store, spatial(spec).join
+    Model, Law, Link, Load, Root = t.Model, t.Law, t.Link, t.Load, t.Root
+    CONSTRAINED, IMPLICIT = spec.constrained, spec.implicit
     BASE = 7 * (spec.nlink - 1)  # where the base's factor begins, packed by rows
 
     @wp.func
@@ -75,7 +78,26 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
             a[r] = y * load(ck_f, row, BASE + r * (r + 1) / 2 + r, e)
         return a
 
-    return by_name(factor_base, store_base, solve_base)
+    @wp.func
+    def damp_base(m: Model, law: Law, last: bool, link: Link, load: Load, root: Root):
+        """The base's load with its damping, implicit where that of joints is: with constraints in the last solve."""
+        b = T(m.base_damping)
+        hb = law.h * b
+        implicit = int(IMPLICIT)
+        if wp.static(CONSTRAINED):
+            implicit = wp.where(last, 1, 0)
+        if wp.static(CONSTRAINED) and implicit == 1:
+            load.f = load.f + hb * join(link.R * root.wdot, root.vdot)
+        else:
+            load.f = load.f + b * link.V
+            if wp.static(IMPLICIT):  # of a spatial acceleration, which lacks w x v and gravity
+                load.f = load.f + hb * join(vec3(), wp.cross(wp.spatial_top(link.V), root.v) + vec3(m.gravity))
+        if implicit == 1:
+            load.a = load.a + wp.diag(vec3(hb, hb, hb))
+            load.d = load.d + wp.diag(vec3(hb, hb, hb))
+        return load
+
+    return by_name(factor_base, store_base, solve_base, damp_base)
 
 
 @cache

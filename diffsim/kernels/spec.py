@@ -58,7 +58,7 @@ class KernelSpec:
     @property
     def damped(self) -> bool:
         """Whether damping follows the constraints."""
-        return self.constrained and "damping" in self.features
+        return self.constrained and bool(self.features & {"damping", "base_damping"})
 
     @property
     def nfactor(self) -> int:
