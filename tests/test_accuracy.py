@@ -312,7 +312,7 @@ CODE = {  # what the code of a feature, and of no other, does: it reads fields o
     "ball": r"\(var_m\)\.(ball_\w+|qpos_adr|inboard|outboard)\b",
     "muscle": r"\(var_m\)\.(pair_\w+|segment_\w+)\b",
     "drag": r"\(var_m\)\.drag_\w+\b",
-    "floating": r"\bquat",  # or a ball; every ball here is on a floating base
+    "floating": r"\bquat_(?!t\b)\w+\(",  # or a ball; every ball here is on a floating base
 }
 
 
