@@ -13,11 +13,16 @@ one step of MuJoCo's contact. It holds if nothing is contained, and velocities a
 MuJoCo's, of the largest velocity and its change within 1e-9 in float64, solved to the end, and 1e-2 in float32, to the
 default tolerance.
 
-Writes containment.csv and extreme_states.csv and, with --update-results, the tables of docs/stability.md.
+Newton (--parts newton --env ant humanoid): a control step of each state of some MOTIONS, to several tolerances, against
+one to 1e-11 in float64: passes of Newton's method on average and the most in a block of 16, time of one core, and the
+errors of velocity (of the largest change) and gradient of float32.
+
+Writes containment.csv, newton.csv and extreme_states.csv and, with --update-results, the tables of docs/stability.md.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -29,6 +34,7 @@ import mujoco
 import numpy as np
 import torch
 from common import CommonFlags, Part, TaskName, Tasks, measured, run
+from motions import shipped
 from tables import Row, grouped, markdown, numbers
 from torch import Tensor
 from worlds import Array
@@ -36,7 +42,7 @@ from worlds import Array
 import diffsim
 from diffsim import Integration, Scene, Simulator, load_scene
 
-PartName = Literal["containment", "states"]
+PartName = Literal["containment", "states", "newton"]
 INTEGRATIONS = {
     "semi_implicit": Integration("semi_implicit", 8),
     "implicit": Integration("implicit", 8),
@@ -69,6 +75,13 @@ ls_tolerance="1e-14"/><worldbody><geom type="plane" size="0 0 1"/><body pos="0 0
 <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".03" mass="{link}" friction="{friction}"/><body pos="0 0 -.2">
 <joint axis="1 0 0" range="-30 30"/><geom type="sphere" size=".05" mass="{link}" friction="{friction}"/>
 </body></body></body></worldbody></mujoco>"""
+
+MOTIONS: dict[str, tuple[float, float, float]] = {  # friction (0: the file's), speed along and into the ground [m/s]
+    **{"gait": (0, 0, 0), "random actions": (0, 0, 0), "impact": (0, 0, 10)},
+    **{f"slip, friction {friction:g}": (friction, 2, 0) for friction in (0.05, 0.3, 1.0)},
+}
+TOLERANCES = 1e-3, 1e-4, 1e-5
+NEWTON_KEY = "task", "motion", "tolerance"
 
 
 @dataclass
@@ -172,6 +185,70 @@ def throw() -> Iterator[Row]:
             yield row | {"held": int(held.sum())}
 
 
+class Moving(NamedTuple):
+    """A scene, how it is simulated, the length of a control step, and states with their actions."""
+
+    scene: Scene
+    how: Integration
+    dt: float
+    states: list[Tensor]
+
+    def advance(self, dtype: torch.dtype, passes: int, tolerance: float) -> tuple[Simulator, Tensor, Tensor, float]:
+        """The simulator after a control step, velocities and gradients in float64, microseconds without gradients."""
+        how = self.how._replace(passes=passes, tolerance=tolerance, touchdown=False)
+        sim = Simulator(self.scene, len(self.states[0]), how, self.dt, dtype=dtype, threads=1)
+        start, times = [x.to(dtype, copy=True).requires_grad_() for x in self.states], []
+        end = torch.cat(sim.step(*start), 1)
+        weights = torch.linspace(-1, 1, end.shape[1], dtype=dtype)
+        slopes = torch.autograd.grad((end * weights).sum(), start)
+        with torch.no_grad():
+            for _ in range(9):
+                begin = time.thread_time()
+                sim.step(*start)
+                times.append(time.thread_time() - begin)
+        sim.unconverged //= 10
+        velocities = end[:, sim.nq :].detach().double()
+        return sim, velocities, torch.cat(slopes, 1).double(), 1e6 * min(times) / sim.num_envs
+
+
+def moving(task: TaskName, name: str) -> Moving:
+    """1,280 states of a motion."""
+    friction, along, down = MOTIONS[name]
+    env, act = diffsim.make(task, 32, seed=0, contact="mujoco", early_termination=False), shipped(task)
+    model = mujoco.MjModel.from_xml_path(env.scene.path)
+    model.geom_friction[:, 0] = friction or model.geom_friction[:, 0]
+    obs, drawn, found = env.reset(seed=0)[0], torch.Generator().manual_seed(0), []
+    with torch.no_grad():
+        for _ in range(60):
+            action = act(obs).clamp(-1, 1)
+            if name != "gait":
+                action = torch.rand(action.shape, generator=drawn) * 2 - 1
+            found.append([x.double() for x in (env.qpos, env.qvel, action)])
+            obs = env.step(action)[0]
+    qpos, qvel, actions = map(torch.cat, zip(*found[20:], strict=True))
+    qvel[:, :2] += along * torch.randn(len(qvel), 2, generator=drawn)
+    qvel[:, 2] -= down
+    return Moving(load_scene(model), env.sim.integration, env.control_dt, [qpos, qvel, actions])
+
+
+def converge(args: Args, task: TaskName) -> Iterator[Row]:
+    """A row for each motion and tolerance."""
+    for name in MOTIONS:
+        of = moving(task, name)
+        _, expected, right, _ = of.advance(torch.float64, 300, 1e-11)
+        change = (expected - of.states[1]).abs().amax(1)
+        for tolerance in TOLERANCES:
+            sim, found, slope, each = of.advance(torch.float32, Integration().passes, tolerance)
+            row: dict[str, object] = {"task": task, "motion": name, "tolerance": tolerance}
+            row |= {"passes": float(sim.passes.mean()), "most of 16": float(sim.passes.view(-1, 16).amax(1).mean())}
+            row |= {"us": each, "not converged": float(sim.unconverged.double().mean())}
+            velocity = (found - expected).abs().amax(1) / change
+            gradient = (slope - right).norm(dim=1) / right.norm(dim=1)
+            row |= {"residual": float(sim.residual.max()), "velocity 99 %": float(velocity.quantile(0.99))}
+            row |= {"gradient 99 %": float(gradient.quantile(0.99)), "velocity most": float(velocity.max())}
+            yield row | {"gradient most": float(gradient.max())}
+
+
 def worst(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each robot: all its speeds."""
     lines = list[Row]()
@@ -183,10 +260,20 @@ def worst(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
+def at_default(rows: list[dict[str, str]]) -> list[Row]:
+    """The rows of the default tolerance, without the most of errors."""
+    rows = [row for row in rows if float(row["tolerance"]) == Integration().tolerance]
+    return [
+        {k: v for k, v in row.items() if not k.endswith(" most") and k not in ("tolerance", "residual")} for row in rows
+    ]
+
+
 def main(args: Args) -> None:
     if "containment" in args.parts:
         key = "task", "integrator"
         measured(args, Part("containment", contain, key, "containment", "stability.md"))
+    if "newton" in args.parts:
+        measured(args, Part("newton", converge, NEWTON_KEY, "newton", "stability.md", at_default))
     if "states" in args.parts:
         for row in () if args.draw_only else throw():
             args.keep("extreme_states", row, (*ROBOT_KEY, "speed"))

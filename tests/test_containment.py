@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import BALL, acting_states, parse, task_scene
+from scenes import BALL, SHOULDER, acting_states, free_states, parse, task_scene
 
 import diffsim
 from diffsim.sim.integration import INTEGRATORS, Integration
@@ -46,6 +46,25 @@ def test_simulator_contains_what_is_not_finite(name, threads, integrator, where,
     assert sim.nonfinite_gradients.sum() == 0
     assert not step_and_gradients(sim, states := acting_states(scene, 5, rng))[0][0].isnan().any()
     assert not sim.nonfinite.any()
+
+
+@pytest.mark.parametrize("scene", [BALL, SHOULDER])
+@pytest.mark.parametrize("length", [0.0, 1e-20, 1e20])
+def test_quaternions_without_a_direction_are_contained(scene, length, rng):
+    """Lengths from 1e-10 to 1e10 are normalised. A zero one's gradient was NaN, far ones became the identity."""
+    scene = parse(scene)
+    states, sim = [x.astype(np.float32) for x in free_states(scene, 5, rng)], Simulator(scene, 5)
+    quaternions = states[0][:, scene.quaternion_adr[0] :][:, :4]
+    quaternions[[0, 1]] *= np.array([[1e-10], [1e10]], np.float32)
+    outputs, gradients = step_and_gradients(sim, states)
+    assert not sim.nonfinite.any()
+    quaternions[BAD] *= length
+    bad_outputs, bad_gradients = step_and_gradients(sim, states)
+    assert sim.nonfinite.tolist() == [False, False, True, False, False]
+    for value, expected in zip(bad_outputs + bad_gradients, outputs + gradients, strict=True):
+        assert value.isfinite().all() and torch.equal(value[GOOD], expected[GOOD])
+    assert torch.equal(bad_outputs[0][BAD], torch.tensor(states[0][BAD]))
+    assert all((gradient[BAD] == 0).all() for gradient in bad_gradients)
 
 
 def test_a_speed_that_nothing_has_is_contained():

@@ -260,18 +260,26 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         return pick(wp.abs(rate), T(LIMIT), T(0.0), T(1.0))
 
     @wp.func
-    def broken_numbers(m: Model, here: Lane, links: Links, turn: Quats, root: Root):
-        """How many numbers of the state left the finite ones, or any imaginable speed."""
+    def no_turn(start: t.Start, here: Lane, adr: int):
+        """1 where the square of a quaternion that came in is near the ends of float32, or no number, else 0."""
+        given = kin.load_quat(start.qpos, here.e, adr)
+        square = wp.dot(given, given)
+        return pick(T(1e-30), square, pick(square, T(1e30), T(0.0), T(1.0)), T(1.0))
+
+    @wp.func
+    def broken_numbers(m: Model, here: Lane, start: t.Start, links: Links, turn: Quats, root: Root):
+        """How many numbers of the state left the finite ones, or any imaginable speed, or came in without direction."""
         broken = T(0.0)
         if wp.static(FLOATING):
             for k in range(3):
                 broken = broken + block.broken(root.pos[k]) + block.broken(root.rot[k])
                 broken = broken + too_fast(root.v[k]) + too_fast(root.w[k])
-            broken = broken + block.broken(root.rot[3])
+            broken = broken + block.broken(root.rot[3]) + no_turn(start, here, 3)
         for i in range(1, here.n):
             broken = broken + block.broken(links[i].q) + too_fast(links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
+                broken = broken + no_turn(start, here, qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b]))
                 for k in range(4):
                     broken = broken + block.broken(turn[b][k])
         if wp.static(THREADS_PER_ENV > 1):
@@ -441,7 +449,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             root = integrate(m, law, here, links, motions, turn, root)
 
         # An environment that left the finite numbers, or any imaginable speed, is handed back as it came.
-        broken = broken_numbers(m, here, links, turn, root)
+        broken = broken_numbers(m, here, start, links, turn, root)
         block.write_flags(nonfinite, here.e, broken)
         if wp.static(CONSTRAINED):
             residual = pick(T(0.0), broken, T(0.0), wp.sqrt(residual))

@@ -53,8 +53,9 @@ class Simulator:
             first zero: MuJoCo's xfrc_applied, with the rows of scene.mj_model's bodies. What acts on the world or on a
             body that is fixed to it has no effect. Constant over a control step; to be changed like factors, and a
             step is differentiable in them too. (N, 0, 6) without the argument.
-        nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s. Their
-            state is returned as it was before that step, its gradient is zero; other environments are not touched.
+        nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s, or
+            started from a quaternion shorter than 1e-15 or longer than 1e15. Their state is returned as it was before
+            that step, its gradient is zero; other environments are not touched.
         residual: (N,) with the integrator mujoco, by how much the constraints' forces differ after the last pass of
             Newton's method from those that it counted on, as accelerations relative to sqrt(1 + |qacc|^2), in that
             substep of the last step where it is largest; 1 where that pass went a part of its way; else zeros.

@@ -360,6 +360,24 @@ def test_skipped_updates_are_told_when_they_have_doubled(
     ]
 
 
+def test_steps_that_do_not_converge_are_told_when_they_have_doubled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The simulator counts them; a line tells the sum over all environments and iterations."""
+    collect = bptt.collect
+
+    def counted(env: DiffEnv, *arguments: Any) -> bptt.Rollout:
+        env.sim.unconverged += 1  # in each of two environments
+        return collect(env, *arguments)
+
+    monkeypatch.setattr(bptt, "collect", counted)
+    run(bptt, tmp_path, *TINY, "--contact", "mujoco", "--iterations", 7)
+    words = "control steps so far in which Newton's method did not converge"
+    told = re.findall(rf"iteration (\d): {words}: (\d+)", capsys.readouterr().out)
+    assert told == [("1", "2"), ("3", "6"), ("7", "14")]
+    assert [float(row["sim_unconverged"]) for row in read_progress(tmp_path)] == [2, 4, 6, 8, 10, 12, 14]
+
+
 def test_runs_without_a_directory_have_one_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also those that begin in the same second."""
     monkeypatch.chdir(tmp_path)
