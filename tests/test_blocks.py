@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -157,6 +158,23 @@ def test_sines_of_large_angles():
     near = np.abs(angles[:, 0]) <= 8192
     torch.testing.assert_close(block[1][near], exact[1][near], rtol=1e-6, atol=1e-6 * exact[1].abs().max().item())
     torch.testing.assert_close(block[1], exact[1], rtol=1e-5, atol=1e-5 * exact[1].abs().max().item())
+
+
+@pytest.mark.parametrize("count", [1, BLOCK])
+def test_a_hinge_far_off_moves_on_or_is_contained(count):
+    """In float32 a substep's motion is less than a rounding there, but that of a control step is not lost."""
+    scene = dataclasses.replace(parse(PENDULUM.replace('range="-9 9"', 'range="-1e9 1e9"')), gravity=np.zeros(3))
+    zeros = torch.zeros(count, 1)
+    for angle in (1e4, -1e4, 9e4):
+        sim = Simulator(scene, count, Integration("semi_implicit", 64), CONTROL_DT)
+        end, _ = sim.step(zeros + angle, zeros + 3.0, zeros)
+        assert not sim.nonfinite.any()
+        np.testing.assert_allclose(
+            end.double() - angle, 3.0 * CONTROL_DT, atol=0.51 * np.spacing(np.float32(abs(angle)))
+        )
+    for angle in (1.1e5, 3e7, -2e9):  # sines of blocks are wrong from 3e7 on
+        end, _ = sim.step(zeros + angle, zeros + 3.0, zeros)
+        assert sim.nonfinite.all() and (end == zeros + angle).all()
 
 
 @pytest.mark.parametrize(

@@ -240,7 +240,7 @@ def test_free_flight_keeps_momentum_and_energy_to_first_order(base, rng):
 
 @pytest.mark.parametrize("name", ["ant", "hopper"])
 def test_motion_is_the_same_far_from_the_origin(name, rng):
-    """Horizontally, 10 km away: the position is rounded to float32's spacing there, nothing else notices."""
+    """Horizontally, 10 km away: a step's end is rounded to float32's spacing there, nothing else notices."""
     scene, steps, substeps = task_scene(name), 4, 16
     qpos, qvel, ctrl = acting_states(scene, 16, rng)
     horizontal = [0, 1] if scene.floating else [0]
@@ -261,7 +261,7 @@ def test_motion_is_the_same_far_from_the_origin(name, rng):
     np.testing.assert_array_equal(np.delete(far_q, horizontal, 1), np.delete(near_q, horizontal, 1))
     for far, near in zip(far_gradients, near_gradients, strict=True):
         np.testing.assert_array_equal(far, near)
-    rounding = np.spacing(np.float32(1e4)) / 2 * substeps * steps
+    rounding = np.spacing(np.float32(1e4)) / 2 * steps * 1.01  # once in a control step
     np.testing.assert_allclose(far_q[:, horizontal] - 1e4, near_q[:, horizontal], rtol=0, atol=rounding)
 
 

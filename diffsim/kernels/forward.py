@@ -23,7 +23,7 @@ from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.newton import newton_method
 from diffsim.kernels.solve import base_inertia
 from diffsim.kernels.spatial import spatial
-from diffsim.kernels.spec import MAX_SPEED, KernelSpec
+from diffsim.kernels.spec import FAR, MAX_PLACE, MAX_SPEED, KernelSpec
 from diffsim.kernels.wide import blocks, module_options
 
 NEWTON, FACTOR, SOLVE, DONE = range(4)  # a substep's solves: Newton's passes, the factor at their end, and one more
@@ -238,16 +238,33 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         return root
 
     @wp.func
+    def moved(place: T, rate: T, rest: T, h: T):
+        """(The place after a substep, what rounding it lost so far), which is made good where the place is far off."""
+        end = place + h * rate
+        far = pick(T(FAR), wp.abs(end), T(1.0), T(0.0))
+        if block.any_of(far):
+            rest = far * (rest + (rate - (end - place) / h) * h)
+            whole = end + rest
+            rest = rest - (whole - end)
+            end = pick(T(0.0), far, whole, end)
+        return end, rest
+
+    @wp.func
     def integrate(m: Model, law: Law, here: Lane, links: Links, motions: Motions, turn: Quats, root: Root):
         h = law.h
         if wp.static(FLOATING):
             root.v = root.v + h * root.speeding_up
             root.w = root.w + h * root.turning_up
-            root.pos = root.pos + h * root.v
+            for k in range(3):
+                end, rest = moved(root.pos[k], root.v[k], root.rest[k], h)
+                root.pos[k] = end
+                root.rest[k] = rest
             root.rot = wp.normalize(root.rot * exp_quat(h * root.w))
         for i in range(1, here.n):
             links[i].qd = links[i].qd + h * motions[i].u
-            links[i].q = links[i].q + h * links[i].qd
+            end, rest = moved(links[i].q, links[i].qd, motions[i].rest, h)
+            links[i].q = end
+            motions[i].rest = rest
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 i = m.ball_slot[here.lane * NBALL + b]
@@ -258,6 +275,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     def too_fast(rate: T):
         """1 where a rate is beyond any imaginable one, or no number, else 0."""
         return pick(wp.abs(rate), T(LIMIT), T(0.0), T(1.0))
+
+    @wp.func
+    def too_far(place: T):
+        """1 where a place is too far off for float32, or no number, else 0."""
+        return pick(wp.abs(place), T(MAX_PLACE), T(0.0), T(1.0))
 
     @wp.func
     def no_turn(start: t.Start, here: Lane, adr: int):
@@ -272,11 +294,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         broken = T(0.0)
         if wp.static(FLOATING):
             for k in range(3):
-                broken = broken + block.broken(root.pos[k]) + block.broken(root.rot[k])
+                broken = broken + too_far(root.pos[k]) + block.broken(root.rot[k])
                 broken = broken + too_fast(root.v[k]) + too_fast(root.w[k])
             broken = broken + block.broken(root.rot[3]) + no_turn(start, here, 3)
         for i in range(1, here.n):
-            broken = broken + block.broken(links[i].q) + too_fast(links[i].qd)
+            broken = broken + too_far(links[i].q) + too_fast(links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 broken = broken + no_turn(start, here, qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b]))

@@ -237,11 +237,11 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     if spec.damped:
         Node, Adjoint = Node | {"D": vec6, "W1": vec6}, Adjoint | {"d": vec6, "w1": vec6}
     Node, Adjoint = struct("Node", Node), struct("Adjoint", Adjoint)
-    Motion = dict.fromkeys("CAU", vec6) | dict.fromkeys(("dinv", "u", "motor"), T)
+    Motion = dict.fromkeys("CAU", vec6) | dict.fromkeys(("dinv", "u", "motor", "rest"), T)
     if spec.constrained:
         Motion |= {"B": vec6, "twist": vec6} | dict.fromkeys(("rate", "step", "force", "held", "firm"), T)
     Motion = struct("Motion", Motion)
-    root = {"pos": vec3, "rot": quat} | dict.fromkeys("v w speeding_up turning_up vdot wdot".split(), vec3)
+    root = {"pos": vec3, "rot": quat} | dict.fromkeys("v w rest speeding_up turning_up vdot wdot".split(), vec3)
     Touch = struct("Touch", {"p": vec3, "bias": vec3, "D": T, "on": T, "known": T, "jar": vec3})
     constants = dict.fromkeys("h theta k_n k_d k_t mu k_limit d_limit mass motor".split(), T)
     return SimpleNamespace(
@@ -289,9 +289,9 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         # gradients of a floating base's position, turn and velocities, its linear velocity and acceleration
         Base=struct("Base", dict.fromkeys("gp gr gv gw v vdot".split(), vec3)),
         # what the forward kernel keeps of a link and its joint: the link's velocity product C and acceleration A; the
-        # factor U and 1/d, the right-hand side u and then the acceleration, the motors' force. In Newton's method the
-        # joint's acceleration, the last step of that, the force on it without constraints, theirs and minus its slope;
-        # the link's twist if rates were accelerations, and the last step of that
+        # factor U and 1/d, the right-hand side u and then the acceleration, the motors' force, what rounding the
+        # position lost. In Newton's method the joint's acceleration, the last step of that, the force on it without
+        # constraints, theirs and minus its slope; the link's twist if rates were accelerations, and the last step of it
         Motion=Motion,
         Motions=wp.array(dtype=Motion),
         # a floating base's state, accelerations or steps of a solve, and the iterate

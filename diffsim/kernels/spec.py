@@ -6,6 +6,8 @@ from typing import Any
 from diffsim.kernels.lanes import Division
 from diffsim.robot.scene import Scene
 
+FAR = 256.0  # m and rad, where rounding of a substep's motion to float32 begins to matter
+MAX_PLACE = 1e5  # m and rad; farther, float32 has no hundredth of either
 MAX_SPEED = 1e5  # m/s and rad/s; what is faster has blown up, and its squares would soon leave float32
 
 

@@ -53,7 +53,7 @@ class Simulator:
             first zero: MuJoCo's xfrc_applied, with the rows of scene.mj_model's bodies. What acts on the world or on a
             body that is fixed to it has no effect. Constant over a control step; to be changed like factors, and a
             step is differentiable in them too. (N, 0, 6) without the argument.
-        nonfinite: (N,) bool, environments whose last step left the finite numbers, or passed 1e5 m/s or rad/s, or
+        nonfinite: (N,) bool, whose last step left the finite numbers, or passed 1e5 m, rad, m/s or rad/s, or
             started from a quaternion shorter than 1e-15 or longer than 1e15. Their state is returned as it was before
             that step, its gradient is zero; other environments are not touched.
         residual: (N,) with the integrator mujoco, by how much the constraints' forces differ after the last pass of
