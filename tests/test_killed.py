@@ -119,9 +119,11 @@ def test_a_run_that_is_signalled_leaves_a_whole_checkpoint_or_none(seed: int, tm
         process.send_signal(number)
         time.sleep(draw.uniform(0, 0.02))
     _, error = process.communicate(timeout=120)
-    codes = {128 + number for number in signals} | {-number for number in signals}  # the latter before it trains
-    assert process.returncode in codes | {130}
-    assert "Traceback" not in error or (process.returncode == -signal.SIGINT and not progress.exists())
+    if not (tmp_path / "run").exists():  # while Python imports, its own traceback ends it
+        assert process.returncode != 0 and seed >= 50
+        return
+    codes = {128 + number for number in signals} | {-number for number in signals}  # the latter once it has ended
+    assert process.returncode in codes | {130} and "Traceback" not in error
     assert not list(tmp_path.glob("run/*.tmp"))
     if seed < 50 and len(signals) == 1:
         assert process.returncode == 128 + signals[0]
