@@ -5,7 +5,7 @@
     python benchmarks/transfer.py runs/learning/ppo_mujoco_warp/ant__1   judges its policy here and in MuJoCo
 
 What follows "--" goes to ppo_baseline.py. mujoco_warp has at most 10 iterations of Newton's method and 20 of the line
-search, as in its own benchmark of a humanoid; this simulator has four passes.
+search, as in its own benchmark of a humanoid; this simulator passes until it has converged to its tolerance.
 """
 
 from __future__ import annotations
