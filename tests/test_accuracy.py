@@ -151,7 +151,7 @@ def extreme(scene, qpos, qvel, kind):
     elif kind == "falling":
         qvel[:, height] = -44.0  # after 100 m
     elif kind == "far":
-        qpos[:, 0] = 1e6
+        qpos[:, 0] = 5e4  # m; from 1e5 on an environment is contained
     return scene, qpos, qvel
 
 
