@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import torch
@@ -13,8 +11,8 @@ from worlds import Array, Here, State, in_double, rollout, starts
 
 import diffsim
 from diffsim import DiffEnv, Integration, Simulator
-from diffsim.__main__ import POLICIES
 from diffsim.training import load_policy
+from diffsim.training.checkpoint import POLICIES
 
 VISITED = 15, 30, 60, 120  # control steps after which a quarter of the states is taken
 INTEGRATORS = "semi_implicit", "implicit 0", "implicit 0.5", "extrapolated"  # with theta
@@ -27,7 +25,7 @@ def integration(integrator: str, substeps: int) -> Integration:
 
 def shipped(name: TaskName) -> nn.Module:
     """The policy of a task that comes with the package, as a map from observations to actions."""
-    return load_policy(Path(str(POLICIES / f"{name}.pt"))).network
+    return load_policy(POLICIES / f"{name}.pt").network
 
 
 class Case:

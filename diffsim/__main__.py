@@ -24,10 +24,10 @@ from diffsim.robot.report import report as report_robot
 from diffsim.sim.launcher import available_cores
 from diffsim.tasks import FILE, Contact, find_task
 from diffsim.training import command, evaluate, export_onnx, export_policy, fail, load_policy, make_policy_env
+from diffsim.training.checkpoint import POLICIES
 from diffsim.tune import tune
 from diffsim.view import render
 
-POLICIES = files("diffsim") / "policies"
 PACKAGE = Path(str(files("diffsim")))
 LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo_baseline", "sac_baseline", "mbpo", "pfpn", "pfpn_sac", "gps")
 DEMO_EPISODES = 8  # the one of median return is filmed
@@ -78,7 +78,7 @@ def shipped(task: str) -> Path:
     there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
     if task not in there:
         fail(f"no policy of {task} comes with this version; there are: {', '.join(there) or 'none'}")
-    return Path(str(POLICIES / f"{task}.pt"))
+    return POLICIES / f"{task}.pt"
 
 
 def drive(

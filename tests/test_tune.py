@@ -157,3 +157,20 @@ def test_bad_input_is_one_line(flags, message, pendulum, tmp_path, monkeypatch, 
         main(["tune", *(known.get(word, word) for word in flags)])
     told = str(end.value.code) + capsys.readouterr().err
     assert message in told and len(told.strip().splitlines()) <= 12
+
+
+def test_an_interrupt_leaves_what_was_measured(pendulum, tmp_path, monkeypatch, capsys):
+    """Before the default's turn, too: then no row is compared with it, and nothing more is measured."""
+    errors, calls = Reference.errors, []
+
+    def interrupted(self, truth):
+        calls.append(self)
+        if len(calls) > 2:
+            raise KeyboardInterrupt
+        return errors(self, truth)
+
+    monkeypatch.setattr(Reference, "errors", interrupted)
+    main(["tune", str(pendulum), "--contact", "soft", "--states", "4", "--output", str(tmp_path / "front.png")])
+    out = capsys.readouterr().out
+    assert "stopped after 2 settings" in out and "take --contact soft --integrator semi_implicit" in out
+    assert "default" not in out and "environments per call" not in out

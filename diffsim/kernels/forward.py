@@ -45,12 +45,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     NU, FLOATING, IMPLICIT, FORCED = spec.nu, spec.floating, spec.implicit, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
-    BASE_DAMPED, NV, VADR = (
-        "base_damping" in spec.features,
-        spec.nv,
-        spec.dof0 - 1,
-    )  # link i's joint in qvel is VADR + i
-    NBALL, LIMIT = spec.nball, MAX_SPEED
+    BASE_DAMPED, NBALL, LIMIT = "base_damping" in spec.features, spec.nball, MAX_SPEED
+    NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
     SPHERES, BALLS, PULLS = max(spec.spheres, 1), max(NBALL, 1), NU if MUSCLE else 1  # no array has none
 

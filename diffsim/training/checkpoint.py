@@ -23,6 +23,7 @@ from diffsim.tasks.imitation.clip import Clip
 from diffsim.training.errors import fail
 from diffsim.training.layers import First, Likeliest, ObsNormalizer
 
+POLICIES = Path(__file__).resolve().parents[1] / "policies"  # that come with the package
 FORMAT = 2
 POLICY = {"script", "args", "iteration", "policy"}  # what an exported policy has
 HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one

@@ -219,7 +219,6 @@ class Run:
         scalars = {name: float(value) for name, value in metrics.items() if not isinstance(value, Tensor)}
         if self._env is not None:
             tensors |= self._env.take_statistics()
-            scalars |= self._watch(self._env)
         signals = torch.full((), float(len(self._signals)), device=self.device)
         seen = sum((normalizer.mean.sum() for normalizer in self._normalizers), torch.zeros_like(signals))
         with self._together():
@@ -228,6 +227,9 @@ class Run:
         times = self._times | {"time/total": (begin, self._mark)}
         self._records.append(Record(self.iteration, steps, list(tensors), numbers, scalars, times))
         self._times = {}
+        if self._env is not None and (found := self._watch(self._env)):
+            self._records[-1].scalars |= found
+            self._mark = Mark(self.device)  # no time of training
 
     def _watch(self, env: DiffEnv) -> dict[str, float]:
         """What --monitor measures, in the iterations that are due."""
@@ -236,6 +238,7 @@ class Run:
             return {}
         if not is_due(self.iteration, args.monitor):
             return {}
+        self._check_learner()  # no replay of a policy that has diverged
         self._monitor = self._monitor or Monitor(args, env)
         found = self._monitor.replay(learner.policy)
         if self._monitor.suspects(found):

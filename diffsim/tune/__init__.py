@@ -12,15 +12,15 @@ from tyro.conf import Positional
 
 import diffsim
 from diffsim.sim.options import check_device
-from diffsim.tasks import Contact, Task, find_task
+from diffsim.tasks import FILE, Contact, Task, find_task
 from diffsim.training import Count, fail, load_policy
+from diffsim.training.checkpoint import POLICIES
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row, batches, choice, costs, front, measure, settings
-from diffsim.tune.motion import SPANS, Motion
+from diffsim.tune.motion import SPANS, Motion, Setting
 from diffsim.view.render import whole_file
 
 SHOWN = 10  # rows of the printed front
-POLICIES = Path(__file__).resolve().parents[1] / "policies"
 
 
 def tune(
@@ -59,28 +59,32 @@ def tune(
     policy, source = actor(robot, task, checkpoint)
     motion, rows = Motion(env, policy), list[Row]()
     print(f"{task.name}: {states} start states and actions of {source}; control steps of {1e3 * env.control_dt:.4g} ms")
+    contacts, stopped = contact or (task.contact,), False
     try:
-        for each in contact or (task.contact,):
+        for each in contacts:
             measure(motion, settings(task, each), device, rows)
     except KeyboardInterrupt:
+        stopped = True
         print(f"stopped after {len(rows)} settings")
     if not rows:
         return
-    best, usual = choice(rows, error), task.integration("default", (contact or (task.contact,))[0])
-    default = next(row for row in rows if row.setting.integration == usual)
+    best, usual = choice(rows, error), Setting(task.integration("default", contacts[0]))
+    default = next((row for row in rows if row.setting == usual), None)
     print(table([mark(row, best, default) | row.columns() for row in thin(front(rows), best)]))
     print(verdict(best, default, error))
     if csv:
         write(csv, [row.columns() for row in rows])
     draw(output, rows, best, default, task.name)
-    setting = (best or default).setting
+    if stopped:
+        return
+    setting = best.setting if best else usual
     per_call = ", ".join(f"{n} {us:.3g}" for n, us in batches(motion, setting, device).items())
     print(f"environments per call, us of a control step with gradient: {per_call}")
     whole, *parts = costs(motion, setting, device).items()
     shares = ", ".join(f"{part} {us:.2g}" for part, us in parts)
     print(f"of {whole[1]:.3g} us the scene pays for {shares or 'nothing that can be left out'}")
     if extremes:
-        print(table(stress(motion, task, contact or (task.contact,))))
+        print(table(stress(motion, task, contacts)))
 
 
 class Watched(Task):
@@ -107,12 +111,13 @@ def actor(robot: str, task: type[Task], checkpoint: Path | None) -> tuple[torch.
     if checkpoint is None and not shipped.is_file():
         return None, "smooth random actions"
     saved = load_policy(checkpoint or shipped)
-    if find_task(saved.args["env"]) is not task:
-        fail(f"{checkpoint} is a checkpoint of {saved.args['env']}, not of {robot}")
+    own = robot if FILE.fullmatch(robot) else None
+    if own is None and (trained := saved.task()) != task.name:
+        fail(f"{checkpoint} is a checkpoint of {trained}, not of {robot}")
     return saved.network, f"{saved.script}.py's policy, iteration {saved.iteration}"
 
 
-def mark(row: Row, best: Row | None, default: Row) -> dict[str, str]:
+def mark(row: Row, best: Row | None, default: Row | None) -> dict[str, str]:
     return {"": "->" if row is best else "default" if row is default else ""}
 
 
@@ -125,11 +130,11 @@ def thin(rows: Sequence[Row], best: Row | None) -> list[Row]:
     return rows
 
 
-def verdict(best: Row | None, default: Row, error: float) -> str:
+def verdict(best: Row | None, default: Row | None, error: float) -> str:
     if best is None:
         return f"no setting keeps the state's error after {SPANS[-1]} s below {error:g}"
-    speed = default.cost / best.cost
-    return f"take {best.setting.flags}: error {best.error:.2g}, {speed:.2g} times as fast as the default"
+    speed = f", {default.cost / best.cost:.2g} times as fast as the default" if default else ""
+    return f"take {best.setting.flags}: error {best.error:.2g}{speed}"
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
@@ -146,7 +151,7 @@ def write(path: Path, rows: Sequence[Mapping[str, str]]) -> None:
         writer.writerows(rows)
 
 
-def draw(path: Path, rows: Sequence[Row], best: Row | None, default: Row, title: str) -> None:
+def draw(path: Path, rows: Sequence[Row], best: Row | None, default: Row | None, title: str) -> None:
     """Error against cost of all rows, the front as a line."""
     try:
         from matplotlib.figure import Figure

@@ -18,8 +18,6 @@ from diffsim.tune.motion import Motion, Setting
 
 FINER = 16  # the reference's substeps, in multiples of the default's
 
-# Extremes -------------------------------------------------------------------------------------------------------------
-
 SWEEPS: dict[str, tuple[float, ...]] = {
     "substeps": (24, 16, 12, 8, 6, 4, 3, 2, 1),
     "contact stiffness x": (10, 100, 1000),

@@ -20,7 +20,7 @@ from diffsim.tune.motion import HORIZONS, SPANS, Motion, Setting, without
 FINER = 8  # the reference's substeps, in multiples of the most measured
 TIMED, ROUNDS = 64, 7  # environments and turns of a timing; the fastest turn counts, the others were disturbed
 FACTORS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # substeps, in multiples of the default's
-PASSES = (2, 4, 8)  # of Newton's method on MuJoCo's contact
+ENDS = ((4, 1e-4), (8, 1e-4), (30, 1e-2), (30, 1e-3))  # of Newton's method on MuJoCo's contact: passes, tolerance
 
 
 class Row(NamedTuple):
@@ -49,7 +49,8 @@ def settings(task: type[Task], contact: str) -> list[Setting]:
     default = task.integration("default", contact)
     counts = sorted({max(1, round(factor * default.substeps)) for factor in FACTORS})
     if default.constrained:
-        found = [default._replace(substeps=n, passes=p) for n in counts for p in sorted({*PASSES, default.passes})]
+        ends = *ENDS, (default.passes, default.tolerance)
+        found = [default._replace(substeps=n, passes=passes, tolerance=end) for n in counts for passes, end in ends]
     else:
         found = [Integration("semi_implicit", n) for n in counts]
         found += [Integration("implicit", n, theta) for theta in (0.0, 0.5) for n in counts]
@@ -108,7 +109,7 @@ def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> li
 def measure(motion: Motion, found: list[Setting], device: str, rows: list[Row]) -> None:
     """Append a row of each setting of one contact model; timings are of all of them side by side."""
     most = max(setting.integration.substeps for setting in found)
-    finest = found[0].integration._replace(substeps=FINER * most, passes=12)
+    finest = found[0].integration._replace(substeps=FINER * most, passes=100, tolerance=1e-9)
     truth = Reference(motion, Setting(finest, torch.float64))
     times = timed([motion.simulator(setting, TIMED, device=device) for setting in found], motion)
     for setting, (forward, both) in zip(tqdm(found, "errors", leave=False, ncols=80), times, strict=True):

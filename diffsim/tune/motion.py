@@ -35,7 +35,8 @@ class Setting(NamedTuple):
     def kind(self) -> str:
         """What it shares with the settings of other substeps."""
         how = self.integration
-        of = {"mujoco": f" {how.passes} passes", "implicit": f" {how.theta:g}"}.get(how.integrator, "")
+        newton = f" to {how.tolerance:g}, {how.passes} passes"
+        of = {"mujoco": newton, "implicit": f" {how.theta:g}"}.get(how.integrator, "")
         return how.integrator + of + " float64" * (self.dtype == torch.float64)
 
     @property
@@ -43,7 +44,8 @@ class Setting(NamedTuple):
         """What a script is given to use it."""
         how = self.integration
         if how.constrained:
-            words = f"--contact mujoco --substeps {how.substeps} --passes {how.passes}"
+            words = f"--contact mujoco --substeps {how.substeps}"
+            words += f" --passes {how.passes} --tolerance {how.tolerance:g}"
         else:
             theta = f" --theta {how.theta:g}" if how.integrator == "implicit" else ""
             words = f"--contact soft --integrator {how.integrator}{theta} --substeps {how.substeps}"
