@@ -186,7 +186,15 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
 
     @wp.func
     def partials(
-        m: Model, law: Law, here: Lane, links: Links, nodes: Nodes, place: t.Place, adj: Adjoints, adj_factors: Array
+        m: Model,
+        law: Law,
+        here: Lane,
+        links: Links,
+        nodes: Nodes,
+        place: t.Place,
+        ck: Ck,
+        adj: Adjoints,
+        adj_factors: Array,
     ):
         """Into adj the partial derivatives of phi, link by link."""
         for i in range(1, INERT + 1):
@@ -195,7 +203,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             k = here.at + i
             own = link.link_adjoint(m, law, k, links[i], nodes[i], place, adj_factors)
             if wp.static(CONSTRAINED and CONTACT):
-                own = constraint.add_contacts_adjoint(m, law, k, links[i], nodes[i], place, own, adj_factors)
+                own = constraint.add_contacts_adjoint(m, law, here, k, links[i], nodes[i], place, ck, own, adj_factors)
             if wp.static(DAMPED):
                 own = link.add_damping_adjoint(m, law, k, links[i], nodes[i], own, adj_factors)
             adj[i] = own
@@ -460,7 +468,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             joints_state(m, law, here, ck, links, nodes)
             # 2. to 4.
             solve(m, law, here, ck, links, nodes, base)
-            partials(m, law, here, links, nodes, place, adj, adj_factors)
+            partials(m, law, here, links, nodes, place, ck, adj, adj_factors)
             if wp.static(FORCED):
                 force.add_forces_adjoint(m, here, start.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):

@@ -30,6 +30,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.factors import K_D, K_N, MU
+from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
@@ -54,7 +55,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         t.Link,
     )
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
-    Load, Lane = t.Load, t.Lane
+    Load, Lane, NV, kin = t.Load, t.Lane, spec.nv, kinematics(spec)
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
     @wp.func
@@ -221,26 +222,27 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return load, found
 
     @wp.func
-    def contacts_along(m: Model, law: Law, here: Lane, k: int, B: vec6, step: vec6, part: T, touches: t.Touches):
-        """Of the contacts of link k after a part of a step of its twist: step . f."""
-        found = T(0.0)
-        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            s = c - m.contact_begin[here.at]
-            if block.any_of(touches[s].on):
-                by = point_velocity(step, touches[s].p)
-                jar = point_velocity(B, touches[s].p) + touches[s].bias + part * by
-                f, _H = cone(touches[s].D, friction(m, law, c), T(m.contact_numbers[c][3]), jar, T(0.0))
-                found = found + wp.dot(by, f)
-        return found
+    def record_contacts(m: Model, here: Lane, ck: t.Checkpoint, touches: t.Touches):
+        """Into the checkpoint jar of all contacts of a lane, after the accelerations.
+
+        It is a small difference of large numbers, of which float32 would not find the cone's zone again, and a factor
+        of one zone does not go with forces of another.
+        """
+        first = m.contact_begin[here.at]
+        for c in range(first, m.contact_begin[here.at + here.n]):
+            for r in range(3):
+                kin.store(ck.a, here.row, 2 * NV + 3 * c + r, here.e, touches[c - first].jar[r])
 
     @wp.func
     def add_contacts_adjoint(
         m: Model,
         law: Law,
+        here: Lane,
         k: int,
         link: Link,
         node: t.Node,
         height: T,
+        ck: t.Checkpoint,
         adj: t.Adjoint,
         adj_factors: t.array,
     ):
@@ -248,7 +250,10 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             centre, distance, on = place(m, c, link, height)
             if block.any_of(on):
-                p, jar, state, of = contact_state(m, law, c, centre, distance, on, link.V, node.B)
+                p, _, state, of = contact_state(m, law, c, centre, distance, on, link.V, node.B)
+                jar = vec3()
+                for r in range(3):
+                    jar[r] = kin.load(ck.a, here.row, 2 * NV + 3 * c + r, here.e)
                 f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
                 w = point_velocity(node.W, p)
                 g_jar = H * w
@@ -338,4 +343,4 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
         return gain
 
-    return by_name(touch, add_contacts, contacts_along, add_contacts_adjoint, joint_constraint, joint_gain)
+    return by_name(touch, add_contacts, record_contacts, add_contacts_adjoint, joint_constraint, joint_gain)

@@ -451,6 +451,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         motions[i].rate = motions[i].rate + change
                 if record == 1:  # the acceleration of the constraints, of which the adjoint is
                     record_rates(m, here, ck, NV, root.vdot, root.wdot, motions)
+                    if wp.static(CONTACT):
+                        constraint.record_contacts(m, here, ck, touches)
                 for i in range(1, here.n):
                     motions[i].u = motions[i].rate
                 if wp.static(not DAMPED):

@@ -121,11 +121,12 @@ class Launcher:
     def checkpoints(self, count: int) -> Any:
         """The kernels' struct Checkpoint, of `count` substeps.
 
-        With MuJoCo's constraints also the acceleration where the last pass began, and where damping follows them the
-        factors of both.
+        With MuJoCo's constraints also their acceleration and jar of all contacts there, and where damping follows them
+        the factors of both.
         """
         spec, n, result = self.spec, self.num_envs, types(self.spec).Checkpoint()
-        widths = (spec.nq, spec.nv, (1 + spec.constrained) * spec.nv, spec.nfactor)
+        accelerations = 2 * spec.nv + 3 * self.scene.ncontact if spec.constrained else spec.nv
+        widths = (spec.nq, spec.nv, accelerations, spec.nfactor)
         counts = (count, count, count, spec.solves * count)
         numbers = sum(rows * width for rows, width in zip(counts, widths, strict=True))
         check_memory("checkpoints", n, numbers * self.dtype.itemsize, self.device)
