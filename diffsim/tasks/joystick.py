@@ -105,13 +105,13 @@ class Joystick(Task):
     alive: ClassVar[float] = 4.0  # reward of a perfect step
 
     def __init_subclass__(cls) -> None:
-        """Its sizes: those of what `begin`, `remember` and `observe_with` say, in their order."""
+        """Its sizes: those of what `begin`, `remember` and `observe_with` say, in their order; names are mjlab's."""
         if "robot" not in vars(cls):
             return
         n = len(cls.robot.joints)
-        body = ("velocity", 3), ("angular_velocity", 3), ("gravity", 3)
-        sensed = *body, ("joints_from_home", n), ("joint_rates_x0.1", n)
-        seen = *sensed, ("last_action", n), ("command", 3), ("clock_sin", 1), ("clock_cos", 1)
+        body = ("base_lin_vel", 3), ("base_ang_vel", 3), ("projected_gravity", 3)
+        sensed = *body, ("joint_pos", n), ("joint_vel_x0.1", n)
+        seen = *sensed, ("actions", n), ("command", 3), ("clock_sin", 1), ("clock_cos", 1)
         private = *((f"true_{name}", size) for name, size in sensed), ("height", 1), ("action_change", n)
         cls.obs_parts = *seen, *private, ("joints_from_reference", n)
         cls.actor_dim, cls.obs_dim = (sum(size for _, size in parts) for parts in (seen, cls.obs_parts))

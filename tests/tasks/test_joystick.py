@@ -107,7 +107,7 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     obs = dict(zip(names, task.observe_with(qpos, qvel, last, memory).split(sizes, dim=-1), strict=True))
     down, joints = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3), qpos[:, 7:] - task._home
     sensed = dict(zip(names[:5], (velocity, qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
-    rest = dict(last_action=last, command=command, height=qpos[:, 2:3], action_change=last - before)
+    rest = dict(actions=last, command=command, height=qpos[:, 2:3], action_change=last - before)
     rest |= dict(clock_sin=(2 * torch.pi * clock).sin(), clock_cos=(2 * torch.pi * clock).cos())
     rest |= dict(joints_from_reference=qpos[:, 7:] - task.reference(command, clock))
     rest |= {f"true_{part}": value for part, value in sensed.items()}
@@ -115,7 +115,7 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     assert obs.keys() == rest.keys() and sum(sizes[:9]) == task.actor_dim
     for part, value in rest.items():
         torch.testing.assert_close(obs[part], value)
-    assert names[:5] == ("velocity", "angular_velocity", "gravity", "joints_from_home", "joint_rates_x0.1")
+    assert names[:5] == ("base_lin_vel", "base_ang_vel", "projected_gravity", "joint_pos", "joint_vel_x0.1")
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -243,7 +243,7 @@ def test_onnx_takes_only_what_the_actor_sees(tmp_path: Path) -> None:
     assert_acts_alike(model, policy, obs, seen)
     assert [told[name] for name in ("task", "script", "iteration", "control_dt")] == ["go1", "my_shac", "7", "0.02"]
     assert told["obs"] == (
-        "velocity[3], angular_velocity[3], gravity[3], joints_from_home[12], joint_rates_x0.1[12], last_action[12], "
+        "base_lin_vel[3], base_ang_vel[3], projected_gravity[3], joint_pos[12], joint_vel_x0.1[12], actions[12], "
         "command[3], clock_sin[1], clock_cos[1]"
     )
     scene = diffsim.load_scene(ASSETS / "go1.xml").mj_model
@@ -287,4 +287,4 @@ def test_names_of_observations_add_up() -> None:
             sizes = [size for _, size in task.obs_parts]
             assert sum(sizes) == task.obs_dim and task.actor_dim in (None, *itertools.accumulate(sizes))
             assert len({name for name, _ in task.obs_parts}) == len(sizes)
-    assert diffsim.TASKS["g1"].obs_parts[3] == ("joints_from_home", 29)
+    assert diffsim.TASKS["g1"].obs_parts[3] == ("joint_pos", 29)
