@@ -206,7 +206,7 @@ def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
         for row in part.measure(args, case):
             args.keep(part.csv, row, part.key)
     order: dict[str, int] = {name: place for place, name in enumerate(LEARNT)}
-    rows = sorted(args.read(part.csv), key=lambda row: order.get(row.get("task", "").partition(" ")[0], 0))
+    rows = sorted(args.read(part.csv), key=lambda row: order.get(row.get("task", "").partition(" ")[0], len(order)))
     args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
     return rows
 

@@ -46,7 +46,7 @@ class Task:
     asset: ClassVar[Asset]  # of a file's name, load_robot says where it is looked for
     contact: ClassVar[Contact] = "mujoco"  # unless the user asks for the other one
     substeps: ClassVar[int]  # simulation steps per control step: the "default" accuracy on this contact
-    fast: ClassVar[Integration]  # the other two on soft contact, chosen by measurement: docs/accuracy.md
+    fast: ClassVar[Integration]  # the other two on soft contact, chosen by measurement: docs/numerics.md
     accurate: ClassVar[Integration]
     obs_dim: int
     num_random: int  # random numbers per reset
@@ -148,22 +148,32 @@ class Task:
                 raise TaskError(f"task {self.name!r} has no method {names[0]!r}")
 
     @classmethod
-    def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
-        """The preset "fast", "default" (the paper's) or "accurate"; with MuJoCo's contact the first two are one.
+    def presets(cls, contact: str | None = None) -> dict[str, Integration]:
+        """The presets "fast", "default" (the paper's) and "accurate" that it has on a contact model, its own if None.
 
         Raises:
-            ValueError: another name, or a preset that the task has not.
+            ValueError: another contact model.
         """
         contact = cls.contact if contact is None else contact
         if contact not in RATE:
             raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(RATE)}")
         own = hasattr(cls, "substeps") and contact == cls.contact
         explicit = Integration.explicit(contact, cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt)))
-        presets = {name: getattr(cls, name) for name in ("fast", "accurate") if hasattr(cls, name)}
         if explicit.constrained:
-            presets["fast"] = explicit.replaced(tolerance=10 * TOLERANCE)
-            presets["accurate"] = explicit.replaced(substeps=4 * explicit.substeps, tolerance=TOLERANCE / 10)
-        presets["default"] = explicit
+            fast = explicit.replaced(tolerance=10 * TOLERANCE)
+            accurate = explicit.replaced(substeps=4 * explicit.substeps, tolerance=TOLERANCE / 10)
+            return {"fast": fast, "default": explicit, "accurate": accurate}
+        others = {name: getattr(cls, name) for name in ("fast", "accurate") if hasattr(cls, name)}
+        return others | {"default": explicit}
+
+    @classmethod
+    def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
+        """One of the presets.
+
+        Raises:
+            ValueError: another name, or a preset that the task has not.
+        """
+        presets = cls.presets(contact)
         if accuracy not in presets:
             raise ValueError(f"task {cls.name!r} has no preset {accuracy!r}; choose from {', '.join(presets)}")
         return presets[accuracy]

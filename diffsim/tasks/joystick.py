@@ -118,10 +118,10 @@ class Joystick(Task):
         cls.num_memory, cls.num_noise, cls.num_random = 13 + 4 * n, 17 + 2 * n, 21 + 2 * n
 
     @classmethod
-    def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
+    def presets(cls, contact: str | None = None) -> dict[str, Integration]:
         """See Task."""
-        found = super().integration(accuracy, contact)
-        return found._replace(touchdown=cls.touchdown) if found.constrained else found
+        found = super().presets(contact)
+        return {k: how._replace(touchdown=cls.touchdown) if how.constrained else how for k, how in found.items()}
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)

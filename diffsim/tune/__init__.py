@@ -62,7 +62,7 @@ def tune(
     contacts, stopped = contact or (task.contact,), False
     try:
         for each in contacts:
-            measure(motion, settings(task, each), device, rows)
+            measure(motion, settings(task, each), rows, device=device)
     except KeyboardInterrupt:
         stopped = True
         print(f"stopped after {len(rows)} settings")
@@ -70,7 +70,9 @@ def tune(
         return
     best, usual = choice(rows, error), Setting(task.integration("default", contacts[0]))
     default = next((row for row in rows if row.setting == usual), None)
-    print(table([mark(row, best, default) | row.columns() for row in thin(front(rows), best)]))
+    names = {Setting(how): name for each in contacts for name, how in task.presets(each).items()}
+    shown = [("->" * (row is best), names.get(row.setting, ""), row) for row in thin(front(rows), best)]
+    print(table([{"": arrow, "preset": name} | row.columns() for arrow, name, row in shown]))
     print(verdict(best, default, error))
     if csv:
         write(csv, [row.columns() for row in rows])
@@ -115,10 +117,6 @@ def actor(robot: str, task: type[Task], checkpoint: Path | None) -> tuple[torch.
     if own is None and (trained := saved.task()) != task.name:
         fail(f"{checkpoint} is a checkpoint of {trained}, not of {robot}")
     return saved.network, f"{saved.script}.py's policy, iteration {saved.iteration}"
-
-
-def mark(row: Row, best: Row | None, default: Row | None) -> dict[str, str]:
-    return {"": "->" if row is best else "default" if row is default else ""}
 
 
 def thin(rows: Sequence[Row], best: Row | None) -> list[Row]:

@@ -45,8 +45,9 @@ class Row(NamedTuple):
 
 
 def settings(task: type[Task], contact: str) -> list[Setting]:
-    """What is measured on a contact model, around the task's default."""
-    default = task.integration("default", contact)
+    """What is measured on a contact model: the task's presets, and others around its default."""
+    presets = task.presets(contact)
+    default = presets["default"]
     counts = sorted({max(1, round(factor * default.substeps)) for factor in FACTORS})
     if default.constrained:
         ends = *ENDS, (default.passes, default.tolerance)
@@ -56,7 +57,7 @@ def settings(task: type[Task], contact: str) -> list[Setting]:
         found += [Integration("implicit", n, theta) for theta in (0.0, 0.5) for n in counts]
         found += [Integration("extrapolated", n) for n in counts if n % 2 == 0]
     double = [Setting(default._replace(substeps=n), torch.float64) for n in counts[-2:]]
-    return [Setting(each) for each in found] + double
+    return [Setting(each) for each in dict.fromkeys((*found, *presets.values()))] + double
 
 
 class Reference:
@@ -106,12 +107,24 @@ def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> li
     return best.tolist()
 
 
-def measure(motion: Motion, found: list[Setting], device: str, rows: list[Row]) -> None:
-    """Append a row of each setting of one contact model; timings are of all of them side by side."""
-    most = max(setting.integration.substeps for setting in found)
-    finest = found[0].integration._replace(substeps=FINER * most, passes=100, tolerance=1e-9)
-    truth = Reference(motion, Setting(finest, torch.float64))
-    times = timed([motion.simulator(setting, TIMED, device=device) for setting in found], motion)
+def finest(found: Iterable[Setting]) -> Setting:
+    """The reference of settings of one contact model."""
+    how = max((setting.integration for setting in found), key=lambda how: how.substeps)
+    if how.constrained:
+        fine = how._replace(substeps=FINER * how.substeps, passes=100, tolerance=1e-9)
+    else:
+        fine = Integration("extrapolated", FINER * how.substeps)
+    return Setting(fine, torch.float64)
+
+
+def measure(motion: Motion, found: list[Setting], rows: list[Row], **options: object) -> None:
+    """Append a row of each setting of one contact model; timings are of all of them side by side.
+
+    Args:
+        options: of Simulator, where timings are: device, threads.
+    """
+    truth = Reference(motion, finest(found))
+    times = timed([motion.simulator(setting, TIMED, **options) for setting in found], motion)
     for setting, (forward, both) in zip(tqdm(found, "errors", leave=False, ncols=80), times, strict=True):
         numbers = {"us forward": forward, "us with gradient": both}
         rows.append(Row(setting, numbers | Reference(motion, setting).errors(truth)))

@@ -1,0 +1,175 @@
+"""What `diffsim tune` finds of every task: its presets among all settings, where integrators fail, and if it is right.
+
+    python benchmarks/numerics.py                                  presets and extremes of all tasks
+    python benchmarks/numerics.py ant --parts presets
+    python benchmarks/numerics.py go2 examples/own_robot.xml --parts promise
+    python benchmarks/numerics.py ant go2 --parts monitor
+
+Presets: all settings of a task, timed side by side on one thread. Extremes: the first value of each sweep with which an
+integrator fails. Promise: the setting chosen for an error of 0.01, and its error on 200 states of other episodes.
+Monitor: how long a replay takes, and in which iteration it warns of a training with 2 substeps and theta 1.
+Writes numerics_*.csv and a picture, and with --update-results the tables of docs/numerics.md.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Annotated, Literal
+
+import numpy as np
+import tables
+import tyro
+from common import TASKS, CommonFlags, Line, Panel, Part, Tasks, measured, plot, run
+from tables import Cells, Row, grouped
+
+import diffsim
+from diffsim.training import Count
+from diffsim.training.flags import ParallelFlags
+from diffsim.training.monitor import apart
+from diffsim.tune import actor, subject
+from diffsim.tune.extremes import stress
+from diffsim.tune.front import Row as Measured
+from diffsim.tune.front import Setting, choice, finest, measure, settings
+from diffsim.tune.motion import SPANS, Motion
+
+PartName = Literal["presets", "extremes", "promise", "monitor"]
+ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again
+SHOWN = ("task", "preset", "setting", "speed", "state 0.5 s", "gradient 8", "gradient 32")
+ITERATIONS, TURNS = 100, 4  # of the monitored trainings
+CHEAT = "--integrator implicit --theta 1 --substeps 2".split()
+
+
+@dataclass
+class Args(CommonFlags):
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = (*diffsim.TASKS,)  # tasks, my_task.py or robot.xml
+    parts: tuple[PartName, ...] = ("presets", "extremes")  # tables to measure
+    states: Count = 64  # start states
+    env: tyro.conf.Suppress[Tasks] = TASKS
+
+    @property
+    def measured(self) -> Sequence[str]:
+        return () if self.draw_only else self.robots
+
+
+def motion_of(robot: str, states: int, seed: int = 0) -> Motion:
+    task = subject(robot)
+    env = diffsim.make(task, states, seed=seed, early_termination=False, max_episode_steps=2**31)
+    return Motion(env, actor(robot, task, None)[0], seed)
+
+
+def measure_presets(args: Args, robot: str) -> Iterator[Row]:
+    task, rows = subject(robot), list[Measured]()
+    measure(motion_of(robot, args.states), settings(task, task.contact), rows, threads=1)
+    names = {Setting(how): name for name, how in task.presets().items()}
+    (default,) = (row for row in rows if names.get(row.setting) == "default")
+    for row in rows:
+        about: dict[str, object] = {"task": task.name, "preset": names.get(row.setting, ""), "kind": row.setting.kind}
+        about |= {"setting": f"{row.setting.kind}, {row.setting.integration.substeps}"}
+        yield {**about, "speed": default.cost / row.cost, **row.numbers}
+
+
+def presets(rows: list[Cells]) -> list[Row]:
+    """The rows of presets, by task."""
+    return [{name: row[name] for name in SHOWN} for row in rows if row["preset"]]
+
+
+def measure_extremes(args: Args, robot: str) -> Iterator[Row]:
+    task = subject(robot)
+    for row in stress(motion_of(robot, 8), task, (task.contact,)):
+        yield {"task": task.name} | row
+
+
+def bounds(rows: list[Cells]) -> list[Row]:
+    """Of each sweep and integrator: the mildest value with which a task fails, and how many do."""
+    lines = list[Row]()
+    for (sweep,), own in grouped(rows, "sweep").items():
+        line: dict[str, object] = {"sweep": sweep}
+        for kind in [name for name in own[0] if name not in ("task", "sweep")]:
+            found = [row[kind] for row in own if row[kind]]
+            failed = [float(cell.split(" ")[0]) for cell in found if cell != "-"]
+            mildest = (max if sweep == "substeps" else min)(failed, default=0)
+            line[kind] = f"{mildest:g} ({len(failed)} of {len(found)})" if failed else f"- ({len(found)})"
+        lines.append(line)
+    return lines
+
+
+def measure_promise(args: Args, robot: str) -> Iterator[Row]:
+    task, rows = subject(robot), list[Measured]()
+    found = settings(task, task.contact)
+    measure(motion_of(robot, args.states), found, rows, threads=1)
+    default = next(row for row in rows if row.setting == Setting(task.integration("default")))
+    best, others = choice(rows, ERROR), motion_of(robot, OTHERS, seed=1)
+    assert best is not None, "no setting is good enough"
+    ends = [others.replay(setting)[0][SPANS[-1]] for setting in (best.setting, finest(found))]
+    again = float(np.median(apart(others.scene.mj_model, *ends)))
+    row: dict[str, object] = {"robot": Path(robot).stem, "chosen": f"{best.setting.kind}, {best.setting.integration.substeps}"}
+    row |= {"default": f"{default.setting.kind}, {default.setting.integration.substeps}"}
+    row |= {"error": best.error, "error on 200 others": again, "times 0.01": again / ERROR}
+    yield row | {"speed": default.cost / best.cost, "default's error": default.error}
+
+
+def train(task: str, *flags: object) -> tuple[float, float, str]:
+    """Of a short training: its seconds with its start, those of an iteration, and what it prints."""
+    with TemporaryDirectory() as folder:
+        words = [tables.ROOT / "shac.py", "--env", task, "--device", "cpu", "--iterations", ITERATIONS]
+        words += ["--eval-every", 0, "--save-every", 0, "--run-dir", folder, *flags]
+        begin = time.perf_counter()
+        done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, check=True)
+        whole = time.perf_counter() - begin
+        seconds = [float(row["seconds"]) for row in tables.read_csv(Path(folder) / "progress.csv")]
+    half = len(seconds) // 2
+    return whole, (seconds[-1] - seconds[half - 1]) / (len(seconds) - half), done.stdout + done.stderr
+
+
+def measure_monitor(args: Args, robot: str) -> Iterator[Row]:
+    """A replay takes what trainings with one in each iteration take longer than those without any, in turn."""
+    pairs = [(train(robot, "--monitor", 0), train(robot, "--monitor", 1)) for _ in range(TURNS + 1)][1:]  # now compiled
+    iteration = median(without[1] for without, _ in pairs)
+    replay = median((own[0] - without[0]) / ITERATIONS for without, own in pairs)
+    row: dict[str, object] = {"task": robot, "iteration (ms)": 1e3 * iteration, "replay (ms)": 1e3 * replay}
+    row["share"] = f"{replay / (ParallelFlags.monitor * iteration):.1%}"
+    warnings = re.findall(r"iteration (\d+): with \d+ times .* is (\S+) m or rad", train(robot, *CHEAT)[2])
+    row["warned at"], row["error"] = warnings[0] if warnings else ("never", "")
+    yield row
+
+
+def draw(args: Args, rows: list[Cells]) -> None:
+    panels = list[Panel]()
+    for (task,), own in grouped([row for row in rows if "float64" not in row["kind"]], "task").items():
+        lines = list[Line]()
+        for k, ((kind,), same) in enumerate(grouped(own, "kind").items()):
+            same = sorted(same, key=lambda row: float(row["us with gradient"]))
+            x, y = ([float(row[name]) for row in same] for name in ("us with gradient", "state 0.5 s"))
+            lines.append(Line(x, y, f"C{k}.-", kind, 0.8, [row["preset"] for row in same]))
+        panels.append(Panel(lines, task, "us of a control step", "error of the state after 0.5 s", log="xy"))
+    grid = [panels[k : k + 4] for k in range(0, len(panels), 4)]
+    if grid and len(grid[-1]) == 4:
+        plot(args.picture("numerics"), grid, (3.2, 2.8))
+
+
+PAGE = "numerics.md"
+PARTS: dict[PartName, Part] = {
+    "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, presets),
+    "extremes": Part("numerics_extremes", measure_extremes, ("task", "sweep"), "extremes", PAGE, bounds),
+    "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", PAGE),
+    "monitor": Part("numerics_monitor", measure_monitor, ("task",), "monitor", PAGE),
+}
+
+
+def main(args: Args) -> None:
+    for name in args.parts:
+        rows = measured(args, PARTS[name])
+        if name == "presets":
+            draw(args, rows)
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
