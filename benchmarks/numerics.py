@@ -110,7 +110,10 @@ def measure_promise(args: Args, robot: str) -> Iterator[Row]:
     assert best is not None, "no setting is good enough"
     ends = [others.replay(setting)[0][SPANS[-1]] for setting in (best.setting, finest(found))]
     again = float(np.median(apart(others.scene.mj_model, *ends)))
-    row: dict[str, object] = {"robot": Path(robot).stem, "chosen": f"{best.setting.kind}, {best.setting.integration.substeps}"}
+    row: dict[str, object] = {
+        "robot": Path(robot).stem,
+        "chosen": f"{best.setting.kind}, {best.setting.integration.substeps}",
+    }
     row |= {"default": f"{default.setting.kind}, {default.setting.integration.substeps}"}
     row |= {"error": best.error, "error on 200 others": again, "times 0.01": again / ERROR}
     yield row | {"speed": default.cost / best.cost, "default's error": default.error}
