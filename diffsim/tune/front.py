@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -117,7 +117,7 @@ def finest(found: Iterable[Setting]) -> Setting:
     return Setting(fine, torch.float64)
 
 
-def measure(motion: Motion, found: list[Setting], rows: list[Row], **options: object) -> None:
+def measure(motion: Motion, found: list[Setting], rows: list[Row], **options: Any) -> None:
     """Append a row of each setting of one contact model; timings are of all of them side by side.
 
     Args:

@@ -31,6 +31,9 @@ class Setting(NamedTuple):
     integration: Integration
     dtype: torch.dtype = torch.float32
 
+    def __str__(self) -> str:
+        return f"{self.kind}, {self.integration.substeps} substeps"
+
     @property
     def kind(self) -> str:
         """What it shares with the settings of other substeps."""
