@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import tables
@@ -31,6 +31,7 @@ from common import TASKS, CommonFlags, Line, Panel, Part, Tasks, measured, plot,
 from tables import Cells, Row, grouped
 
 import diffsim
+from diffsim.tasks import Accuracy, find_task
 from diffsim.training import Count
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.monitor import apart
@@ -51,7 +52,7 @@ CHEAT = "--integrator implicit --theta 1 --substeps 2".split()
 class Args(CommonFlags):
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = (*diffsim.TASKS,)  # tasks, my_task.py or robot.xml
     parts: tuple[PartName, ...] = ("presets", "extremes")  # tables to measure
-    states: Count = 64  # start states
+    states: Count = 32  # start states
     env: tyro.conf.Suppress[Tasks] = TASKS
 
     @property
@@ -68,16 +69,27 @@ def motion_of(robot: str, states: int, seed: int = 0) -> Motion:
 def measure_presets(args: Args, robot: str) -> Iterator[Row]:
     task, rows = subject(robot), list[Measured]()
     measure(motion_of(robot, args.states), settings(task, task.contact), rows, threads=1)
-    names = {Setting(how): name for name, how in task.presets().items()}
-    (default,) = (row for row in rows if names.get(row.setting) == "default")
     for row in rows:
-        about: dict[str, object] = {"task": task.name, "preset": names.get(row.setting, ""), "kind": row.setting.kind}
-        yield {**about, "setting": row.setting, "speed": default.cost / row.cost, **row.numbers}
+        yield {"task": task.name, "setting": row.setting, "kind": row.setting.kind, **row.numbers}
+
+
+def named(rows: list[Cells]) -> list[Cells]:
+    """The rows, by task, with the name of the preset that has this setting, and the speed relative to the default."""
+    lines = list[Cells]()
+    for (task,), own in grouped(rows, "task").items():
+        names = {str(Setting(how)): name for name, how in find_task(task).presets().items()}
+        labelled = [row | {"preset": names.get(row["setting"], "")} for row in own]
+        (default,) = (float(row["us with gradient"]) for row in labelled if row["preset"] == "default")
+        lines += [row | {"speed": f"{default / float(row['us with gradient']):.2f}"} for row in labelled]
+    return lines
 
 
 def presets(rows: list[Cells]) -> list[Row]:
-    """The rows of presets, by task."""
-    return [{name: row[name] for name in SHOWN} for row in rows if row["preset"]]
+    """A line for each preset, by task, the fastest first."""
+    lines = sorted(
+        (row for row in named(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
+    )
+    return [{name: row[name] for name in SHOWN} for own in grouped(lines, "task").values() for row in own]
 
 
 def measure_extremes(args: Args, robot: str) -> Iterator[Row]:
@@ -145,7 +157,7 @@ def measure_monitor(args: Args, robot: str) -> Iterator[Row]:
 
 def draw(args: Args, rows: list[Cells]) -> None:
     panels = list[Panel]()
-    for (task,), own in grouped([row for row in rows if "float64" not in row["kind"]], "task").items():
+    for (task,), own in grouped((row for row in named(rows) if "float64" not in row["kind"]), "task").items():
         lines = list[Line]()
         for k, ((kind,), same) in enumerate(grouped(own, "kind").items()):
             same = sorted(same, key=lambda row: float(row["us with gradient"]))
