@@ -27,6 +27,7 @@ from worlds import Array, OtherFile, State, in_double, rollout
 
 from diffsim.tasks.joystick import Joystick
 from diffsim.training import NonNegative, Positive, fail
+from diffsim.training.checkpoint import HOME
 from diffsim.training.ranges import Range
 
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
@@ -84,6 +85,8 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     """A row for each friction."""
     case = load_case(path, 1, "cpu")
     about, task = case.about, case.env.task
+    if case.saved.simulator != HOME:
+        about["learner"] = f"{about['learner']} in {case.saved.simulator}"
     if not isinstance(task, Joystick):
         fail(f"{path} was trained on {task.name}, which follows no command")
     for friction in args.friction:

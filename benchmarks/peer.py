@@ -1,9 +1,11 @@
 """mujoco_warp, MuJoCo's own simulator for GPUs, beside this one with --contact mujoco: the same law and substeps.
 
-    python benchmarks/peer.py                      control steps per second of both
+    python benchmarks/peer.py                                            control steps per second of both
+    python benchmarks/peer.py --parts train --env ant --seconds 100      ppo_baseline.py, trained in mujoco_warp
+    python benchmarks/transfer.py runs/learning/ppo_mujoco_warp/ant__1   judges its policy here and in MuJoCo
 
-mujoco_warp has at most 10 iterations of Newton's method and 20 of the line search, as in its own benchmark of a
-humanoid; this simulator passes until it has converged to its tolerance.
+What follows "--" goes to ppo_baseline.py. mujoco_warp has at most 10 iterations of Newton's method and 20 of the line
+search, as in its own benchmark of a humanoid; this simulator passes until it has converged to its tolerance.
 """
 
 from __future__ import annotations
@@ -16,27 +18,34 @@ from typing import Literal
 
 import torch
 import warp as wp
-from common import CommonFlags, Part, measured, run
+from cells import ScriptFlags
+from common import Part, measured, run
 from speed import timed, windows
-from tables import Row
+from tables import Row, read_csv
 from torch import Tensor
 from worlds import FASTEST, mujoco_model
 
 import diffsim
-from diffsim.training import Count, fail, graph
+import ppo_baseline
+from diffsim.training import Count, Positive, Run, fail, graph, parse
 
+PartName = Literal["speed", "train"]
 Name = Literal["hopper", "half_cheetah", "ant", "humanoid", "go1", "go2", "g1"]
 # Contacts and rows of constraints for which mujoco_warp has room in a world; `lost` tells whether they are too few.
 ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64), "humanoid": (24, 96)}
 ROOM |= {"go1": (16, 96), "go2": (16, 96), "g1": (24, 192)}
+PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
 HORIZON = 32  # control steps of a timed window
 
 
 @dataclass
-class Args(CommonFlags):
+class Args(ScriptFlags):
     env: tuple[Name, ...] = ("ant", "humanoid")  # type: ignore[assignment]  # tasks
-    num_envs: tuple[Count, ...] = (1024, 4096)  # batch sizes
+    parts: tuple[PartName, ...] = ("speed",)  # what to measure
+    num_envs: tuple[Count, ...] = (1024, 4096)  # batch sizes of the speed
     repeats: Count = 10  # windows of 32 control steps; the fastest counts
+    seed: int = 1  # seed of the training, which writes to {runs}/ppo_mujoco_warp/{env}__{seed}
+    seconds: Positive = 100.0  # of training, after which it stops and saves
 
 
 class MuJoCoWarp(diffsim.Simulator):
@@ -108,10 +117,40 @@ def measure_speed(args: Args, name: Name) -> Iterator[Row]:
         graph.release()
 
 
+def train(args: Args, name: Name) -> Iterator[Row]:
+    """ppo_baseline.py's training, for some seconds. Its rollout is no CUDA graph: each control step in it is one."""
+    flags = f"--env {name} --seed {args.seed} --device {args.device} --contact mujoco {PPO} --run-dir".split()
+    settings = parse(ppo_baseline.Args, [*flags, f"{args.runs}/ppo_mujoco_warp/{name}__{args.seed}", *args.arguments])
+    if settings.contact != "mujoco" or settings.randomise:
+        fail("mujoco_warp has its own contact, which does not vary: leave out --contact and --randomise")
+    training = Run(settings)
+    training.simulator = "mujoco_warp"
+    env = training.make_env(settings.num_envs, settings.horizon)
+    env.sim = peer = MuJoCoWarp(env.sim, name)
+    ppo = training.restore(ppo_baseline.PPO(settings, env))
+    update = training.capture(ppo.update)
+    for iteration in training:
+        training.log(ppo.collect() | update() | {"charts/speed": env.qvel[:, 0].mean(), "sim/lost": peer.lost()})
+        if training.seconds >= args.seconds:
+            training.last = settings.iterations = iteration
+    last = read_csv(training.directory / "progress.csv")[-1]
+    shown = {"control steps": "control_steps", "training (s)": "seconds", "control steps/s": "charts_SPS"}
+    shown |= {"return": "return", "lost": "sim_lost"}
+    row: Row = {"task": name, "seed": args.seed, "iteration": int(last["iteration"])}
+    yield {**row, **{column: last[metric] and float(last[metric]) for column, metric in shown.items()}}
+
+
+PARTS = {
+    "speed": Part("peer_speed", measure_speed, ("task", "environments"), "peer_speed", "performance.md"),
+    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md"),
+}
+
+
 def main(args: Args) -> None:
     if not (args.draw_only or util.find_spec("mujoco_warp")):
         fail("mujoco_warp is missing: pip install -e '.[peer]'")
-    measured(args, Part("peer_speed", measure_speed, ("task", "environments"), "peer_speed", "performance.md"))
+    for part in args.parts:
+        measured(args, PARTS[part])
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
     python benchmarks/transfer.py runs/learning/shac/ant__1            a run, or a checkpoint of any learner's script
     python benchmarks/transfer.py runs/learning/*/* --friction 0.5 0.7 1 1.3 1.5
+    python benchmarks/transfer.py runs/learning/shac/ant__1 --episodes 8 --video both.mp4
 
 A policy acts from the same start states in several worlds, of which each step changes one thing:
 
@@ -11,7 +12,10 @@ A policy acts from the same start states in several worlds, of which each step c
     MuJoCo x1    MuJoCo with its own contact and limits, cones and timestep on the same file
     MuJoCo x0.5  and so on, with other friction
 
-Writes transfer.csv, a row for each policy and world, and with --update-results the table of docs/transfer.md.
+A policy that peer.py trained in mujoco_warp was trained in "MuJoCo same", and what it keeps is its share of that speed.
+
+Writes transfer.csv, a row for each policy and world, and with --update-results the table of docs/transfer.md. The video
+shows the episode of median return here (left), and its start in MuJoCo (right).
 """
 
 from __future__ import annotations
@@ -31,7 +35,9 @@ from worlds import Here, Motion, MuJoCo, World, travel
 import diffsim
 from diffsim import DiffEnv, Integration, Scene, Simulator
 from diffsim.training import Count, Positive, fail, gait
-from diffsim.training.evaluation import FINER
+from diffsim.training.checkpoint import HOME
+from diffsim.training.evaluation import FINER, VIDEO_SECONDS
+from diffsim.view import render
 
 SAME = "MuJoCo same"  # with the law and the substeps of contact mujoco
 
@@ -42,6 +48,7 @@ class Args(common.CheckpointFlags):
     steps: Count = 1000  # control steps at most
     friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # friction in MuJoCo, in multiples of the file's mu
     finer: Count = FINER  # steps of "finer" in multiples of the task's substeps
+    video: Path | None = None  # write the episode of median return, here and in MuJoCo side by side: .mp4 or .gif
 
 
 def speed(motion: Motion, control_dt: float, forward: int) -> float:
@@ -91,18 +98,18 @@ def conditions(case: Case, args: Args) -> dict[str, World]:
     finer = Integration("semi_implicit", args.finer * env.task.substeps)
     if exact:
         finer = how._replace(substeps=args.finer * how.substeps)
-    worlds: dict[str, World] = {"here": Here(env.sim)}
-    worlds |= {"finer": Here(Simulator(scene, n, finer, dt, device=env.device))}
-    worlds |= {SAME: MuJoCo(scene, n, dt, 1.0, exact, how.substeps)} if exact else {}
+    worlds: dict[str, World] = {SAME: MuJoCo(scene, n, dt, 1.0, exact, how.substeps)} if exact else {}
+    worlds |= {"here": Here(env.sim), "finer": Here(Simulator(scene, n, finer, dt, device=env.device))}
+    first = SAME if exact and case.saved.simulator != HOME else "here"
     for friction in args.friction if scene.ncontact else (1.0,):
         worlds[f"MuJoCo x{friction:g}"] = MuJoCo(scene, n, dt, friction, own_friction=exact)
-    return worlds
+    return {first: worlds[first], **worlds}
 
 
 def measure(args: Args, path: Path) -> Iterator[Row]:
     """A row for each world. What cannot be compared ends the benchmark with one line."""
     case = load_case(path, args.episodes, args.device)
-    env, how, own = case.env, case.env.sim.integration, math.nan
+    env, how, motions, own = case.env, case.env.sim.integration, dict[str, Motion](), math.nan
     trained_on = f"{case.path} was trained on {env.task.name}, whose"
     if "muscle" in env.scene.features:
         fail(f"{trained_on} muscles are not simulated in MuJoCo here")
@@ -110,19 +117,21 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         fail(f"{trained_on} policy depends on the past: choose one of another task")
     flags = {"episodes": args.episodes, "steps": args.steps, "finer": args.finer}
     for name, world in conditions(case, args).items():
-        motion = travel(case, world, args.steps)
-        row = case.about | {"condition": name}
+        motion = motions[name] = travel(case, world, args.steps)
+        row = case.about | {"trained in": case.saved.simulator, "condition": name}
         row |= {"integrator": how.integrator, "substeps": how.substeps} | summary(motion, env)
         if isinstance(value := row["speed"], float):
-            own = value if name == "here" else own
+            own = value if len(motions) == 1 else own
             row["kept"] = value / own
         yield row | flags
+    if args.video:
+        film(args.video, env, motions["here"], motions["MuJoCo x1"])
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task, contact and learner, over its seeds: medians of the speed in each world in m/s, or of the
-    return of a robot that does not travel, what is kept of the speed in MuJoCo at the file's friction, mean shares of
-    whole episodes here and in MuJoCo, medians of the feet's penetration.
+    return of a robot that does not travel, what is kept of the training's own speed in the world that judges, mean
+    shares of whole episodes here and in MuJoCo, medians of the feet's penetration.
 
     Runs that are not named {learner}/{task}__{seed} have a line each.
     """
@@ -133,15 +142,17 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     rows = sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft"))
     names, lines = {row["condition"] for row in rows}, list[Row]()
     worlds = sorted((name for name in names if name.startswith("MuJoCo x")), key=lambda name: float(name[8:]))
-    for (task, contact, learner), own in grouped(rows, "task", "contact", "learner").items():
+    for (task, contact, learner, home), own in grouped(rows, "task", "contact", "learner", "trained in").items():
         group = {name: found for (name,), found in grouped(own, "condition").items()}
         here, there = group["here"], group.get("MuJoCo x1", [])
         unit = ("speed", ".2f") if here[0]["speed"] else ("return", ".0f")
-        kept = numbers(there, "kept")
+        trained, judge = ("here", "MuJoCo x1") if home == HOME else (home, "here")
+        kept = numbers(group.get(judge, []), "kept")
         shares = [mean(numbers(group[name], "whole")) for name in ("here", *worlds) if name in group]
         lines.append(
             {"task": task, "contact": contact, "learner": learner, "seeds": len(here)}
             | {name: middle(group.get(name, []), *unit) for name in ("here", *({SAME} & names), *worlds)}
+            | {"trained in": trained, "judged in": judge}
             | {"kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
             | {"whole": " / ".join(f"{share:.0%}" for share in shares)}
             | {"depth here": middle(here, "penetration", ".1f"), "depth MuJoCo x1": middle(there, "penetration", ".1f")}
@@ -149,7 +160,30 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
+def film(path: Path, env: DiffEnv, here: Motion, there: Motion) -> None:
+    """The episode of median return here (left), and its start there (right), small as a gif; the fallen lie there."""
+    episode = int(here.returns.argsort()[(len(here.returns) - 1) // 2])
+    stride = max(1, math.ceil(1 / (render.VIDEO_FPS * env.control_dt) - 1e-6))
+    size, seconds = ((288, 208), 4.0) if path.suffix == ".gif" else (render.VIDEO_SIZE, VIDEO_SECONDS)
+    count = min(max(here.lengths[episode], there.lengths[episode]), round(seconds / env.control_dt))
+    with render.Renderer(env.scene, *size) as left, render.Renderer(env.scene, *size) as right:
+        sides = (left, here), (right, there)
+        frames = (
+            np.concatenate([side.draw(m.qpos[min(k, m.lengths[episode]), episode]) for side, m in sides], 1)
+            for k in range(0, count, stride)
+        )
+        print(render.save_video(path, frames, 1 / (stride * env.control_dt)))
+
+
 def main(args: Args) -> None:
+    if args.video:
+        if len(args.measured) != 1 or 1.0 not in args.friction:
+            fail("--video shows one checkpoint, and MuJoCo at the file's friction (--friction 1)")
+        try:
+            render.check_video(args.video, (2 * render.VIDEO_SIZE[0], render.VIDEO_SIZE[1]))
+            render.check_opengl()
+        except (ValueError, RuntimeError) as error:
+            fail(f"--video: {error}")
     measured(args, Part("transfer", measure, (*ABOUT[:-1], "condition"), "transfer", "transfer.md", table))
 
 

@@ -120,6 +120,9 @@ def test_an_export_is_the_policy_alone(trained: Path, tmp_path: Path) -> None:
     before, after, obs = load_policy(trained), load_policy(small), torch.randn(3, 5)
     assert torch.equal(before.network(obs), after.network(obs))
     assert (before.args, before.script, before.iteration) == (after.args, after.script, after.iteration)
+    torch.save(torch.load(trained, weights_only=True) | {"simulator": "another"}, tmp_path / "other.pt")
+    command.main(["export", str(tmp_path / "other.pt"), str(small)])
+    assert (after.simulator, load_policy(small).simulator) == ("diffsim", "another")
 
 
 @pytest.mark.parametrize(

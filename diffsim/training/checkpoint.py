@@ -26,6 +26,7 @@ from diffsim.training.layers import First, Likeliest, ObsNormalizer
 POLICIES = Path(__file__).resolve().parents[1] / "policies"  # that come with the package
 FORMAT = 2
 POLICY = {"script", "args", "iteration", "policy"}  # what an exported policy has
+HOME = "diffsim"  # the simulator in which policies are trained, unless a checkpoint names another one
 
 # What a policy may consist of, and the attributes that its constructor takes.
 LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
@@ -58,6 +59,7 @@ class SavedPolicy:
     script: str  # that trained it
     args: dict[str, Any]  # with which arguments, env among them
     iteration: int
+    simulator: str = HOME
 
     def task(self, given: str | None = None) -> str:
         """The name of its task, or the given file of an own one: what a checkpoint names is data, and no code to run.
@@ -148,13 +150,13 @@ def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
             network(torch.zeros(1, task.obs_dim))  # on the device meta this would take seconds, of torch's imports
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers or its task")
-    return SavedPolicy(network, state["script"], state["args"], state["iteration"])
+    return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))
 
 
 def export_policy(path: str | os.PathLike[str], output: Path) -> None:
     """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB."""
     state = load(path)
-    _write(output, {name: value for name, value in state.items() if name in {"format", *POLICY}})
+    _write(output, {name: value for name, value in state.items() if name in {"format", "simulator", *POLICY}})
 
 
 def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:

@@ -70,6 +70,8 @@ class Run:
     by args.seed here.
     """
 
+    simulator = checkpoint.HOME  # which its environments have
+
     def __init__(self, args: Flags) -> None:
         self.args = args
         self.writes = distributed.rank() == 0
@@ -404,6 +406,7 @@ class Run:
         args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
         state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
+        state |= dict(simulator=self.simulator)
         with self._writing():
             checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
         self._saved = self.iteration

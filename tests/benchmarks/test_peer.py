@@ -10,9 +10,11 @@ import pytest
 import torch
 import worlds
 from common import parse
+from learners import refusal
 from tables import read_csv
 
 import diffsim
+from diffsim.training import load_policy, make_policy_env
 
 pytest.importorskip("mujoco_warp")
 
@@ -39,8 +41,20 @@ def test_a_step_is_mujoco_s_and_ours(name: peer.Name, share: float, tolerance: f
     assert (other.step(env.qpos, qvel, action)[0][1] == env.qpos[1]).all() and other.nonfinite.tolist() == [False, True]
 
 
-def test_the_command(tmp_path: Path) -> None:
+def test_the_commands(tmp_path: Path) -> None:
     flags = ["--device", "cpu", "--env", "hopper", "--output", str(tmp_path)]
     peer.main(parse(peer.Args, None, [*flags, "--num-envs", "2", "--repeats", "1"]))
     (row,) = read_csv(tmp_path / "peer_speed.csv")
     assert row["lost"] == "0" and all(float(row[name]) > 0 for name in ("mujoco_warp", "here", "forward and backward"))
+    own = "--num-envs 2 --minibatch-size 8 --horizon 4 --eval-episodes 2 --quiet".split()
+    training = ["--parts", "train", "--seconds", "0.1", "--runs", str(tmp_path), "--", *own]
+    peer.main(parse(peer.Args, None, [*flags, *training]))
+    (row,) = read_csv(tmp_path / "peer_train.csv")
+    saved = load_policy(tmp_path / "ppo_mujoco_warp" / "hopper__1" / "checkpoint.pt")
+    assert (saved.simulator, saved.script, saved.iteration) == ("mujoco_warp", "ppo_baseline", int(row["iteration"]))
+    assert make_policy_env(saved, 1).sim.integration == diffsim.Integration("mujoco", 4)
+
+
+def test_what_mujoco_warp_does_not_vary(capsys: pytest.CaptureFixture[str]) -> None:
+    args = parse(peer.Args, None, "--device cpu --env hopper --parts train -- --randomise friction=0.7:1.3".split())
+    assert "leave out --contact and --randomise" in refusal(lambda: peer.main(args), capsys)

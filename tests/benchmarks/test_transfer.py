@@ -36,27 +36,32 @@ def test_the_summary_of_a_known_motion() -> None:
 
 
 def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What is kept counts from here."""
+    """What is kept counts from the world of the training, here or, in mujoco_warp, that of the same law."""
     state = torch.load(POLICIES / "hopper.pt", weights_only=True)
     exact = {"contact": "mujoco", "integrator": "mujoco", "substeps": 4, "theta": 0.0, "passes": 4, "seed": 1}
-    path = tmp_path / "exact" / "hopper__1" / "checkpoint.pt"
-    path.parent.mkdir(parents=True)
-    torch.save(state | {"args": state["args"] | exact}, path)
-    paths = POLICIES / "hopper.pt", POLICIES / "cartpole.pt", path
+    paths = [POLICIES / "hopper.pt", POLICIES / "cartpole.pt"]
+    for simulator in ("diffsim", "mujoco_warp"):
+        paths.append(tmp_path / simulator / "hopper__1" / "checkpoint.pt")
+        paths[-1].parent.mkdir(parents=True)
+        torch.save(state | {"args": state["args"] | exact, "simulator": simulator}, paths[-1])
     flags = "--episodes 2 --steps 30 --friction 1 0.5 --output".split()
     transfer.main(parse(transfer.Args, None, [*map(str, paths), *flags, str(tmp_path)]))
     rows = read_csv(tmp_path / "transfer.csv")
     lines = {line["learner"]: line for line in transfer.table(rows)}
     assert markdown([*lines.values()]) in capsys.readouterr().out
     worlds = ["here", "finer", "MuJoCo x1", "MuJoCo x0.5"]
-    for learner, names in (("policies/hopper", worlds), ("exact", ["here", "finer", "MuJoCo same", *worlds[2:]])):
+    for learner, names, judge in (
+        ("policies/hopper", worlds, "MuJoCo x1"),
+        ("diffsim", ["here", "finer", "MuJoCo same", *worlds[2:]], "MuJoCo x1"),
+        ("mujoco_warp", ["MuJoCo same", "here", "finer", *worlds[2:]], "here"),
+    ):
         own = {row["condition"]: row for row in rows if row["checkpoint"].startswith(learner)}
         speed = {name: float(row["speed"]) for name, row in own.items()}
-        assert list(own) == names
+        assert sorted(own) == sorted(names)
         assert "MuJoCo same" in own or speed["finer"] == pytest.approx(speed["here"], rel=0.02)
-        kept = float(own["MuJoCo x1"]["kept"])
-        assert kept == pytest.approx(speed["MuJoCo x1"] / speed["here"], rel=0.01)
-        assert lines[learner]["kept"] == f"{kept:.0%}"
+        kept = float(own[judge]["kept"])
+        assert kept == pytest.approx(speed[judge] / speed[names[0]], rel=0.01)
+        assert (lines[learner]["judged in"], lines[learner]["kept"]) == (judge, f"{kept:.0%}")
         if "MuJoCo same" in own:  # one law
             assert speed["here"] == pytest.approx(speed["MuJoCo same"], rel=0.01)
     alone = [row for row in rows if row["task"] == "cartpole"]  # which touches nothing: a return, the same in MuJoCo
@@ -88,3 +93,11 @@ def test_what_cannot_be_compared(name: str, message: str, tmp_path: Path, capsys
         torch.save(state | {"args": state["args"] | {"env": "juggler"}}, path)
     args = parse(transfer.Args, None, [str(path)] if name else [])
     assert message in refusal(lambda: transfer.main(args), capsys)
+
+
+def test_a_video_shows_both_worlds(opengl: None, tmp_path: Path) -> None:
+    env = diffsim.make("hopper", 1)
+    qpos = env.qpos.double().numpy()
+    motion = transfer.Motion(np.stack([qpos] * 9), np.zeros((9, 1, 6)), np.zeros(1), np.array([8]), np.array([False]))
+    transfer.film(tmp_path / "both.gif", env, motion, motion)
+    assert (tmp_path / "both.gif").stat().st_size > 1_000

@@ -147,6 +147,7 @@ def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> Non
     save(path, f"my_{name}", learner, STATE | {"iteration": 7})
     loaded, obs = load_policy(path), 3.0 + 2.0 * torch.randn(7, 5, env.task.obs_dim)
     assert (loaded.script, loaded.args, loaded.iteration) == (f"my_{name}", {"env": "cartpole"}, 7)
+    assert loaded.simulator == "diffsim"  # unless it says otherwise
     torch.testing.assert_close(loaded.network(obs), learner.policy(obs), rtol=0, atol=0)
     state = load(path, f"my_{name}")
     assert {"actor", "actor_critic"} & state["modules"].keys() and not {"env", "policy"} & state["modules"].keys()
