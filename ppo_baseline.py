@@ -18,10 +18,10 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.tasks import Task, find_task
+from diffsim.tasks.mirror import Mirror
 from diffsim.training import Run, distributed, evaluate, fail, script
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, moments, seeing
+from diffsim.training.flags import SymmetricFlags
+from diffsim.training.layers import ObsNormalizer, folded, make_even, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
 
@@ -43,13 +43,13 @@ CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost m
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(SymmetricFlags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
     MAY_CHANGE = (
-        *ParallelFlags.MAY_CHANGE,
+        *SymmetricFlags.MAY_CHANGE,
         *("horizon", "epochs", "minibatch_size", "target_kl", "lr_bounds", "max_grad_norm", "gamma", "gae_lambda"),
-        *("clip_coef", "value_coef", "entropy_coef", "bound_coef", "symmetric", "symmetry_weight"),
+        *("clip_coef", "value_coef", "entropy_coef", "bound_coef"),
     )
 
     iterations: Count = 5000
@@ -84,10 +84,6 @@ class Args(ParallelFlags):
     """weight of the policy's entropy, which keeps its noise from vanishing (per task)"""
     bound_coef: NonNegative = 1e-4
     """weight of the squared excess of the policy's mean beyond 1.1, where the action is clipped"""
-    symmetric: bool = False
-    """left and right are treated alike: what the policy does in a state it does in the mirrored state, mirrored"""
-    symmetry_weight: Positive = 1.0
-    """weight of the squared difference between the two, with --symmetric"""
     initial_log_std: Finite = 0.0
     """initial log standard deviation of the policy"""
     eval_every: Natural = 500
@@ -97,15 +93,13 @@ class Args(ParallelFlags):
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
-        return values
+        return super().task_defaults() | values
 
     def check(self) -> None:
         super().check()
         least, largest = self.lr_bounds
         if least > largest:
             fail(f"--lr-bounds {least} {largest} are the wrong way round")
-        if self.symmetric and find_task(self.env).mirror is Task.mirror:
-            fail(f"--symmetric: task {self.env!r} has no mirror image")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -122,13 +116,17 @@ def hidden(inputs: int, args: Args) -> nn.Sequential:
 class ActorCritic(nn.Module):
     """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(
+        self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
+    ) -> None:
         super().__init__()
-        self.normalizer = ObsNormalizer(obs_dim)
-        self.features = seeing(seen, hidden(seen or obs_dim, args))
-        self.own = None if seen is None else hidden(obs_dim, args)  # of V, which sees more
-        self.mean, self.value = nn.Linear(args.hidden[-1], action_dim), nn.Linear(args.hidden[-1], 1)
+        self.normalizer = ObsNormalizer(obs_dim, mirror)
+        self.features = seeing(seen, hidden(seen or obs_dim, args), mirror)
+        self.own = None if seen is None else seeing(None, hidden(obs_dim, args), mirror)  # of V, which sees more
+        mean, value = (nn.Sequential(nn.Linear(args.hidden[-1], n)) for n in (action_dim, 1))
+        self.mean, self.value = folded(mean, mirror and mirror.action), folded(value, mirror and mirror.value)
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
+        make_even(self, "log_std", mirror)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""
@@ -137,7 +135,7 @@ class ActorCritic(nn.Module):
 
     def deterministic(self) -> nn.Sequential:
         """The mean alone, of observations as they come, with the same weights."""
-        return nn.Sequential(self.normalizer, *self.features, self.mean)
+        return nn.Sequential(self.normalizer, *self.features, *self.mean)
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -160,7 +158,6 @@ class Batch(NamedTuple):
     """What the update needs of a rollout's samples, or of some of them: (B, ...)."""
 
     obs: Tensor  # normalized
-    mirrored: Tensor  # the mirror image of obs, likewise; none unless --symmetric
     mean: Tensor  # of the policy that acted
     action: Tensor
     advantage: Tensor  # normalized
@@ -176,14 +173,12 @@ class PPO:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor_critic = ActorCritic(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
+        mirror = env.task.mirror if args.symmetric else None
+        self.actor_critic = ActorCritic(args, obs_dim, action_dim, env.task.actor_dim, mirror).to(env.device)
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, args.max_grad_norm, lr=args.lr)
-        if args.symmetric:
-            self.mirror = env.task.mirror
-        mirrored, samples = obs_dim if args.symmetric else 0, args.horizon * env.num_envs
-        sizes = (obs_dim,), (mirrored,), (action_dim,), (action_dim,), (), ()
+        samples, sizes = args.horizon * env.num_envs, ((obs_dim,), (action_dim,), (action_dim,), (), ())
         self.batch = Batch(*(torch.zeros(samples, *size, device=env.device) for size in sizes))
         self.minibatches = math.ceil(samples / args.minibatch_size * distributed.size())
 
@@ -201,8 +196,7 @@ class PPO:
         target = self.return_normalizer(value + advantage)
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
-        mirrored = normalizer(self.mirror.obs(rollout.obs)) if args.symmetric else rollout.obs[..., :0]
-        samples = normalizer(rollout.obs), mirrored, rollout.mean, rollout.action, advantage, target
+        samples = normalizer(rollout.obs), rollout.mean, rollout.action, advantage, target
         for buffer, tensor in zip(self.batch, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(rollout.obs)
@@ -223,9 +217,6 @@ class PPO:
                 value_loss = (value - b.target).square().mean()
                 bound_loss = (mean.abs() - 1.1).clamp(min=0).square().sum(-1).mean()
                 loss = policy_loss + args.value_coef * value_loss + args.bound_coef * bound_loss
-                if args.symmetric:
-                    difference = policy(b.mirrored)[0] - self.mirror.action(mean)
-                    loss = loss + args.symmetry_weight * difference.square().mean()
                 norm = self.optimizer.step(loss - args.entropy_coef * entropy(policy.log_std))
                 metrics.append(torch.stack((policy_loss.detach(), value_loss.detach(), kl, norm)))
         names = ("losses/policy", "losses/value", "losses/kl", "grad/norm")

@@ -20,11 +20,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
-from diffsim.tasks import TASKS, Task, find_task
+from diffsim.tasks import TASKS
+from diffsim.tasks.mirror import Mirror
 from diffsim.training import Run, distributed, evaluate, fail, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, seeing
+from diffsim.training.flags import WindowFlags
+from diffsim.training.layers import ObsNormalizer, folded, make_even, seeing
 from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
 
 # SHAC's networks; docs/sapo.md has what was measured with these settings, which are those of its best results.
@@ -58,11 +59,11 @@ SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(WindowFlags):
     """The algorithm. With --no-entropy --no-state-std --critics 1 --activation elu it is SHAC."""
 
     MAY_CHANGE = (
-        *ParallelFlags.MAY_CHANGE,
+        *WindowFlags.MAY_CHANGE,
         *("horizon", "actor_lr", "critic_lr", "final_lr", "temperature_lr", "betas", "max_grad_norm", "gamma"),
         *("td_lambda", "target_alpha", "target_entropy", "critic_iterations", "critic_minibatches"),
     )
@@ -79,10 +80,6 @@ class Args(ParallelFlags):
     """members that learn side by side, each in its share of the environments, until one goes on (per task)"""
     selection: Fraction = 0.5
     """share of the iterations after which the best member goes on in all environments"""
-    symmetric: bool = False
-    """left and right are treated alike: what the policy does in a state it does in the mirrored state, mirrored"""
-    symmetry_weight: Positive = 1.0
-    """weight in the actor's loss of the squared difference between the two, with --symmetric"""
     initial_target_entropy: Finite = -0.5
     """entropy per action, in nats, at which the temperature aims in the first iteration (per task)"""
     target_entropy: Finite = -0.5
@@ -131,12 +128,10 @@ class Args(ParallelFlags):
                 values["num_envs"] = 4 * values["num_envs"]
         if (self.accuracy, self.contact) == ("default", "soft") and self.env in INTEGRATION:
             values |= INTEGRATION[self.env]._asdict()
-        return values | BALANCING.get(self.env, {})
+        return super().task_defaults() | values | BALANCING.get(self.env, {})
 
     def check(self) -> None:
         super().check()
-        if self.symmetric and find_task(self.env).mirror is Task.mirror:
-            fail(f"--symmetric: task {self.env!r} has no mirror image")
         if (self.num_envs // distributed.size()) % self.population:
             fail(f"--num-envs {self.num_envs} cannot be split evenly among --population {self.population}")
 
@@ -153,31 +148,37 @@ def mlp(inputs: int, hidden: Widths, activation: str) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def critic(args: Args, obs_dim: int) -> nn.Sequential:
+def critic(args: Args, obs_dim: int, mirror: Mirror | None) -> nn.Sequential:
     network = mlp(obs_dim, args.critic_hidden, args.activation).append(nn.Linear(args.critic_hidden[-1], 1))
     for layer in network:
         if isinstance(layer, nn.Linear):
             nn.init.orthogonal_(layer.weight, math.sqrt(2))
             nn.init.zeros_(layer.bias)
-    return network
+    return folded(seeing(None, network, mirror), mirror and mirror.value)
 
 
 class Actor(nn.Module):
     """pi(a|s) of K members, tanh of a Gaussian. Observations are normalized by the statistics of all members."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(
+        self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
+    ) -> None:
         super().__init__()
         K, width = args.population, args.actor_hidden[-1]
-        self.normalizer = ObsNormalizer(obs_dim)
-        self.body = Ensemble([seeing(seen, mlp(seen or obs_dim, args.actor_hidden, args.activation)) for _ in range(K)])
-        self.mean = Ensemble([nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)])
+        self.normalizer = ObsNormalizer(obs_dim, mirror)
+        bodies = [mlp(seen or obs_dim, args.actor_hidden, args.activation) for _ in range(K)]
+        self.body = Ensemble([seeing(seen, body, mirror) for body in bodies])
+        means = [nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)]
+        self.mean = Ensemble([folded(mean, mirror and mirror.action) for mean in means])
         spread = nn.Linear(width, action_dim)  # of the log standard deviation, which begins almost constant
         with torch.no_grad():
             spread.weight.mul_(0.1)
             spread.bias.fill_(args.initial_log_std)
-        self.spread = Ensemble([nn.Sequential(spread)] * K) if args.state_std else None
+        spreads = [folded(nn.Sequential(spread), mirror and mirror.size) for _ in range(K)]
+        self.spread = Ensemble(spreads) if args.state_std else None
         start = torch.full((K, 1, action_dim), args.initial_log_std)
         self.log_std = nn.Parameter(start, requires_grad=not args.state_std)
+        make_even(self, "log_std", mirror)
 
     def forward(self, obs: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations (K, B, obs_dim): the actions, and minus their log density per action (K, B)."""
@@ -187,10 +188,6 @@ class Actor(nn.Module):
         log_slope = 2 * (math.log(2) - u - F.softplus(-2 * u))  # of tanh
         surprise = 0.5 * noise.square() + 0.5 * math.log(2 * math.pi) + log_std + log_slope
         return torch.tanh(u), surprise.mean(-1)
-
-    def act(self, obs: Tensor) -> Tensor:
-        """The actions without noise, of normalized observations (K, B, obs_dim)."""
-        return torch.tanh(self.mean(self.body(obs)))
 
     def deterministic(self, member: int) -> nn.Sequential:
         """A member's policy without noise, of observations as they come; a copy."""
@@ -221,8 +218,9 @@ class SAPO:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env, K, obs_dim = args, env, args.population, env.task.obs_dim
-        self.actor = Actor(args, obs_dim, env.scene.nu, env.task.actor_dim).to(env.device)
-        self.critics = Ensemble([critic(args, obs_dim) for _ in range(args.critics * K)]).to(env.device)
+        mirror = env.task.mirror if args.symmetric else None
+        self.actor = Actor(args, obs_dim, env.scene.nu, env.task.actor_dim, mirror).to(env.device)
+        self.critics = Ensemble([critic(args, obs_dim, mirror) for _ in range(args.critics * K)]).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         log = torch.full((K,), math.log(args.initial_temperature))
         self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
@@ -234,7 +232,7 @@ class SAPO:
         self.temperature_optimizer = EnsembleAdam(self.temperature, 1, K, *limits)
         self.temperature_optimizer.lr.fill_(args.temperature_lr)
         self.target_entropy = torch.zeros((), device=env.device)
-        samples = args.horizon * env.num_envs * (1 + args.symmetric) // K  # a window's of a member, for its critics
+        samples = args.horizon * env.num_envs // K  # a window's of a member, for its critics
         self.obs = torch.zeros(K, samples, obs_dim, device=env.device)
         self.value = torch.zeros(K, samples, device=env.device)
 
@@ -281,8 +279,6 @@ class SAPO:
             weight = self.temperature["log"].detach().exp().repeat_interleave(self.env.num_envs // K)
             reward = reward + weight * (1 + rollout.entropy) / 2
         loss = actor_loss(reward, next_values.mean(0), rollout.done, args.gamma)
-        if args.symmetric:
-            loss = loss + args.symmetry_weight * self.asymmetry(rollout.obs.detach())
         norm = self.actor_optimizer.step(K * loss)  # each member's mean over its own environments
         rollout = Rollout(*(tensor.detach() for tensor in rollout))
         self.keep(rollout, reward.detach(), next_values.detach())
@@ -342,20 +338,11 @@ class SAPO:
 
     def keep(self, rollout: Rollout, reward: Tensor, next_values: Tensor) -> None:
         """A window's observations with their TD(lambda) returns, which the critics are to learn."""
-        args, normalizer, obs = self.args, self.actor.normalizer, rollout.obs
+        args, normalizer = self.args, self.actor.normalizer
         value = td_lambda(reward, next_values.amin(0), rollout.done, args.gamma, args.td_lambda)
-        if args.symmetric:  # a state and its mirror image, one after the other, are worth the same
-            obs = torch.stack((obs, self.env.task.mirror.obs(obs)), 1).flatten(0, 1)
-            value = value.repeat_interleave(2, 0)
         self.value.copy_(self.split(value))
-        self.obs.copy_(self.split(normalizer(obs)))
+        self.obs.copy_(self.split(normalizer(rollout.obs)))
         normalizer.update(rollout.obs)
-
-    def asymmetry(self, obs: Tensor) -> Tensor:
-        """Mean squared difference between the actions in mirrored states and the mirrored actions, without noise."""
-        mirror, normalizer = self.env.task.mirror, self.actor.normalizer
-        there, here = (self.actor.act(self.split(normalizer(x))) for x in (mirror.obs(obs), obs))
-        return (there - mirror.action(here)).square().mean()
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
@@ -383,7 +370,7 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
 
 def train(args: Args) -> None:
     run = Run(args)
-    env = run.make_env(args.num_envs, args.horizon)
+    env = run.make_env(args.num_envs, args.horizon, adjoint_clip=args.adjoint_clip)
     sapo = run.restore(SAPO(args, env))
     update_actor, update_critic = run.capture(sapo.update_actor, env), run.capture(sapo.update_critic)
     for iteration in run:

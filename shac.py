@@ -20,9 +20,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
+from diffsim.tasks.mirror import Mirror
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Chain, seeing
+from diffsim.training.flags import WindowFlags
+from diffsim.training.layers import Chain, folded, make_even, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
@@ -45,11 +46,11 @@ BALANCING = {"g1": {"horizon": 16, "initial_log_std": -2.0, "initial_gain": 0.01
 
 
 @dataclass
-class Args(ParallelFlags):
+class Args(WindowFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
     MAY_CHANGE = (
-        *ParallelFlags.MAY_CHANGE,
+        *WindowFlags.MAY_CHANGE,
         *("horizon", "actor_lr", "critic_lr", "final_lr", "betas", "max_grad_norm", "gamma", "td_lambda"),
         *("target_alpha", "critic_iterations", "critic_minibatches"),
     )
@@ -97,7 +98,7 @@ class Args(ParallelFlags):
             values = {name: value for name, value in values.items() if name == "iterations"}
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
             values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
-        return values | BALANCING.get(self.env, {})
+        return super().task_defaults() | values | BALANCING.get(self.env, {})
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -121,9 +122,11 @@ def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Seque
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state; or of its mean alone."""
 
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(
+        self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
+    ) -> None:
         super().__init__()
-        self.normalizer = ObsNormalizer(obs_dim)
+        self.normalizer = ObsNormalizer(obs_dim, mirror)
         network = mlp(seen or obs_dim, args.actor_hidden, action_dim, orthogonal=args.deterministic_policy)
         if args.initial_gain != 1.0:
             last = network[-1]
@@ -131,9 +134,10 @@ class Actor(nn.Module):
             with torch.no_grad():
                 last.weight.mul_(args.initial_gain)
                 last.bias.zero_()
-        self.mean = seeing(seen, network)
+        self.mean = folded(seeing(seen, network, mirror), mirror and mirror.action)
         log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
         self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)
+        make_even(self, "log_std", mirror)
 
     def sample_noise(self, *shape: int) -> Tensor:
         """(*shape, action_dim) reparameterised noise of a whole window, differentiable in log_std (A.1)."""
@@ -170,9 +174,11 @@ class SHAC:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
+        mirror = env.task.mirror if args.symmetric else None
+        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim, mirror).to(env.device)
         self.policy = self.actor.deterministic()
-        self.critic = mlp(obs_dim, args.critic_hidden, 1, orthogonal=True).to(env.device)
+        critic = seeing(None, mlp(obs_dim, args.critic_hidden, 1, orthogonal=True), mirror)
+        self.critic = folded(critic, mirror and mirror.value).to(env.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
         self.critic_optimizer = ClippedAdam(self.critic, args.max_grad_norm, args.betas)
@@ -258,7 +264,7 @@ def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, la
 
 def train(args: Args) -> None:
     run = Run(args)
-    env = run.make_env(args.num_envs, args.horizon)
+    env = run.make_env(args.num_envs, args.horizon, adjoint_clip=args.adjoint_clip)
     shac = run.restore(SHAC(args, env))
     update_actor, update_critic = run.capture(shac.update_actor, env), run.capture(shac.update_critic)
     for iteration in run:

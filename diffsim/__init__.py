@@ -39,7 +39,7 @@ __all__ = [
 
 
 # Arguments of `make` that it hands on
-KEYWORDS = {"stochastic_init", "early_termination", "max_episode_steps", "render_mode", *Options._fields}
+KEYWORDS = {*"stochastic_init early_termination max_episode_steps adjoint_clip render_mode".split(), *Options._fields}
 KEYWORDS -= {"integration", "device", "dtype"}
 
 
@@ -83,8 +83,8 @@ def make(
             observes, rewards and ends by are then those over the ground below the root.
         control_dt: seconds of a control step in place of the task's; the substeps divide it.
         clip: the motion that humanoid_imitation tracks, or its .npz file, see read_clip; default the shipped run.
-        **others: stochastic_init, early_termination, max_episode_steps, render_mode: see DiffEnv; threads, factors,
-            forces: see sim.Options.
+        **others: stochastic_init, early_termination, max_episode_steps, adjoint_clip, render_mode: see DiffEnv;
+            threads, factors, forces: see sim.Options.
 
     Raises:
         ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Iterable, Mapping
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim.robot.scene import Scene
-from diffsim.sim.integration import Integration, check_count
+from diffsim.sim.adjoint import ClipAdjoint
+from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.launcher import check_memory
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options
@@ -63,6 +65,8 @@ class DiffEnv(VectorEnv):
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task says that the robot has fallen.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
+        adjoint_clip: after each step, gradients with respect to an environment's state are scaled down to at most this
+            many times the batch's median, see sim/adjoint.py; 0: not at all.
         render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
         **options: device, dtype, threads, factors, forces, block, division: see sim.Options. `env.sim` has the factors
             and the forces.
@@ -89,6 +93,7 @@ class DiffEnv(VectorEnv):
         stochastic_init: bool = True,
         early_termination: bool = True,
         max_episode_steps: int | None = None,
+        adjoint_clip: float = 0.0,
         render_mode: RenderMode | None = None,
         **options: Any,
     ) -> None:
@@ -110,6 +115,9 @@ class DiffEnv(VectorEnv):
 
             self._screen = Screen(scene, render_mode, 1 / task.control_dt)
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
+        if not is_real(adjoint_clip) or not 0 <= adjoint_clip < math.inf:
+            raise ValueError(f"adjoint_clip is {adjoint_clip!r}, must be a factor of at least 0")
+        self.adjoint_clip = float(adjoint_clip)
         self._elevation = None if scene.terrain is None else Elevation(scene, self.device, self.dtype)
         real = np.float32 if self.dtype == torch.float32 else np.float64
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.obs_dim,), real)
@@ -195,6 +203,8 @@ class DiffEnv(VectorEnv):
             )
         self._recorded += recorded
         self.qpos, self.qvel = self.sim.advance(self.qpos, self.qvel, action)
+        if recorded and self.adjoint_clip:
+            self.qpos, self.qvel = ClipAdjoint.apply(self.adjoint_clip, self.qpos, self.qvel)
         nonfinite = self.sim.nonfinite.clone()
         if self.task.num_memory:
             noise = self._uniform(self.num_envs, self.task.num_noise)

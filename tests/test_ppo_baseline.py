@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import read_progress, refusal, run
+from learners import read_progress, run
 from torch.distributions import Normal, kl_divergence
 
 import diffsim
@@ -101,7 +101,6 @@ def gaussians(count: int = 40) -> tuple[ppo.Batch, torch.Tensor, torch.Tensor, t
     action = mean + old_log_std.exp() * torch.randn_like(mean)
     batch = ppo.Batch(
         torch.zeros(count, 1),
-        torch.zeros(count, 0),
         mean,
         action,
         torch.randn(count, dtype=torch.float64),
@@ -162,27 +161,3 @@ def test_cartpole_improves_within_seconds(tmp_path: Path) -> None:
     run(ppo, tmp_path, *arguments.split())
     returns = [float(row["return"]) for row in read_progress(tmp_path)]
     assert returns[0] < -2000 and returns[-1] > -1700
-
-
-def test_symmetric_policies_are_paid(capsys: pytest.CaptureFixture[str]) -> None:
-    torch.manual_seed(0)
-    flags = "--env ant --device cpu --horizon 8 --hidden 16 --minibatch-size 16 --symmetric --symmetry-weight 1e3"
-    learner = ppo.PPO(parse(ppo.Args, flags.split()), diffsim.make("ant", num_envs=4, seed=0, horizon=8))
-    mirror, normalizer = learner.env.task.mirror, learner.actor_critic.normalizer
-    normalizer.update(torch.randn(50, 37))
-    used = copy.deepcopy(normalizer)
-    learner.collect()
-    obs = used.inverse(learner.batch.obs)
-    torch.testing.assert_close(learner.batch.mirrored, used(mirror.obs(obs)), rtol=1e-4, atol=1e-4)
-
-    def asymmetry() -> torch.Tensor:
-        policy = learner.policy[1:]  # of normalized observations
-        return (policy(used(mirror.obs(obs))) - mirror.action(policy(used(obs)))).square().mean()
-
-    before = asymmetry()
-    for _ in range(20):
-        learner.update()
-    assert asymmetry() < 0.5 * before
-
-    message = "--symmetric: task 'hopper' has no mirror image"
-    assert message in refusal(lambda: parse(ppo.Args, ["--env", "hopper", "--symmetric"]), capsys)

@@ -218,28 +218,3 @@ def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
     modules = run(sapo, tmp_path, *words)["modules"]
     assert all(weight.isfinite().all() for weight in modules["critics"].values())
     assert modules["actor_optimizer"]["skipped"] == 0
-
-
-def test_symmetric_policies_are_paid_and_mirrored_states_are_worth_the_same(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    torch.manual_seed(0)
-    learner = build("ant", "--symmetric", "--symmetry-weight", "1e3", "--population", "2")
-    mirror, obs = learner.env.task.mirror, torch.randn(8, 4, 37)
-    squares = []
-    for k in range(2):
-        policy, own = learner.actor.deterministic(k), obs[:, 2 * k : 2 * k + 2]
-        squares.append((policy(mirror.obs(own)) - mirror.action(policy(own))).square().mean())
-    torch.testing.assert_close(learner.asymmetry(obs), torch.stack(squares).mean())
-
-    learner.prepare(1)
-    rollout = learner.collect()
-    before = learner.asymmetry(rollout.obs.detach())
-    for _ in range(20):
-        learner.update_actor()
-    assert learner.asymmetry(rollout.obs.detach()) < 0.5 * before
-    first, second = learner.value.unflatten(1, (8, 2, 2)).unbind(2)  # (members, steps, state and image, environments)
-    assert torch.equal(first, second) and first.std() > 0
-
-    message = "--symmetric: task 'hopper' has no mirror image"
-    assert message in refusal(lambda: parse(sapo.Args, ["--env", "hopper", "--symmetric"]), capsys)

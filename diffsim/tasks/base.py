@@ -53,6 +53,7 @@ class Task:
     forward_column: int | None  # of qpos [m], grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
+    symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
     episode_length: ClassVar[int] = 1000  # control steps

@@ -96,6 +96,7 @@ class Joystick(Task):
 
     robot: ClassVar[Robot]
     contact: ClassVar[Contact] = "mujoco"
+    symmetric = True
     substeps = 4
     control_dt = 0.02
     episode_length = 1000

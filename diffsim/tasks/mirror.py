@@ -58,6 +58,16 @@ class Mirror(NamedTuple):
     action: Reflection
     obs: Reflection
 
+    @property
+    def size(self) -> Reflection:
+        """Of numbers that each action has and that have no direction, such as standard deviations."""
+        return Reflection(self.action.index, torch.ones_like(self.action.sign))
+
+    @property
+    def value(self) -> Reflection:
+        """Of one number that is the same in the image."""
+        return Reflection.of([(0, 1.0)], self.obs.sign.device, self.obs.sign.dtype)
+
 
 def reflections(
     model: mujoco.MjModel, sides: Sides, device: torch.device, dtype: torch.dtype

@@ -21,7 +21,7 @@ from diffsim.robot.elements import control_range
 from diffsim.tasks import FILE, TASKS
 from diffsim.tasks.imitation.clip import Clip
 from diffsim.training.errors import fail
-from diffsim.training.layers import First, Likeliest, ObsNormalizer
+from diffsim.training.layers import Both, First, Fold, Likeliest, ObsNormalizer
 
 POLICIES = Path(__file__).resolve().parents[1] / "policies"  # that come with the package
 FORMAT = 2
@@ -30,8 +30,10 @@ HOME = "diffsim"  # the simulator in which policies are trained, unless a checkp
 
 # What a policy may consist of, and the attributes that its constructor takes.
 LAYERS: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
+    "Both": (Both, ("size",)),
     "ELU": (nn.ELU, ()),
     "First": (First, ("columns",)),
+    "Fold": (Fold, ("size",)),
     "LayerNorm": (nn.LayerNorm, ("normalized_shape",)),
     "Likeliest": (Likeliest, ("actions", "components", "shared")),
     "Linear": (nn.Linear, ("in_features", "out_features")),

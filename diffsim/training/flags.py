@@ -12,11 +12,11 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 
 from diffsim.sim.integration import PASSES, TOLERANCE
-from diffsim.tasks import FILE, Contact, HumanoidImitation, find_task
+from diffsim.tasks import FILE, Contact, HumanoidImitation, Task, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
-from diffsim.training.ranges import Count, Fraction, Natural, Range, check_ranges, flag
+from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Range, check_ranges, flag
 from diffsim.training.variation import parse_ranges
 
 ClipFile = Annotated[
@@ -29,6 +29,7 @@ ClipFile = Annotated[
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
+ADJOINT_CLIP = 5.0  # on MuJoCo's contact, whose gradients are heavy-tailed: docs/transfer.md
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -144,6 +145,36 @@ class ParallelFlags(Flags):
             fail(f"--randomise: {error}")
         if self.num_envs % distributed.size():
             fail(f"--num-envs {self.num_envs} cannot be split evenly among {distributed.size()} processes")
+
+
+@dataclass
+class SymmetricFlags(ParallelFlags):
+    """Of learners that can treat left and right alike."""
+
+    symmetric: bool = False
+    """in a state's mirror image the policy does the mirror image of what it does there (per task; docs/sapo.md)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        return {"symmetric": find_task(self.env).symmetric}
+
+    def check(self) -> None:
+        super().check()
+        if self.symmetric and find_task(self.env).mirror is Task.mirror:
+            fail(f"--symmetric: task {self.env!r} has no mirror image")
+
+
+@dataclass
+class WindowFlags(SymmetricFlags):
+    """Of learners that descend the gradient of short windows."""
+
+    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*SymmetricFlags.MAY_CHANGE, "adjoint_clip")
+
+    adjoint_clip: NonNegative = 0.0
+    """gradients with respect to a state of an environment are at most this many times the median (0: not clipped; per
+    --contact; docs/transfer.md)"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        return super().task_defaults() | {"adjoint_clip": ADJOINT_CLIP if self.contact == "mujoco" else 0.0}
 
 
 Args = TypeVar("Args", bound=Flags)

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
+from diffsim.tasks.mirror import Mirror, Reflection
 from diffsim.training import distributed
+from diffsim.training.errors import fail
 
 
 class ObsNormalizer(nn.Module):
     """Normalizes by the running mean and variance of what it has seen; constant between updates.
 
     The statistics are buffers, so they are saved with the policy that depends on them. Without the size of an
-    observation it normalizes scalars.
+    observation it normalizes scalars. With a mirror they are those of all observations and their mirror images, so
+    that the normalized image is the image of the normalized observation.
     """
 
-    def __init__(self, size: int | None = None) -> None:
+    def __init__(self, size: int | None = None, mirror: Mirror | None = None) -> None:
         super().__init__()
-        self.size = size
+        self.size, self.mirror = size, mirror and mirror.obs
         shape = () if size is None else (size,)
         self.count: Tensor = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))  # float32 stops counting at 2^24
         self.mean: Tensor = nn.Buffer(torch.zeros(shape))
@@ -35,6 +39,10 @@ class ObsNormalizer(nn.Module):
         """Adds x (..., size) or (...) of all ranks to the statistics (Chan et al.'s parallel variance)."""
         x = x.reshape(-1, *self.mean.shape)
         var, mean = moments(x)
+        if self.mirror is not None:
+            image = self.mirror(mean)
+            var = (var + var.index_select(0, self.mirror.index)) / 2 + ((mean - image) / 2) ** 2
+            mean = (mean + image) / 2
         new = len(x) * distributed.size()
         total, delta = self.count + new, mean - self.mean
         self.var.copy_((self.var * self.count + var * new + delta**2 * self.count * new / total) / total)
@@ -89,9 +97,68 @@ class First(nn.Module):
         return x[..., : self.columns]
 
 
-def seeing(columns: int | None, network: nn.Sequential) -> nn.Sequential:
-    """A network that sees the first columns of its input alone; None: all."""
-    return network if columns is None else type(network)(First(columns), *network)
+class Both(nn.Module):
+    """Rows (..., B, n), and then their mirror images: (..., 2 B, n)."""
+
+    def __init__(self, size: int, reflection: Reflection | None = None) -> None:
+        super().__init__()
+        self.size = size  # n
+        self.index: Tensor = nn.Buffer(torch.arange(size) if reflection is None else reflection.index)
+        self.sign: Tensor = nn.Buffer(torch.ones(size) if reflection is None else reflection.sign)
+
+    def image(self, x: Tensor) -> Tensor:
+        return x.index_select(-1, self.index) * self.sign
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat((x, self.image(x)), dim=-2)
+
+
+class Fold(Both):
+    """What a network makes of both (..., 2 B, n) as one (..., B, n): the mean of the first half and the second's image.
+
+    So f becomes (f(s) + M f(M s)) / 2: for the mirror image of s it is exactly the image of what it is for s.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        own, other = x.unflatten(-2, (2, -1)).unbind(-3)
+        return (own + self.image(other)) / 2
+
+
+class Even(Both):
+    """Numbers (..., n) without direction, such as standard deviations: the mean of those of both sides."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x + x.index_select(-1, self.index)) / 2
+
+
+def seeing(columns: int | None, network: nn.Sequential, mirror: Mirror | None = None) -> nn.Sequential:
+    """A network that sees the first columns of its input alone, or all (None); with a mirror, their image as well.
+
+    Raises:
+        UsageError: the image has other columns than those.
+    """
+    layers = list(network)
+    if mirror is not None:
+        index, sign = (part[:columns] for part in (mirror.obs.index, mirror.obs.sign))
+        if (index >= len(index)).any():
+            fail(
+                f"--symmetric: the first {columns} numbers of an observation, which the actor sees, need others' images"
+            )
+        layers.insert(0, Both(len(index), Reflection(index, sign)))
+    if columns is not None:
+        layers.insert(0, First(columns))
+    return type(network)(*layers)
+
+
+def folded(network: nn.Sequential, reflection: Reflection | None) -> nn.Sequential:
+    """A network on what `seeing` makes of a state and its image, with the mean of what both say; None: as it is."""
+    return network if reflection is None else network.append(Fold(len(reflection.index), reflection))
+
+
+def make_even(module: nn.Module, name: str, mirror: Mirror | None) -> None:
+    """Let a parameter (..., nu) that has no direction be equal on both sides, if there is a mirror."""
+    if mirror is not None:
+        parametrize.register_parametrization(module, name, Even(len(mirror.action.index), mirror.action))
 
 
 def moments(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -111,13 +111,13 @@ class Run:
 
     # Setting up ------------------------------------------------------------------------------------------------------
 
-    def make_env(self, num_envs: int, horizon: int) -> DiffEnv:
-        """This rank's share of the training environments, with its own random start states."""
+    def make_env(self, num_envs: int, horizon: int, **options: Any) -> DiffEnv:
+        """This rank's share of the training environments, with its own random start states, and options of DiffEnv."""
         self._samples = num_envs * horizon
         args, size = self.args, num_envs // distributed.size()
         seed = args.seed + distributed.rank() * RANK_SEED
         ranges = parse_ranges(args.randomise) if isinstance(args, ParallelFlags) else {}
-        self._env = make_env(args, size, horizon, seed, factors=bool(ranges))
+        self._env = make_env(args, size, horizon, seed, factors=bool(ranges), **options)
         if isinstance(args, ParallelFlags) and ranges:
             self._variation = Variation(self._env, ranges, args.redraw, seed)
         return self._env

@@ -161,7 +161,7 @@ def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> Non
 def test_a_layer_that_cannot_be_saved_is_named(tmp_path: Path) -> None:
     learner = Tiny()
     learner.policy.append(nn.Dropout())
-    with pytest.raises(TypeError, match="layer Dropout; .* has ELU, First, LayerNorm, Likeliest, Linear"):
+    with pytest.raises(TypeError, match="layer Dropout; .* has Both, ELU, First, Fold, LayerNorm, Likeliest"):
         save(tmp_path / "checkpoint.pt", "shac", learner, STATE)
     assert not list(tmp_path.iterdir())
 
@@ -228,11 +228,12 @@ def test_the_shipped_ant_as_onnx(tmp_path: Path) -> None:
     }
 
 
-def test_onnx_takes_only_what_the_actor_sees(tmp_path: Path) -> None:
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_onnx_takes_only_what_the_actor_sees(symmetric: bool, tmp_path: Path) -> None:
     torch.manual_seed(0)
     seen, whole = Go1.actor_dim, Go1.obs_dim
     args = parse(shac.Args, "--env go1 --device cpu --actor-hidden 16".split())
-    actor = shac.Actor(args, whole, 12, seen=seen)
+    actor = shac.Actor(args, whole, 12, seen, Go1().mirror if symmetric else None)
     actor.normalizer.update(3.0 + 2.0 * torch.randn(100, whole) * torch.rand(whole))
     kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
     policy = actor.deterministic()[:-1]  # without tanh: actions leave [-1, 1]
