@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import reference
@@ -469,3 +470,17 @@ def run(
 def acceleration(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, **simulator: object) -> Array:
     """qacc: the change of velocity over one substep of one second."""
     return run(scene, qpos, qvel, ctrl, control_dt=1.0, integration=Integration(substeps=1), **simulator)[1] - qvel
+
+
+def with_motors(path: str | Path) -> mujoco.MjSpec:
+    """A file of servos at joints, with motors of the same bounds in place of them, in reverse order; compiled."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    servos = [(servo.name, servo.target, servo.forcerange.copy()) for servo in reversed(spec.actuators)]
+    for servo in list(spec.actuators):
+        spec.delete(servo)
+    for name, joint, forces in servos:
+        motor = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+        motor.forcerange = forces
+    spec.compile()
+    return spec

@@ -14,12 +14,17 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import common
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import torch
+import worlds
+from scenes import with_motors
 
 import diffsim
+from diffsim.__main__ import POLICIES, main
 from diffsim.training import load_policy
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -86,6 +91,33 @@ def test_pictures(tmp_path: Path) -> None:
     assert (tmp_path / "swing_up.gif").stat().st_size > 10_000
     with pytest.raises(ValueError, match="a video ends in"):
         load("trajectory_optimisation").optimise(video=tmp_path / "swing_up.avi")
+
+
+@pytest.mark.parametrize("name, file", [("go2", "go2.xml"), ("go2", "motors.xml"), ("g1", "g1.xml")])
+def test_onnx_acts_and_walks_as_the_policy_is_judged(name: str, file: str, tmp_path: Path) -> None:
+    """Beside benchmarks/joystick.py's world for 2 s; with motors in another order, too."""
+    ort = pytest.importorskip("onnxruntime")
+    policy, output, command = POLICIES / f"{name}.pt", tmp_path / "policy.onnx", (0.5, 0.2, -0.3)
+    main(["export", str(policy), str(output)])
+    case = common.load_case(policy, 1, "cpu")
+    path, task, n = Path(case.env.scene.path), worlds.in_double(case.env), case.env.scene.nu
+    if file == "motors.xml":
+        spec, path = with_motors(path), tmp_path / file
+        path.write_text(spec.to_xml())
+    rest = torch.tensor(task.start)[None].double()
+    memory = task.begin(rest.new_full((1, task.num_random), 0.5))
+    memory[:, :4] = torch.tensor([*command, 0.0])  # and the clock
+    start = worlds.State(rest[:, : n + 7], rest.new_zeros(1, n + 6), rest.new_zeros(1, n), memory)
+    world = worlds.OtherFile(case.env, 1, path, 1.0)
+    steps = [*worlds.rollout(world, task, case.saved.network, start, 100)]
+    assert not steps[-1].fallen.any() and steps[-1].state.qpos[0, 0] > 0.5
+    low, high = case.env.scene.mj_model.actuator_ctrlrange.T
+    walk = load("run_onnx").walk(ort.InferenceSession(output), mujoco.MjModel.from_xml_path(str(path)), command, 2.0)
+    for step, data in zip(steps, walk, strict=True):
+        np.testing.assert_allclose(data.qpos, step.state.qpos[0], atol=1e-4)
+        np.testing.assert_allclose(data.qvel, step.state.qvel[0], atol=1e-2)
+        if file != "motors.xml":
+            np.testing.assert_allclose(data.ctrl, low + (high - low) * (step.state.action[0] + 1) / 2, atol=1e-4)
 
 
 NOTEBOOK = json.loads((EXAMPLES / "first_steps.ipynb").read_text())

@@ -8,18 +8,20 @@ import os
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import mujoco
 import torch
 from torch import nn
 
 from diffsim.env import DiffEnv
-from diffsim.robot.elements import control_range
+from diffsim.robot.elements import control_range, servos
 from diffsim.tasks import FILE, TASKS
 from diffsim.tasks.imitation.clip import Clip
+from diffsim.tasks.joystick import Joystick
 from diffsim.training.errors import fail
 from diffsim.training.layers import Both, First, Fold, Likeliest, ObsNormalizer
 
@@ -164,14 +166,14 @@ def export_policy(path: str | os.PathLike[str], output: Path) -> None:
 def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
     """Write the policy as ONNX, "observation" (batch, n) -> "action" (batch, nu), clipped to [-1, 1] as env does.
 
-    n is how many columns the policy sees (Task.actor_dim). The metadata say what all the numbers are.
+    n is how many columns the policy sees (Task.actor_dim). `describe` says what all the numbers are.
     """
     try:
         import onnx
         import onnxscript  # noqa: F401  # torch.onnx needs it
     except ImportError:
         fail('ONNX needs packages that are not installed: pip install -e ".[onnx]"')
-    task, m, layers, n = env.task, env.scene.mj_model, list(saved.network), env.task.obs_dim
+    layers, n = list(saved.network), env.task.obs_dim
     match layers:
         case [ObsNormalizer() as whole, First(columns=n), *others]:
             layers = [normalizer := ObsNormalizer(n), *others]
@@ -186,14 +188,39 @@ def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
     model = program.model_proto
     for node in model.graph.node:
         del node.metadata_props[:]  # paths of this machine
-    parts = task.obs_parts or (("observation", n),)
-    seen = Counter([name for name, size in parts for _ in range(size)][:n])
-    ranges = zip(range(m.nu), *control_range(m), strict=True)
-    told = dict(task=task.name, script=saved.script, iteration=str(saved.iteration), control_dt=str(env.control_dt))
-    told["obs"] = ", ".join(f"{name}[{size}]" for name, size in seen.items())
-    told["actuators"] = ", ".join(f"{m.actuator(a).name or a}[{low:.9g}:{high:.9g}]" for a, low, high in ranges)
-    onnx.helper.set_model_props(model, told)
+    onnx.helper.set_model_props(model, describe(saved, env, n))
     output.write_bytes(model.SerializeToString())
+
+
+def describe(saved: SavedPolicy, env: DiffEnv, columns: int) -> dict[str, str]:
+    """What a program needs to know that runs the policy, as an ONNX file's metadata; columns are those that it sees.
+
+    Keys and formats are mjlab's where it has one: lists are separated by commas, and joints are in the action's order.
+    What does not hold for a task is left out.
+    """
+    task, m = env.task, env.scene.mj_model
+    low, high = control_range(m)
+    controls = zip(range(m.nu), low, high, strict=True)
+    told = dict(task=task.name, script=saved.script, iteration=str(saved.iteration), control_dt=str(env.control_dt))
+    told["actuators"] = joined(f"{m.actuator(a).name or a}[{least:.9g}:{most:.9g}]" for a, least, most in controls)
+    if task.obs_parts:
+        seen = Counter([name for name, size in task.obs_parts for _ in range(size)][:columns])
+        told |= dict(observation_names=joined(seen), observation_sizes=joined(seen.values()))
+    if (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT).all():
+        told["joint_names"] = joined(m.joint(j).name for j in m.actuator_trnid[:, 0])
+        if servos(m).all() and (m.actuator_gear[:, 0] == 1).all():  # target = default_joint_pos + action_scale * action
+            told |= dict(joint_stiffness=joined(m.actuator_gainprm[:, 0]))
+            told |= dict(joint_damping=joined(0.0 - m.actuator_biasprm[:, 2]))
+            told |= dict(default_joint_pos=joined((low + high) / 2), action_scale=joined((high - low) / 2))
+    if isinstance(task, Joystick):
+        told |= dict(command_names="twist", command_range=joined(task.robot.command))
+        told |= dict(gait_frequency=f"{task.robot.cycle:g}", root_height=f"{task.robot.height:g}")
+    return told
+
+
+def joined(values: Iterable[object]) -> str:
+    """Values as they are, numbers with 9 digits, separated by commas."""
+    return ",".join(f"{value:.9g}" if isinstance(value, float) else str(value) for value in values)
 
 
 def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:

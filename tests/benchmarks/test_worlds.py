@@ -10,6 +10,7 @@ import pytest
 import torch
 import transfer
 import worlds
+from scenes import with_motors
 from torch import Tensor
 
 import diffsim
@@ -87,16 +88,8 @@ def test_the_same_law_differs_from_the_file_in_cones_and_steps_alone() -> None:
 def test_another_file_of_the_robot_is_driven_as_the_task_s(tmp_path: Path) -> None:
     """Actuators in another order, and motors in place of servos: the robot moves as on its own file."""
     env = diffsim.make("go2", 2, seed=1)
-    spec = mujoco.MjSpec.from_file(str(env.scene.path))
-    servos = [(servo.name, servo.target, servo.forcerange.copy()) for servo in reversed(spec.actuators)]
-    for servo in list(spec.actuators):
-        spec.delete(servo)
-    for name, joint, forces in servos:
-        motor = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        motor.set_to_motor()
-        motor.forcerange = forces
-    spec.compile()
-    (path := tmp_path / "motors.xml").write_text(spec.to_xml())
+    spec, path = with_motors(env.scene.path), tmp_path / "motors.xml"
+    path.write_text(spec.to_xml())
     start, drawn, ends = worlds.starts(env, torch.float64), torch.Generator().manual_seed(0), list[Tensor]()
     actions = 2 * torch.rand(10, 2, env.scene.nu, generator=drawn).double() - 1
     for world in (

@@ -223,8 +223,8 @@ def test_the_shipped_ant_as_onnx(tmp_path: Path) -> None:
         "script": "sapo",
         "iteration": str(saved.iteration),
         "control_dt": str(1 / 60),
-        "obs": "observation[37]",
-        "actuators": ", ".join(f"{part}_{leg}[-1:1]" for leg in range(1, 5) for part in ("hip", "ankle")),
+        "actuators": ",".join(f"{part}_{leg}[-1:1]" for leg in range(1, 5) for part in ("hip", "ankle")),
+        "joint_names": ",".join(f"{part}_{leg}" for leg in range(1, 5) for part in ("hip", "ankle")),
     }
 
 
@@ -243,12 +243,21 @@ def test_onnx_takes_only_what_the_actor_sees(symmetric: bool, tmp_path: Path) ->
     assert policy(obs).abs().max() > 1.5
     assert_acts_alike(model, policy, obs, seen)
     assert [told[name] for name in ("task", "script", "iteration", "control_dt")] == ["go1", "my_shac", "7", "0.02"]
-    assert told["obs"] == (
-        "base_lin_vel[3], base_ang_vel[3], projected_gravity[3], joint_pos[12], joint_vel_x0.1[12], actions[12], "
-        "command[3], clock_sin[1], clock_cos[1]"
+    assert told["observation_names"] == (
+        "base_lin_vel,base_ang_vel,projected_gravity,joint_pos,joint_vel_x0.1,actions,command,clock_sin,clock_cos"
+    )
+    assert told["observation_sizes"] == "3,3,3,12,12,12,3,1,1"
+    assert [told[name] for name in ("command_names", "command_range", "gait_frequency", "root_height")] == (
+        ["twist", "1,0.6,1", "2", "0.27"]
     )
     scene = diffsim.load_scene(ASSETS / "go1.xml").mj_model
-    for text, a in zip(told["actuators"].split(", "), range(12), strict=True):
+    low, high = scene.actuator_ctrlrange.T
+    lists = "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"
+    wanted = scene.actuator_gainprm[:, 0], -scene.actuator_biasprm[:, 2], scene.key_qpos[0, 7:], (high - low) / 2
+    for name, numbers in zip(lists, wanted, strict=True):
+        assert list(map(float, told[name].split(","))) == pytest.approx(numbers)
+    assert told["joint_names"].split(",") == [scene.joint(1 + j).name for j in range(12)]
+    for text, a in zip(told["actuators"].split(","), range(12), strict=True):
         name, _, limits = text.rstrip("]").partition("[")
         assert name == scene.actuator(a).name
         assert list(map(float, limits.split(":"))) == pytest.approx(scene.actuator(a).ctrlrange)
@@ -263,7 +272,7 @@ def test_every_layer_as_onnx(shared: bool, tmp_path: Path) -> None:
     save(path := tmp_path / "checkpoint.pt", "pfpn", learner, STATE)
     model, told = export(path, tmp_path / "policy.onnx")
     assert_acts_alike(model, learner.policy, 3 * torch.randn(50, 5), 5)
-    assert told["actuators"] == "slider[-1:1]"
+    assert told["actuators"] == "slider[-1:1]" and "joint_stiffness" not in told  # a motor
 
 
 def test_what_cannot_be_onnx_is_one_line(
