@@ -117,7 +117,9 @@ def test_onnx_acts_and_walks_as_the_policy_is_judged(name: str, file: str, tmp_p
         np.testing.assert_allclose(data.qpos, step.state.qpos[0], atol=1e-4)
         np.testing.assert_allclose(data.qvel, step.state.qvel[0], atol=1e-2)
         if file != "motors.xml":
-            np.testing.assert_allclose(data.ctrl, low + (high - low) * (step.state.action[0] + 1) / 2, atol=1e-4)
+            np.testing.assert_allclose(
+                data.ctrl, low + (high - low) * (step.state.action[0].numpy() + 1) / 2, atol=1e-4
+            )
 
 
 NOTEBOOK = json.loads((EXAMPLES / "first_steps.ipynb").read_text())
