@@ -254,6 +254,7 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
         return
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from matplotlib.ticker import LogLocator
 
     figure = Figure(figsize=(len(grid[0]) * size[0], len(grid) * size[1]), layout="constrained")
     axes = figure.subplots(len(grid), len(grid[0]), squeeze=False)
@@ -267,6 +268,10 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
                 axis.annotate(note, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6)
         axis.set(xlabel=panel.x, ylabel=panel.y)
         axis.set(xscale="log" if "x" in panel.log else "linear", yscale="log" if "y" in panel.log else "linear")
+        if "x" in panel.log:
+            axis.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter("{x:g}")
         axis.set_title(panel.title, fontsize=10)
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)

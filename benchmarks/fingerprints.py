@@ -2,7 +2,8 @@
 
 `python benchmarks/paper.py --same REVISION` compares a revision with this one on this machine; with --update-results
 it adds a link to results/fingerprints.csv. A result counts while each link from its revision to the newest one keeps
-the fingerprints that its training depends on: its learner's, and those of its task. A link keeps a fingerprint that is
+the fingerprints that its training depends on, its learner's and those of its task, and while a preset that it was
+trained with (--accuracy) is the same. A link keeps a fingerprint that is
 equal in both revisions, or that was meant to change (--reason) if all sentinels that depend on it, cells that were
 trained again, are within the published range.
 """
@@ -49,8 +50,8 @@ CASES: dict[str, tuple[str, ...]] = {
     "humanoid_imitation": ("shac --env humanoid_imitation --num-envs 16",),
     "mujoco": ("shac --env ant --contact mujoco --num-envs 16",),
     "joystick": ("shac --env go2 --num-envs 16",),
-    "fast": ("shac --env half_cheetah --accuracy fast --num-envs 16",),
-    "accurate": ("shac --env half_cheetah --accuracy accurate --num-envs 16",),
+    "fast": ("shac --env half_cheetah --integrator implicit --substeps 8 --num-envs 16",),
+    "accurate": ("shac --env half_cheetah --integrator extrapolated --substeps 16 --num-envs 16",),
 }
 SMALL = "--device {} --threads 1 --iterations 4 --stop-after 3 --eval-every 0 --quiet"
 TRAIN_AND_HASH = """
@@ -150,8 +151,22 @@ def keeps(link: Mapping[str, str], name: str) -> bool:
     return name in link["equal"].split() or bool(link["reason"]) and verdicts == {KEEPS}
 
 
+@functools.cache
+def preset(revision: str, command: str) -> str:
+    """The line of a task's file that sets a training's --accuracy, at a revision; empty without that flag."""
+    words = command.split()
+    if "--accuracy" not in words:
+        return ""
+    task, accuracy = (words[words.index(flag) + 1] for flag in ("--env", "--accuracy"))
+    call = ["git", "show", f"{revision}:diffsim/tasks/{task}.py"]
+    lines = subprocess.run(call, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()
+    return next((line for line in lines if line.strip().startswith(f"{accuracy} = ")), "")
+
+
 def counts(revision: str, command: str) -> bool:
     """Whether a result of a training there, a script with its flags, is one of the newest recorded revision."""
+    if preset(revision, command) != preset("HEAD", command):
+        return False
     script, names, at = command.split()[0], depends(command), ""
     for link in reversed(links()):
         if at and not same_files(link["revision"], at):

@@ -333,7 +333,8 @@ def main(args: Args) -> None:
         args.publish(name, shown, GROUPS[name].page if "|" in shown else "", everywhere=True)
         if GROUPS[name].picture:
             pictured(args, name)
-    rows = sorted(args.read("pace"), key=lambda row: TASKS.index(row["task"]))
+    rows = [row for row in args.read("pace") if cells.same_numbers(row["revision"], row["learner"], row["task"])]
+    rows.sort(key=lambda row: TASKS.index(row["task"]))
     if rows:
         args.publish("pace", markdown(rows, ("task", "learner", "iteration (s)")), "performance.md", everywhere=True)
 

@@ -72,7 +72,7 @@ def make(
         num_envs, device, dtype: how many environments, where, and in which precision.
         seed, horizon: see DiffEnv.
         accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
-            docs/accuracy.md has what each costs and how much it errs.
+            docs/numerics.md has what each costs and how much it errs.
         substeps, integrator, theta, passes, tolerance, touchdown: each in place of the preset's, if given.
         contact: "soft" (the paper's springs) or "mujoco" (MuJoCo's own constraints, see Integration): the laws of
             contact and limits and how they are integrated; docs/transfer.md has what policies keep of their speed.

@@ -14,8 +14,8 @@ class Ant(Locomotion):
     name = "ant"
     asset, contact = "ant.xml", "soft"
     substeps = 16
-    fast = Integration("implicit", 8)
-    accurate = Integration("extrapolated", 16)
+    fast = Integration("semi_implicit", 8)
+    accurate = Integration("extrapolated", 32)
     obs_dim = 37
     num_random = 29
     min_height = 0.27

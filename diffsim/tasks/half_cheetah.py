@@ -15,7 +15,7 @@ class HalfCheetah(Planar):
     asset, contact = "half_cheetah.xml", "soft"
     substeps = 16
     fast = Integration("implicit", 8)
-    accurate = Integration("extrapolated", 16)
+    accurate = Integration("extrapolated", 32)
     obs_dim = 17
     num_random = 18
     start = (0.0, -0.2) + (0.0,) * 16

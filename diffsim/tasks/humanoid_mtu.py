@@ -18,7 +18,7 @@ class HumanoidMTU(Locomotion):
     name = "humanoid_mtu"
     asset, contact = "humanoid_mtu.xml", "soft"
     substeps = 48
-    fast = Integration("implicit", 24)
+    fast = Integration("semi_implicit", 24)
     accurate = Integration("extrapolated", 96)
     obs_dim = 53
     num_random = 53

@@ -81,7 +81,7 @@ class Flags(RunFlags):
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
     """task, one of diffsim.TASKS, or the file of your own: my_task.py or my_task.py:Class (docs/own_robot.md)"""
     accuracy: Literal["fast", "default", "accurate"] = "default"
-    """preset of integrator, substeps and theta (docs/accuracy.md); default is the paper's"""
+    """preset of integrator, substeps and theta (docs/numerics.md); default is the paper's"""
     integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
     """time integration (per task, --accuracy and --contact); mujoco has MuJoCo's own contact and limits"""
     substeps: Count = 16

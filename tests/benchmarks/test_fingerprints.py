@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -72,6 +73,23 @@ def test_a_result_counts_while_each_link_keeps_what_it_depends_on(
     assert not counts("a", "shac --env ant") and counts("a", "shac --env hopper")
     made[1] = link("z", "c")  # nobody has compared b with z
     assert [counts(revision, "shac --env ant") for revision in "abzcd"] == [False, False, True, True, True]
+
+
+def test_a_result_counts_while_its_preset_is_the_same(
+    chain: Callable[..., list[dict[str, str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chain()
+    text = "class Ant:\n    fast = 8\n    accurate = {}\n"
+    files = {f"{at}:diffsim/tasks/ant.py": text.format(n) for at, n in (("a", 16), ("b", 32), ("HEAD", 32))}
+
+    def show(call: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(call, 0, files.get(call[-1], ""))
+
+    monkeypatch.setattr(subprocess, "run", show)
+    fingerprints.preset.cache_clear()
+    for flags, kept in (("--accuracy accurate", False), ("--accuracy fast", True), ("", True)):
+        assert counts("a", f"shac {flags} --env ant") == kept and counts("b", f"shac {flags} --env ant")
+    fingerprints.preset.cache_clear()
 
 
 def test_head_is_the_newest_revision_or_the_command_is_told(
