@@ -18,8 +18,8 @@ from diffsim.training.monitor import apart
 from diffsim.tune.motion import HORIZONS, SPANS, Motion, Setting, without
 
 FINER = 8  # the reference's substeps, in multiples of the most measured
-TIMED, ROUNDS = 64, 8  # environments and turns of a timing; the fastest turn counts, the others were disturbed
-FACTORS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # substeps, in multiples of the default's
+TIMED, ROUNDS = 64, 15  # environments and turns of a timing; the fastest turn counts, the others were disturbed
+FACTORS = (0.125, 0.25, 0.5, 0.75, 1.0, 2.0, 4.0)  # substeps, in multiples of the default's
 ENDS = ((4, 1e-4), (8, 1e-4), (30, 1e-2), (30, 1e-3))  # of Newton's method on MuJoCo's contact: passes, tolerance
 
 
