@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from diffsim import DiffEnv
 from diffsim.tasks import find_task
-from diffsim.training import command, evaluate, fail, gait, load_policy, make_policy_env
-from diffsim.training.evaluation import SEED, VIDEO_SECONDS
+from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.training.evaluation import SEED, VIDEO_SECONDS, gait_lines
 from diffsim.view import render, web
 from diffsim.view.screen import Screen
 
@@ -110,7 +110,7 @@ def show(args: Args) -> None:
     evaluation = evaluate(env, saved.network, args.seed)
     print(f"{task}, {name}, {args.episodes} episodes: {evaluation}")
     if feet := evaluation.gait():
-        print(gait.table(feet))
+        print(gait_lines(feet))
     qpos, action = evaluation.median_episode(args.seconds)
     if args.video:
         print(f"video: {render.film(args.video, env.scene, qpos, env.control_dt, action, args.size)}")

@@ -1,19 +1,21 @@
 """How well policies of the joystick tasks follow commands in MuJoCo, on any file of their robot.
 
     python benchmarks/joystick.py runs/go2__shac__1 --file path/to/unitree_go2/scene.xml
-    python benchmarks/joystick.py runs/joystick/* --push 0.5
+    python benchmarks/joystick.py runs/joystick/* --push 1 --latency 20 --mass 0.85 1.15 --gains 0.8 1.2
 
 Each command is held for 20 s from the keyframe. The error of an episode is the mean distance of the velocity, averaged
 over a second, from the command, after the first second. The joints are those of the same names; servos get the policy's
-targets, and a motor the torque that the task's servo would have. Nothing else of the file is changed.
+targets, and a motor the torque that the task's servo would have. Nothing else of the file is changed. The gait is that
+at 0.5 m/s forward; the change of actions that of all commands.
 
-Writes joystick.csv, a row for each policy and world, and with --update-results the table of docs/joystick.md.
+Writes joystick.csv, a row for each policy and world, and with --update-results the tables of docs/joystick.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -26,13 +28,14 @@ from tables import Row, grouped, middle, numbers
 from worlds import Array, OtherFile, State, in_double, rollout
 
 from diffsim.tasks.joystick import Joystick
-from diffsim.training import NonNegative, Positive, fail
+from diffsim.training import NonNegative, Positive, fail, gait
 from diffsim.training.checkpoint import HOME
 from diffsim.training.ranges import Range
 
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
 COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) for v in SIDEWAYS)]
 COMMANDS += [(0.0, 0.0, w) for w in TURNING] + [(v, 0.0, w) for v in (0.5, -0.5) for w in TURNING]
+WALK = COMMANDS.index((0.5, 0.0, 0.0))
 PUSHED_EVERY = 4.0  # s
 Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # the first second does not count
 
@@ -41,13 +44,19 @@ Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # th
 class Args(common.CheckpointFlags):
     file: Path | None = None  # MJCF of the robot with a ground, in place of the task's
     friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
+    mass: tuple[Positive, ...] = (1.0,)  # of all bodies' mass and inertia
+    gains: tuple[Positive, ...] = (1.0,)  # of the servos' stiffness and damping
+    latency: Annotated[float, Range("from 0 to 40", lambda ms: 0 <= ms <= 40)] = 0.0  # ms by which actions come late
     push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
     seconds: Long = 20.0  # of an episode
 
 
-def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array]:
-    """The root's velocities (T, n, 3), vx and vy in its frame and its yaw rate, and falls (n,), of each command."""
+def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array, Array, Array]:
+    """The root's velocities (T, n, 3), vx and vy in its frame and its yaw rate, of each command; states before a step
+    (T, n, nq), actions (T, n, nu), falls (n,)."""
     task, scene, n = in_double(case.env), case.env.scene, len(COMMANDS)
+    late = args.latency / 1e3 / task.control_dt
+    task.disturbances = {"latency": (late, late), "push": (0.0, 0.0)}
     every, drawn = round(PUSHED_EVERY / task.control_dt), np.random.default_rng(1)
 
     def push(step: int, state: State) -> State:
@@ -63,7 +72,8 @@ def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array]:
     start = State(rest[:, : scene.nq], rest.new_zeros(n, scene.nv), rest.new_zeros(n, scene.nu), memory)
     steps = list(rollout(world, task, case.saved.network, start, round(args.seconds / task.control_dt), push))
     seen = torch.stack([step.obs[:, task.actor_dim :] for step in steps])  # the critic's part, without noise
-    return seen[..., [0, 1, 5]].numpy(), steps[-1].fallen.numpy()
+    qpos, action = (torch.stack([getattr(step.state, name) for step in steps]).numpy() for name in ("qpos", "action"))
+    return seen[..., [0, 1, 5]].numpy(), qpos[:-1], action[1:], steps[-1].fallen.numpy()
 
 
 def errors(velocities: Array, second: int) -> Array:
@@ -82,51 +92,85 @@ def training(case: Case) -> dict[str, object]:
 
 
 def measure(args: Args, path: Path) -> Iterator[Row]:
-    """A row for each friction."""
+    """A row for each friction, mass and gains."""
     case = load_case(path, 1, "cpu")
     about, task = case.about, case.env.task
     if case.saved.simulator != HOME:
         about["learner"] = f"{about['learner']} in {case.saved.simulator}"
     if not isinstance(task, Joystick):
         fail(f"{path} was trained on {task.name}, which follows no command")
-    for friction in args.friction:
-        velocities, fallen = follow(case, OtherFile(case.env, len(COMMANDS), args.file, friction), args)
+    for friction, mass, gains in product(args.friction, args.mass, args.gains):
+        world = OtherFile(case.env, len(COMMANDS), args.file, friction, mass, gains)
+        velocities, qpos, action, fallen = follow(case, world, args)
         error, yaw = errors(velocities, round(1 / task.control_dt))
         print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, error, strict=True)))
         row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
+        row |= {"mass": mass, "gains": gains, "latency": args.latency, **walk(case, qpos, action)}
         row |= {"error": error.mean(), "worst error": error.max(), "yaw error": yaw.mean()}
         yield about | training(case) | row | {"whole": 1 - fallen.mean(), "seconds": args.seconds}
+
+
+def walk(case: Case, qpos: Array, action: Array) -> dict[str, object]:
+    """Gait at 0.5 m/s of qpos (T, n, nq) under action (T, n, nu): means over the feet, the lowest clearance; and how
+    the actions of all commands change."""
+    parts = gait.measure(case.env.scene, case.env.control_dt, [(qpos[:, WALK], action[:, WALK])])
+    robot, feet = parts.pop("robot", {}), [*parts.values()]
+    found: dict[str, object] = {name: robot.get(name, "") for name in ("left-right", "diagonal", "cost of transport")}
+    found["clearance (m)"] = min((foot["clearance (m)"] for foot in feet), default="")
+    for name in ("slip (m/s)", "duty"):
+        found[name] = float(np.mean([foot[name] for foot in feet])) if feet else ""
+    found["action change"] = float(np.sqrt(np.mean(np.diff(action, axis=0) ** 2)))
+    return found | {"saturated": float(np.mean(np.abs(action) > gait.END))}
+
+
+def of_policies(rows: list[dict[str, str]]) -> Iterator[tuple[Row, list[dict[str, str]], list[dict[str, str]]]]:
+    """For each task, learner, machine and file: these, its rows, and those without disturbance at its friction."""
+    rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
+    rows.sort(key=lambda row: (row["task"], row["checkpoint"]))
+    for key, group in grouped(rows, "task", "learner", "machine", "file").items():
+        about = dict(zip(("task", "learner", "machine", "judged on"), key, strict=True))
+        yield about, group, [row for row in group if not disturbed(row) and float(row["friction"]) == 1]
+
+
+def disturbed(row: dict[str, str]) -> tuple[str, ...]:
+    """By what, besides friction."""
+    nominal = {"push": 0.0, "latency": 0.0, "mass": 1.0, "gains": 1.0}
+    return tuple(name for name, value in nominal.items() if float(row[name]) != value)
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each task, learner and machine, over seeds: medians, and the worst command of the worst seed.
 
-    Errors are those without pushes on the file's friction, and empty if only others were measured.
+    Errors are those without disturbance at the file's friction, and empty if only others were measured. Of whole
+    episodes it has the least: undisturbed, only pushed, and otherwise disturbed.
     """
-    rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
-    rows.sort(key=lambda row: (row["task"], row["checkpoint"]))
     lines = list[Row]()
-    for (task, learner, machine, file), group in grouped(rows, "task", "learner", "machine", "file").items():
-        calm = [row for row in group if float(row["push"]) == 0]
-        pushed = [row for row in group if float(row["push"]) > 0]
-        plain = [row for row in calm if float(row["friction"]) == 1]
-
-        def least(found: list[dict[str, str]]) -> str:
-            return f"{min(numbers(found, 'whole')):.0%}" if found else ""
-
-        lines.append(
-            {"task": task, "learner": learner, "machine": machine, "seeds": len({row["checkpoint"] for row in group})}
-            | {"return": middle(plain, "return", ",.0f"), "training (s)": middle(plain, "training s", ".0f")}
-            | {"judged on": file, "error (m/s)": middle(plain, "error", ".3f")}
-            | {"worst command": f"{max(numbers(plain, 'worst error')):.2f}" if plain else ""}
-            | {"yaw (rad/s)": middle(plain, "yaw error", ".2f"), "whole": least(calm), "whole, pushed": least(pushed)}
-        )
+    for about, group, plain in of_policies(rows):
+        kinds: dict[str, list[dict[str, str]]] = {"whole": [], "pushed": [], "disturbed": []}
+        for row in group:
+            kinds[{(): "whole", ("push",): "pushed"}.get(disturbed(row), "disturbed")].append(row)
+        line = {"seeds": len({row["checkpoint"] for row in group}), "training (s)": middle(plain, "training s", ".0f")}
+        line |= {"error (m/s)": middle(plain, "error", ".3f"), "yaw (rad/s)": middle(plain, "yaw error", ".2f")}
+        line |= {"worst command": f"{max(numbers(plain, 'worst error')):.2f}" if plain else ""}
+        least = {name: f"{min(numbers(some, 'whole')):.0%}" if some else "" for name, some in kinds.items()}
+        lines.append({**about, **line, **least})
     return lines
 
 
+def gaits(rows: list[dict[str, str]]) -> list[Row]:
+    """The gaits of the same policies, medians over seeds."""
+    forms = {"left-right": ".2f", "diagonal": ".2f", "clearance (m)": ".3f", "slip (m/s)": ".2f"}
+    forms |= {"action change": ".0%", "saturated": ".0%", "cost of transport": ".2f"}
+    return [
+        {**about, **{name: middle(plain, name, form) for name, form in forms.items()}}
+        for about, _, plain in of_policies(rows)
+    ]
+
+
 def main(args: Args) -> None:
-    key = (*ABOUT[:-1], "file", "friction", "push")
-    measured(args, Part("joystick", measure, key, "joystick", "joystick.md", table))
+    key = (*ABOUT[:-1], "file", "friction", "push", "mass", "gains", "latency")
+    rows = measured(args, Part("joystick", measure, key, "joystick", "joystick.md", table))
+    args.publish("gaits", tables.markdown(gaits(rows)), "joystick.md")
 
 
 if __name__ == "__main__":

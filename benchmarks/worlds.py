@@ -123,11 +123,16 @@ class OtherFile(MuJoCo):
     of its joint acts there, and so do its clamps. A file that lacks a joint or its actuator ends the benchmark.
     """
 
-    def __init__(self, env: DiffEnv, num_envs: int, file: Path | None, friction: float) -> None:
+    def __init__(
+        self, env: DiffEnv, num_envs: int, file: Path | None, friction: float, mass: float = 1.0, gains: float = 1.0
+    ) -> None:
         own = env.scene.mj_model
         model = mujoco.MjModel.from_xml_path(str(file or env.scene.path))
         model.geom_friction[:, 0] *= friction
         model.pair_friction[:, :2] *= friction
+        model.body_mass *= mass
+        model.body_inertia *= mass
+        mujoco.mj_setConst(model, mujoco.MjData(model))
         names = [own.joint(j).name for j in range(1, own.njnt)]
         at_joints = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
         actuator = {model.joint(model.actuator_trnid[a, 0]).name: a for a in at_joints}
@@ -141,7 +146,11 @@ class OtherFile(MuJoCo):
         self._order = [own.actuator_trnid[:, 0].tolist().index(j) for j in range(1, own.njnt)]
         low, high = own.actuator_ctrlrange[self._order].T
         self._middle, self._reach = (low + high) / 2, (high - low) / 2
-        self._stiffness, self._damping = own.actuator_gainprm[self._order, 0], -own.actuator_biasprm[self._order, 2]
+        self._stiffness = gains * own.actuator_gainprm[self._order, 0]
+        self._damping = -gains * own.actuator_biasprm[self._order, 2]
+        servos = self._ctrl[self._servo]
+        model.actuator_gainprm[servos, 0] *= gains
+        model.actuator_biasprm[servos, 1:3] *= gains
         self._least, self._most = model.actuator_ctrlrange[self._ctrl].T
         self._limited = model.actuator_ctrllimited[self._ctrl] != 0
         self._begin(model, num_envs, env.control_dt)
@@ -206,7 +215,7 @@ def rollout(
     for step in range(steps):
         action = policy(obs.float()).clamp(-1.0, 1.0).to(obs.dtype)
         state = push(step, state)
-        qpos, qvel, lost = world.step(state.qpos, state.qvel, action)
+        qpos, qvel, lost = world.step(state.qpos, *task.disturb(state.qvel, action, state.memory))
         state = State(qpos, qvel, action, task.remember(state.memory, action, middle))
         obs = task.observe_with(*state)
         fallen = fallen | (lost := lost.to(fallen.device)) | task.terminated(obs)

@@ -202,7 +202,7 @@ class DiffEnv(VectorEnv):
                 "window, step under torch.no_grad(), or make the environment with a larger horizon"
             )
         self._recorded += recorded
-        self.qpos, self.qvel = self.sim.advance(self.qpos, self.qvel, action)
+        self.qpos, self.qvel = self.sim.advance(self.qpos, *self.task.disturb(self.qvel, action, self.memory))
         if recorded and self.adjoint_clip:
             self.qpos, self.qvel = ClipAdjoint.apply(self.adjoint_clip, self.qpos, self.qvel)
         nonfinite = self.sim.nonfinite.clone()

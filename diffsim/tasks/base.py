@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
+from types import MappingProxyType
 from typing import ClassVar, Literal, TypeAlias
 
 import mujoco
@@ -56,6 +58,8 @@ class Task:
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
+    # Ranges of what `disturb` does, by names that --randomise may give: "latency" [control steps], "push" [m/s]
+    disturbances: Mapping[str, tuple[float, float]] = MappingProxyType({})
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: float = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
@@ -219,6 +223,13 @@ class Task:
             noise: (..., num_noise) uniform in [0, 1).
         """
         return memory
+
+    def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """What a control step starts with in place of qvel (..., nv) and action (..., nu): pushes, delays.
+
+        memory: (..., num_memory) before the step.
+        """
+        return qvel, action
 
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
         """`observe`, with the memory (..., num_memory) after the step."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -17,10 +18,13 @@ from torch import Tensor
 
 from diffsim.sim.integration import Integration
 from diffsim.tasks.base import Contact, Task
+from diffsim.tasks.feet import Feet
 from diffsim.tasks.locomotion import rotate
-from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
+from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, partners, reflections
 
 FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
+FREQUENCY_OF_PUSHES = 0.25  # 1/s
+NEAR, SLIP = 0.01, 0.05  # m over the ground, within which a foot's speed counts as slip; (m/s)^2, the score's scale
 STANDING = 0.1  # share of commands that are zero; each of the three numbers of others is with the same probability
 # Noise of the sensors, uniform to both sides: joints [rad], rates [rad/s], angular and linear velocity, gravity
 JOINT_NOISE, RATE_NOISE, GYRO_NOISE, VELOCITY_NOISE, GRAVITY_NOISE = 0.03, 0.5, 0.2, 0.1, 0.05
@@ -43,6 +47,7 @@ class Robot(NamedTuple):
     height: float  # m, of the root there
     legs: tuple[Leg, ...]  # joints of no leg stay near the keyframe's
     length: float  # m, of a leg, from hip to foot there
+    lift: float  # m, of a foot in the middle of the swing
     cycle: float  # Hz, of the gait; legs of the two sides are half a cycle apart
     sides: Sides  # (right, left) beginnings of the joints' names
     command: tuple[float, float, float] = (1.0, 0.6, 1.0)  # largest vx, vy [m/s] and yaw rate [rad/s]
@@ -53,14 +58,14 @@ def quadruped(order: Sequence[str]) -> Robot:
     legs = tuple(
         Leg(
             (f"{name}_thigh", f"{name}_hip"),
-            {f"{name}_thigh": 0.25, f"{name}_calf": -0.5},
+            {f"{name}_thigh": 0.19, f"{name}_calf": -0.38},
             (0.19 if name[0] == "F" else -0.19, 0.14 if name[1] == "L" else -0.14),
             0.0 if name in ("FL", "RR") else 0.5,
         )
         for name in order
     )
     joints = tuple(f"{name}_{part}" for name in order for part in ("hip", "thigh", "calf"))
-    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
+    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.065, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
 
 
 def humanoid() -> Robot:
@@ -80,7 +85,7 @@ def humanoid() -> Robot:
     )
     home = (*stance, *stance, 0.0, 0.0, 0.073, 0.2, *hang, 0.2, -0.2, *hang[1:])
     joints = tuple(side + name for side, names in parts for name in names)
-    return Robot(joints, home, 0.755, legs, 0.65, 1.4, (("right_", "left_"),))
+    return Robot(joints, home, 0.755, legs, 0.65, 0.08, 1.4, (("right_", "left_"),))
 
 
 def score(square: Tensor, scale: float) -> Tensor:
@@ -91,7 +96,8 @@ def score(square: Tensor, scale: float) -> Tensor:
 class Joystick(Task):
     """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates).
 
-    Memory: command, clock in cycles, the last two actions, then the noise of the sensors.
+    Memory: command, clock in cycles, the last two actions, the noise of the sensors; then how late actions come, and a
+    push that is due.
     """
 
     robot: ClassVar[Robot]
@@ -104,6 +110,8 @@ class Joystick(Task):
     forward_column = None  # what counts is the command
     touchdown: ClassVar[bool] = True
     alive: ClassVar[float] = 4.0  # reward of a perfect step
+    # By how much the actions of an episode come late; how large the pushes are that come at random
+    disturbances = MappingProxyType({"latency": (0.0, 0.0), "push": (0.0, 0.0)})
 
     def __init_subclass__(cls) -> None:
         """Its sizes: those of what `begin`, `remember` and `observe_with` say, in their order; names are mjlab's."""
@@ -114,9 +122,11 @@ class Joystick(Task):
         sensed = *body, ("joint_pos", n), ("joint_vel_x0.1", n)
         seen = *sensed, ("actions", n), ("command", 3), ("clock_sin", 1), ("clock_cos", 1)
         private = *((f"true_{name}", size) for name, size in sensed), ("height", 1), ("action_change", n)
-        cls.obs_parts = *seen, *private, ("joints_from_reference", n)
+        private = *private, ("joints_from_reference", n)
+        legs = len(cls.robot.legs)
+        cls.obs_parts = *seen, *private, ("feet_from_reference", legs), ("feet_slip", legs)
         cls.actor_dim, cls.obs_dim = (sum(size for _, size in parts) for parts in (seen, cls.obs_parts))
-        cls.num_memory, cls.num_noise, cls.num_random = 13 + 4 * n, 17 + 2 * n, 21 + 2 * n
+        cls.num_memory, cls.num_noise, cls.num_random = 16 + 4 * n, 20 + 2 * n, 22 + 2 * n
 
     @classmethod
     def presets(cls, contact: str | None = None) -> dict[str, Integration]:
@@ -150,6 +160,10 @@ class Joystick(Task):
         self._noise = tensor(scales + (JOINT_NOISE,) * n + (0.1 * RATE_NOISE,) * n)
         self._down = tensor((0.0, 0.0, -1.0))
         self._n = n
+        self._phases = tensor([leg.phase for leg in robot.legs])
+        names = [f"{leg.joints[0]}_joint" for leg in robot.legs]
+        self._feet = Feet.of(self.load_robot().mj_model, names, device, dtype)
+        self._rest = robot.height + self._feet.places(self._home)[:, 2]  # m, of the feet, which sink in
 
     @cached_property
     def mirror(self) -> Mirror:
@@ -159,7 +173,9 @@ class Joystick(Task):
         signs = (*VECTOR, *PSEUDOVECTOR, *VECTOR), (1.0, -1.0, -1.0, -1.0, -1.0), (1.0,)
         body, command, height = (Reflection.of(enumerate(part), device, dtype) for part in signs)
         sensed = body, joints, rates
-        obs = Reflection.cat((*sensed, action, command, *sensed, height, action, joints))
+        names = [leg.joints[0] for leg in self.robot.legs]
+        legs = Reflection.of(((k, 1.0) for k in partners(names, self.robot.sides)), device, dtype)
+        obs = Reflection.cat((*sensed, action, command, *sensed, height, action, joints, legs, legs))
         return Mirror(qpos, qvel, action, obs)
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,11 +185,11 @@ class Joystick(Task):
         return qpos, qvel
 
     def begin(self, rand: Tensor) -> Tensor:
-        """A command and a phase; no action yet."""
-        command, phase = self._draw(rand[..., len(self.start) :]), rand[..., -1:]
-        return torch.cat(
-            (command, phase, torch.zeros_like(rand[..., :1]).expand(*rand.shape[:-1], 4 * self._n + 9)), -1
-        )
+        """A command, a phase and a latency; no action yet."""
+        drawn, phase, late = rand[..., len(self.start) :].split((7, 1, 1), dim=-1)
+        (least, most), empty = self.disturbances["latency"], torch.zeros_like(phase)
+        nothing = empty.expand(*phase.shape[:-1], 4 * self._n + 9), least + (most - least) * late, empty, empty
+        return torch.cat((self._draw(drawn), phase, *nothing), dim=-1)
 
     def _draw(self, rand: Tensor) -> Tensor:
         """A command (..., 3) from rand (..., 7)."""
@@ -181,48 +197,85 @@ class Joystick(Task):
         return (2.0 * size - 1.0) * self._most * kept * some
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
-        command, clock, last, _, _ = memory.split((3, 1, self._n, self._n, 9 + 2 * self._n), dim=-1)
-        drawn, when, sensors = noise.split((7, 1, 9 + 2 * self._n), dim=-1)
+        command, clock, last, _, late, _ = self._recall(memory)
+        drawn, when, sensors, due, size, way = noise.split((7, 1, 9 + 2 * self._n, 1, 1, 1), dim=-1)
         command = torch.where(when < self.control_dt * FREQUENCY_OF_COMMANDS, self._draw(drawn), command)
         clock = (clock + self.control_dt * self.robot.cycle).remainder(1.0)
-        return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise), dim=-1)
+        (least, most), way = self.disturbances["push"], 2.0 * math.pi * way
+        size = (least + (most - least) * size) * (due < self.control_dt * FREQUENCY_OF_PUSHES)
+        kick = size * torch.cat((way.cos(), way.sin()), dim=-1)
+        return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise, late, kick), dim=-1)
+
+    def _recall(self, memory: Tensor) -> tuple[Tensor, ...]:
+        """Command, clock, the last action, the one before, latency, push; the noise lies before the last two."""
+        command, clock, last, before, _, late, kick = memory.split((3, 1, self._n, self._n, 9 + 2 * self._n, 1, 2), -1)
+        return command, clock, last, before, late, kick
+
+    def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Pushes, and actions that come late: over a control step the mean of what the servos are given."""
+        if not any(most for _, most in self.disturbances.values()):
+            return qvel, action
+        *_, last, before, late, kick = self._recall(memory)
+        whole = late.clamp(max=1.0)
+        action = torch.lerp(torch.lerp(action, last, whole), before, late - whole)
+        return torch.cat((qvel[..., :2] + kick, qvel[..., 2:]), dim=-1), action
 
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
         """For the actor, with noise: linear and angular velocity, gravity's direction, in the body's frame; joints from
         the keyframe's, 0.1 joint rates; the last action, the command, sine and cosine of the clock. For the critic also
-        these without noise; height, the change of the action, and how far the joints are from the reference."""
+        these without noise; height, the change of the action, how far joints and, in height, feet are from the
+        reference, and how fast those near the ground slip."""
         position, quat, joints = qpos.split((3, 4, self._n), dim=-1)
         velocity, angular, rates = qvel.split((3, 3, self._n), dim=-1)
-        command, clock, last, before, noise = memory.split((3, 1, self._n, self._n, 9 + 2 * self._n), dim=-1)
+        command, clock, last, before, *_ = self._recall(memory)
+        noise = memory[..., 4 + 2 * self._n : -3]
         world = torch.stack((velocity, self._down.expand_as(velocity)), dim=-2)
         inverse = torch.cat((quat[..., :1], -quat[..., 1:]), dim=-1).unsqueeze(-2)
         velocity, gravity = rotate(inverse, world).unbind(dim=-2)
         sensed = torch.cat((velocity, angular, gravity, joints - self._home, 0.1 * rates), dim=-1)
         turn = 2.0 * math.pi * clock
         private = sensed, position[..., 2:], last - before, joints - self.reference(command, clock)
-        return torch.cat((sensed + noise, last, command, turn.sin(), turn.cos(), *private), dim=-1)
+        place, speed = self._feet.motion(joints, rates)
+        speed = speed + velocity.unsqueeze(-2) + torch.linalg.cross(angular.unsqueeze(-2), place)
+        high = position[..., 2:] - (place * gravity.unsqueeze(-2)).sum(-1)
+        along = speed.square().sum(-1) - (speed * gravity.unsqueeze(-2)).sum(-1).square()
+        swing = self._moving(command) * (turn + 2.0 * math.pi * self._phases).sin().clamp(min=0.0).square()
+        slip = (1.0 - swing) * torch.exp(-(high.clamp(min=0.0) / NEAR).square()) * score(along, SLIP)
+        feet = high - self._rest - self.robot.lift * swing, slip
+        return torch.cat((sensed + noise, last, command, turn.sin(), turn.cos(), *private, *feet), dim=-1)
+
+    @staticmethod
+    def _moving(command: Tensor) -> Tensor:
+        """(..., 1) from 0 for a command of zero to 1."""
+        square = command.square().sum(-1, keepdim=True)
+        return square / (square + 0.01)
 
     def reference(self, command: Tensor, clock: Tensor) -> Tensor:
-        """Joints (..., n) of a gait at the command's speed; at rest the keyframe's."""
-        turn = 2.0 * math.pi * (clock + self._phase)
-        moving = command.square().sum(-1, keepdim=True)
-        moving = moving / (moving + 0.01)
-        return (
-            self._home + moving * self._fold * turn.sin().clamp(min=0.0).square() + command @ self._stride * turn.cos()
-        )
+        """Joints (..., n) of a gait at the command's speed; at rest the keyframe's.
+
+        On the ground a foot goes backward evenly; in the air it comes to its place at the ground's speed.
+        """
+        turn = (clock + self._phase).remainder(1.0)
+        air = (2.0 * turn).clamp(max=1.0)
+        stride = ((8.0 * air - 12.0) * air + 2.0) * air + 1.0 + (4.0 * turn - 2.0).clamp(min=0.0)
+        fold = (2.0 * math.pi * turn).sin().clamp(min=0.0).square()
+        return self._home + self._moving(command) * self._fold * fold + command @ self._stride * stride
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Both velocities, then an upright, level, calm root at its height, the reference's joints, smooth actions."""
-        n = self._n
+        """Both velocities, then an upright, level, calm root at its height; the reference's joints and feet, no slip,
+        smooth actions."""
+        n, legs = self._n, len(self.robot.legs)
         command, private = obs[..., 9 + 3 * n : 12 + 3 * n], obs[..., 14 + 3 * n :]
-        velocity, angular, gravity, _, _, height, change, error = private.split((3, 3, 3, n, n, 1, n, n), dim=-1)
+        parts = private.split((3, 3, 3, n, n, 1, n, n, legs, legs), dim=-1)
+        velocity, angular, gravity, _, _, height, change, error, lift, slip = parts
         speed = score((velocity[..., :2] - command[..., :2]).square().sum(-1), 0.03)
         yaw = score((angular[..., 2] - command[..., 2]).square(), 0.03)
         calm = 0.5 * score(velocity[..., 2].square(), 0.5) + 0.2 * score(angular[..., :2].square().sum(-1), 4.0)
         level = 0.4 * score(gravity[..., :2].square().sum(-1), 0.1)
         level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
-        gait = 0.5 * score(error.square().sum(-1), 1.0) + 0.02 * change.square().sum(-1)
-        return self.alive - 0.3 * speed - 0.15 * yaw - calm - level - gait
+        gait = 0.5 * score(error.square().sum(-1), 0.3) + score(change.square().mean(-1), 0.2)
+        feet = 0.4 * score(lift.square(), 0.0004).mean(-1) + 0.15 * slip.mean(-1)
+        return self.alive - 0.5 * speed - 0.25 * yaw - calm - level - gait - feet
 
     def terminated(self, obs: Tensor) -> Tensor:
         """Tilted by more than 60 degrees, or the root below 60 % of its height."""

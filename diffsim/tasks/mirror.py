@@ -83,11 +83,11 @@ def reflections(
         ValueError: a joint or an actuator has no partner of the other side's name, or its axis is another one.
     """
     qpos, qvel, action = (list[tuple[int, float]]() for _ in range(3))  # from where, sign
-    for joint, partner in enumerate(_partners([model.joint(k).name for k in range(model.njnt)], sides)):
+    for joint, partner in enumerate(partners([model.joint(k).name for k in range(model.njnt)], sides)):
         positions, rates = _joint_signs(model, joint, partner)
         qpos += enumerate(positions, int(model.jnt_qposadr[partner]))
         qvel += enumerate(rates, int(model.jnt_dofadr[partner]))
-    for motor, partner in enumerate(_partners([model.actuator(k).name for k in range(model.nu)], sides)):
+    for motor, partner in enumerate(partners([model.actuator(k).name for k in range(model.nu)], sides)):
         pulls = model.actuator_trntype[motor] == mujoco.mjtTrn.mjTRN_TENDON
         action.append((partner, 1.0 if pulls else qvel[model.jnt_dofadr[model.actuator_trnid[motor, 0]]][1]))
     whole = [Reflection.of(numbers, device, dtype) for numbers in (qpos, qvel, action)]
@@ -108,7 +108,7 @@ def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Seque
     return (sign,), (sign,)
 
 
-def _partners(names: Sequence[str], sides: Sides) -> list[int]:
+def partners(names: Sequence[str], sides: Sides) -> list[int]:
     """Where the other side's name of each is; its own place if it is of no side."""
     other = {side: pair[1 - k] for pair in sides for k, side in enumerate(pair)}
     ends = "|".join(other)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
@@ -97,9 +98,9 @@ class Evaluation:
         steps = int(self.lengths[number])
         return self.qpos[:steps, number].numpy(force=True), self.action[:steps, number].numpy(force=True)
 
-    def gait(self) -> dict[str, gait.Foot]:
-        """How each foot moves over the ground."""
-        return gait.measure(self.scene, self.control_dt, (self.episode(k)[0] for k in range(len(self.returns))))
+    def gait(self) -> gait.Gait:
+        """How the robot moves over the ground."""
+        return gait.measure(self.scene, self.control_dt, map(self.episode, range(len(self.returns))))
 
     def save_video(self, path: Path, seconds: float = VIDEO_SECONDS) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
@@ -113,6 +114,12 @@ class Evaluation:
         if scene.terrain is not None:
             scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])
         return render.film(path, scene, qpos, self.control_dt, action)
+
+
+def gait_lines(parts: gait.Gait) -> str:
+    """A line for each foot, and one for the robot."""
+    lines = (", ".join(f"{name} {value:.3g}" for name, value in numbers.items()) for numbers in parts.values())
+    return "\n".join(f"{part:16}  {line}" for part, line in zip(parts, lines, strict=True))
 
 
 def kept(own: float, finer: float) -> float:
@@ -223,14 +230,16 @@ def evaluate_checkpoint(
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
-    """Print the gait, and leave evaluation.json and, if asked for, the video in the run's directory."""
+    """Print the gait, and leave gait.csv, evaluation.json and, if asked for, the video in the run's directory."""
     assert args.run_dir
     settings = {name: value for name, value in vars(args).items() if name in SETTINGS}
-    if feet := evaluation.gait():
-        say(gait.table(feet))
-        found["gait"] = {name: foot._asdict() for name, foot in feet.items()}
+    if numbers := evaluation.gait():
+        say(gait_lines(numbers))
     settings |= dict(script=args.script(), iteration=iteration)
     evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
+    rows = [(part, name, value) for part, values in numbers.items() for name, value in values.items()]
+    with (args.run_dir / "gait.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([("part", "number", "value"), *rows])
     if args.capture_video:
         try:
             say(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")

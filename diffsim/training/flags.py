@@ -131,7 +131,7 @@ class ParallelFlags(Flags):
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
     randomise: tuple[str, ...] = ()
-    """ranges of factors drawn for each environment: friction=0.7:1.3 stiffness mass motor (per --contact)"""
+    """ranges drawn for each environment: friction=0.7:1.3 stiffness mass motor, and of a joystick latency push"""
     redraw: Count = 10
     """iterations between drawings of the factors"""
     monitor: Natural = 50
@@ -140,7 +140,7 @@ class ParallelFlags(Flags):
     def check(self) -> None:
         super().check()
         try:
-            parse_ranges(self.randomise)
+            parse_ranges(self.randomise, find_task(self.env))
         except ValueError as error:
             fail(f"--randomise: {error}")
         if self.num_envs % distributed.size():

@@ -1,11 +1,8 @@
-"""How a robot moves over the ground, as a table with a row for each body that touches it.
-
-Duty factor and phase: Alexander (1984), The gaits of bipedal and quadrupedal animals, Int. J. Robotics Research 3(2).
-"""
+"""How a robot moves over the ground, as numbers of each foot, and of the robot with its actions."""
 
 from collections.abc import Iterable
 from itertools import islice, pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,17 +14,10 @@ EPISODES = 8  # at most as many are measured
 SETTLING = 1.0  # s at the start of an episode that are left out
 TOUCHING = 0.03  # a body that touches the ground in a smaller share of the frames is no foot
 BOUNCE = 0.05  # s; a foot that leaves the ground for no longer has not made a step
-
-
-class Foot(NamedTuple):
-    """A body that touches the ground. Without steps, its phase and clearance are 0."""
-
-    duty: float  # share of the frames in which it touches the ground
-    steps: float  # touch-downs per second
-    phase: float  # circular mean of its touch-downs within the strides of the first foot, in [0, 1]
-    clearance: float  # m between the ground and its lowest point, the most in a stride; median over strides
-    slip: float  # m/s along the ground, mean over its points that touch it
-    depth: float  # m of its lowest point in the ground, median over the frames of contact
+END = 0.99  # of half its range, beyond which an action is saturated
+FOOT = "duty", "steps/s", "clearance (m)", "slip (m/s)", "depth (m)"  # docs/shac.md says what each is
+ROBOT = "left-right", "diagonal", "action change", "saturated", "cost of transport"
+Gait = dict[str, dict[str, float]]  # those of each foot by its body's name, and of the "robot"
 
 
 def contact_bodies(scene: Scene) -> Index:
@@ -51,43 +41,52 @@ def trace(scene: Scene, qpos: Array) -> tuple[Array, Array]:
     return scene.ground_height - point[..., 2], np.linalg.norm(moved[..., :2], axis=-1)
 
 
-def measure(scene: Scene, control_dt: float, episodes: Iterable[NDArray[Any]]) -> dict[str, Foot]:
-    """The feet in episodes qpos (F, nq), by name; none without contact with a plane or if all episodes are short."""
-    settled = [qpos[round(SETTLING / control_dt) :] for qpos in islice(episodes, EPISODES)]
-    traces = [trace(scene, qpos) for qpos in settled if len(qpos) > 1]
-    if "contact" not in scene.features or scene.terrain is not None or not traces:
+def work(scene: Scene, dt: float, qpos: Array, action: Array) -> float:
+    """J that the motors do, without what they absorb, over the robot's weight: m."""
+    model, data, done = scene.mj_model, mujoco.MjData(scene.mj_model), 0.0
+    low, high = model.actuator_ctrlrange.T
+    for now, then, ctrl in zip(qpos, qpos[1:], (low + high + (high - low) * action.clip(-1, 1)) / 2, strict=False):
+        mujoco.mj_differentiatePos(model, data.qvel, dt, now, then)
+        data.qpos[:], data.ctrl[:] = now, ctrl
+        mujoco.mj_forward(model, data)
+        done += float((data.qfrc_actuator * data.qvel).clip(0).sum()) * dt
+    return done / (9.81 * model.body_mass.sum())
+
+
+def measure(scene: Scene, dt: float, episodes: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> Gait:
+    """Of episodes qpos (F, nq) and action (F, nu); empty without contact with a plane or if all are short."""
+    first, feet = round(SETTLING / dt), Gait()
+    settled = [(q[first:], a[first:]) for q, a in islice(episodes, EPISODES) if len(q) > first + 1]
+    if "contact" not in scene.features or scene.terrain is not None or not settled:
         return {}
-    feet, first = dict[str, Foot](), list[list[int]]()
-    for body in np.unique(bodies := contact_bodies(scene)):
+    traces, bodies, sides = [trace(scene, qpos) for qpos, _ in settled], contact_bodies(scene), list[Array]()
+    mujoco.mj_kinematics(scene.mj_model, data := mujoco.MjData(scene.mj_model))
+    for body in np.unique(bodies):
         depths, slides = ([kind[:, bodies == body] for kind in kinds] for kinds in zip(*traces, strict=True))
         deepest = [depth.max(1) for depth in depths]
         contact = (joined := np.concatenate(deepest)) > 0
         if contact.mean() < TOUCHING:
             continue
-        landings = [touch_downs(depth, control_dt) for depth in deepest]
-        first = first or landings
-        both = zip(first, landings, strict=True)
-        turns = [np.interp(k, a, range(len(a))) for a, b in both for k in b if a and a[0] <= k < a[-1]]
+        landings = [touch_downs(depth, dt) for depth in deepest]
         peaks = [-depth[a:b].min() for depth, ends in zip(deepest, landings, strict=True) for a, b in pairwise(ends)]
         slid = np.concatenate([s[(d[1:] > 0) & (d[:-1] > 0)] for d, s in zip(depths, slides, strict=True)])
-        feet[scene.mj_model.body(body).name] = Foot(
-            duty=float(contact.mean()),
-            steps=sum(map(len, landings)) / (len(contact) * control_dt),
-            phase=round(float(np.angle(np.exp(2j * np.pi * np.array(turns)).sum()) / (2 * np.pi)), 6) % 1,
-            clearance=float(np.median(peaks or 0.0)),
-            slip=float(slid.sum() / (max(len(slid), 1) * control_dt)),
-            depth=float(np.median(joined[contact])),
-        )
-    return feet
+        steps, slip = sum(map(len, landings)) / (len(contact) * dt), slid.sum() / max(len(slid), 1) / dt
+        numbers = contact.mean(), steps, np.median(peaks or 0.0), slip, np.median(joined[contact])
+        feet[scene.mj_model.body(body).name] = dict(zip(FOOT, map(float, numbers), strict=True))
+        sides.append(np.sign(data.xipos[body, :2].round(6)))
+    if not feet:
+        return {}
+    duty, (x, y) = np.array([foot["duty"] for foot in feet.values()]), np.array(sides).T
+    unlike = [2 * abs(np.mean(duty * side)) for side in (y, x * y * (len(feet) == 4))]
+    changes, ends = np.concatenate([[np.diff(a, axis=0), np.abs(a[1:]) > END] for _, a in settled], axis=1)
+    second = min(round(1 / dt), *(len(q) - 1 for q, _ in settled))
+    way = sum(len(q) / second * np.linalg.norm(q[second:, :2] - q[:-second, :2], axis=1).mean() for q, _ in settled)
+    cost = sum(work(scene, dt, *episode) for episode in settled) / max(way, 1e-9)
+    robot = map(float, (*unlike, np.sqrt(np.mean(changes**2)), ends.mean(), cost))
+    return feet | {"robot": dict(zip(ROBOT, robot, strict=True))}
 
 
 def touch_downs(depth: Array, dt: float) -> list[int]:
     """Frames in which a foot lands after more than BOUNCE seconds in the air; depth (F,), dt in s."""
     down = np.flatnonzero(depth > 0)
     return down[np.diff(down, prepend=-1) - 1 > BOUNCE / dt + 1e-6].tolist()
-
-
-def table(feet: dict[str, Foot]) -> str:
-    header = f"{'gait':20}  duty  steps/s  phase  clearance (m)  slip (m/s)  depth (m)"
-    row = "{:20}  {:4.2f}  {:7.2f}  {:5.2f}  {:13.3f}  {:10.2f}  {:9.3f}"
-    return "\n".join([header, *(row.format(name, *foot) for name, foot in feet.items())])

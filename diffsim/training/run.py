@@ -116,7 +116,7 @@ class Run:
         self._samples = num_envs * horizon
         args, size = self.args, num_envs // distributed.size()
         seed = args.seed + distributed.rank() * RANK_SEED
-        ranges = parse_ranges(args.randomise) if isinstance(args, ParallelFlags) else {}
+        ranges = parse_ranges(args.randomise, find_task(args.env)) if isinstance(args, ParallelFlags) else {}
         self._env = make_env(args, size, horizon, seed, factors=bool(ranges), **options)
         if isinstance(args, ParallelFlags) and ranges:
             self._variation = Variation(self._env, ranges, args.redraw, seed)

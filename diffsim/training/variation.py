@@ -10,6 +10,7 @@ import torch
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import is_real
+from diffsim.tasks import Task
 
 # What --randomise may name, and the factors of the simulator that it draws, each by itself.
 VARIED = {
@@ -18,11 +19,15 @@ VARIED = {
     "mass": ("mass",),
     "motor": ("motor",),
 }
+MOST_LATENCY = 2.0  # control steps, of which tasks remember the actions
 SEEDS = 15_485_863  # between the random numbers of one drawing and the next; ranks are 1_000_003 apart
 
 
-def parse_ranges(items: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Of --randomise friction=0.7:1.3 the least and the largest factor by name; raises ValueError for anything else."""
+def parse_ranges(items: Sequence[str], task: type[Task] = Task) -> dict[str, tuple[float, float]]:
+    """Of --randomise friction=0.7:1.3 the least and the largest factor by name, and the range of a task's disturbance.
+
+    Raises ValueError for anything else.
+    """
     ranges = {}
     for item in items:
         name, _, text = item.partition("=")
@@ -30,9 +35,13 @@ def parse_ranges(items: Sequence[str]) -> dict[str, tuple[float, float]]:
             least, most = map(float, text.split(":"))
         except ValueError:
             raise ValueError(f"{item!r} is no range of factors like friction=0.7:1.3") from None
-        if name not in VARIED:
-            raise ValueError(f"unknown {name!r}: choose from {', '.join(VARIED)}")
-        if not (is_real(least) and 0 < least <= most < math.inf):
+        if name not in VARIED and name not in task.disturbances:
+            raise ValueError(f"unknown {name!r}: choose from {', '.join((*VARIED, *task.disturbances))}")
+        if name in task.disturbances:
+            bound = MOST_LATENCY if name == "latency" else math.inf
+            if not (is_real(least) and 0 <= least <= most <= bound and most < math.inf):
+                raise ValueError(f"{item!r}: must be from 0 to {bound:g}, the least one first")
+        elif not (is_real(least) and 0 < least <= most < math.inf):
             raise ValueError(f"{item!r}: factors must be positive and finite, the least one first")
         ranges[name] = least, most
     return ranges
@@ -43,12 +52,16 @@ class Variation:
 
     Args:
         env: made with factors.
-        ranges: least and largest random factor, by their names in VARIED; their logarithm is uniform.
+        ranges: least and largest random factor, by their names in VARIED; their logarithm is uniform. Those of the
+            task's disturbances are its own to draw from, in each episode.
         redraw: iterations between drawings.
     """
 
     def __init__(self, env: DiffEnv, ranges: Mapping[str, tuple[float, float]], redraw: int, seed: int) -> None:
         self.factors, self.redraw, self.seed = env.sim.factors, redraw, seed
+        if disturbances := {name: ranges[name] for name in env.task.disturbances if name in ranges}:
+            env.task.disturbances = {**env.task.disturbances, **disturbances}
+            env.reset()  # into episodes that have them
         drawn = {factor: ranges[name] for name, factors in VARIED.items() if name in ranges for factor in factors}
         least = [math.log(drawn[name][0]) if name in drawn else 0.0 for name in FACTORS]
         most = [math.log(drawn[name][1]) if name in drawn else 0.0 for name in FACTORS]

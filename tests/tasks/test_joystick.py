@@ -11,7 +11,7 @@ from scenes import task_scene
 import diffsim
 from diffsim.env import DiffEnv
 from diffsim.tasks import TASKS
-from diffsim.tasks.joystick import Joystick, score
+from diffsim.tasks.joystick import FREQUENCY_OF_PUSHES, NEAR, SLIP, Joystick, score
 
 NAMES = "go1", "go2", "g1"
 REAL = torch.float64
@@ -73,8 +73,90 @@ def test_the_reference_moves_the_feet_as_commanded(name: str) -> None:
             vx, vy, turn = command
             expected = -np.array((vx - turn * leg.place[1], vy + turn * leg.place[0]))
             speed = (places[1] - places[0])[:2] / (2 * step)
-            # A quarter of pi: a sine's slope at its steepest beside its mean over half a cycle.
-            assert np.linalg.norm(speed - expected * np.pi / 2) < 0.25 * np.linalg.norm(expected) + 0.02
+            assert np.linalg.norm(speed - expected) < 0.25 * np.linalg.norm(expected) + 0.02
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_feet_are_where_mujoco_has_them(name: str, rng: np.random.Generator) -> None:
+    """Their heights and velocities along the ground, of a robot that lies and moves in any way."""
+    task, model = task_of(name), task_scene(name).mj_model
+    data, legs = mujoco.MjData(model), len(task.robot.legs)
+    for _ in range(5):
+        turn = rng.standard_normal(4)
+        joints = np.array(task.robot.home) + 0.3 * rng.standard_normal(model.nu)
+        data.qpos[:] = np.concatenate(([0.1, 0.2, 0.15], turn / np.linalg.norm(turn), joints))
+        data.qvel[:] = rng.standard_normal(model.nv)
+        mujoco.mj_forward(model, data)
+        qpos, qvel, still = torch.tensor(data.qpos), torch.tensor(data.qvel), torch.zeros(model.nu, dtype=REAL)
+        obs = task.observe_with(qpos, qvel, still, torch.zeros(task.num_memory, dtype=REAL))
+        for k, joint in enumerate(task._feet.joint.view(legs, -1)[:, -1].tolist()):
+            foot = model.jnt_bodyid[1 + joint]
+            point = data.xpos[foot] + data.xmat[foot].reshape(3, 3) @ task._feet.point[k, :, 0].numpy()
+            mujoco.mj_jac(model, data, jacobian := np.zeros((3, model.nv)), None, point, foot)
+            along = (jacobian @ data.qvel)[:2]
+            near = np.exp(-((max(point[2], 0.0) / NEAR) ** 2))
+            np.testing.assert_allclose(obs[k - 2 * legs], point[2] - task._rest[k], atol=1e-12)
+            np.testing.assert_allclose(obs[k - legs], near * np.log1p(along @ along / SLIP), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_reference_lifts_its_feet_and_does_not_slip(name: str) -> None:
+    """At 0.5 m/s, with the root at the height at which its lowest foot stands."""
+    task, legs, count = task_of(name), len(task_of(name).robot.legs), 200
+    clock = torch.arange(count, dtype=REAL).unsqueeze(1) / count
+    memory = torch.cat((torch.tensor([0.5, 0, 0], dtype=REAL).expand(count, 3), clock), 1)
+    memory = torch.cat((memory, torch.zeros(count, task.num_memory - 4, dtype=REAL)), 1)
+    joints = task.reference(memory[:, :3], clock)
+    rates = task.reference(memory[:, :3], clock + 1e-5) - task.reference(memory[:, :3], clock - 1e-5)
+    root = task._start[:7].expand(count, 7).clone()
+    root[:, 2] -= (root[:, 2:3] + task._feet.places(joints)[..., 2] - task._rest).min(1).values
+    forward = torch.tensor([0.5, 0, 0, 0, 0, 0], dtype=REAL).expand(count, 6)
+    qvel = torch.cat((forward, rates / 2e-5 * task.robot.cycle), 1)
+    obs = task.observe_with(torch.cat((root, joints), 1), qvel, joints, memory)
+    error, slip = obs[:, -2 * legs : -legs], obs[:, -legs:]
+    swing = (2 * torch.pi * (clock + task._phases)).sin() > 0
+    assert error.square().mean().sqrt() < 0.3 * task.robot.lift
+    assert (slip * ~swing).mean() < 0.5 * np.log1p(0.1**2 / SLIP) and slip.max() > 0
+
+
+def test_actions_come_late_and_the_robot_is_pushed() -> None:
+    """By as much as the memory says, which is drawn; without disturbances what enters a step is what was asked."""
+    task, n = task_of("go2"), 12
+    memory = task.begin(some(task, 400))
+    qvel, actions = torch.rand(400, 18, dtype=REAL), torch.rand(3, 400, n, dtype=REAL)
+    same = task.disturb(qvel, action := actions[0], memory)
+    assert same[0] is qvel and same[1] is action
+    task.disturbances = {"latency": (0.5, 2.0), "push": (0.2, 0.4)}
+    noise = torch.rand(3, 400, task.num_noise, dtype=REAL, generator=torch.Generator().manual_seed(1))
+    noise[1, :, -3], noise[1, 0, -3] = 0.0, 1.0  # all are pushed, except one
+    memory = task.begin(some(task, 400))
+    late = memory[:, -3:-2]
+    assert 0.5 <= late.min() < 0.51 and 1.99 < late.max() <= 2
+    for action, drawn in zip(actions[:2], noise, strict=False):
+        memory = task.remember(memory, action, drawn)
+    pushed, given = task.disturb(qvel, actions[2], memory)
+    kick = pushed - qvel
+    assert torch.equal(memory[:, -3:-2], late) and (kick[0] == 0).all() and (kick[:, 2:] == 0).all()
+    sizes = kick[1:].norm(dim=1)
+    assert 0.2 <= sizes.min() < 0.21 and 0.39 < sizes.max() <= 0.4 and kick[1:, :2].mean(0).abs().max() < 0.05
+    weights = torch.cat([(1 - (late - k).abs()).clamp(min=0) for k in range(3)], 1)
+    torch.testing.assert_close(given, (weights.T.unsqueeze(2) * actions.flip(0)).sum(0))
+    often = [task.remember(memory, actions[0], torch.rand(400, task.num_noise, dtype=REAL))[:, -2:] for _ in range(200)]
+    share = (torch.stack(often) != 0).any(-1).double().mean()
+    assert share == pytest.approx(task.control_dt * FREQUENCY_OF_PUSHES, rel=0.2)
+
+
+def test_gradients_pass_the_disturbances() -> None:
+    """A command that comes a control step late moves the robot in the next one."""
+    env = diffsim.make("go2", 4, seed=3, horizon=3)
+    env.task.disturbances = {"latency": (1.0, 1.0), "push": (0.5, 0.5)}
+    env.reset(seed=3)
+    actions = torch.zeros(3, 4, 12).requires_grad_()
+    states = [(env.step(action), env.qvel)[1] for action in actions.unbind()]
+    states[0].sum().backward(retain_graph=True)
+    assert actions.grad is not None and (actions.grad == 0).all()
+    states[2].sum().backward()
+    assert (actions.grad[:2].abs().sum(2) > 0).all() and (actions.grad[2] == 0).all()
 
 
 def test_memory_holds_command_clock_actions_and_noise() -> None:
@@ -91,7 +173,8 @@ def test_memory_holds_command_clock_actions_and_noise() -> None:
     torch.testing.assert_close(after[::2, :3], task._most.expand(250, 3))
     torch.testing.assert_close(after[:, 3], (memory[:, 3] + 2 * 0.02 * task.robot.cycle) % 1.0)
     assert torch.equal(after[:, 4 : 4 + n], b) and torch.equal(after[:, 4 + n : 4 + 2 * n], a)
-    torch.testing.assert_close(after[:, 4 + 2 * n :], (0.5 * task._noise).expand(500, -1))
+    torch.testing.assert_close(after[:, 4 + 2 * n : -3], (0.5 * task._noise).expand(500, -1))
+    assert (after[:, -3:] == 0).all()  # no latency, no push
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -103,7 +186,7 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     qpos[:, 3:7] = np.sqrt(0.5) * torch.tensor([1.0, 0, 0, 1])
     velocity = torch.stack((qvel[:, 1], -qvel[:, 0], qvel[:, 2]), 1)
     memory = torch.rand(3, task.num_memory, dtype=REAL)
-    command, clock, last, before, noise = memory.split((3, 1, n, n, 9 + 2 * n), dim=-1)
+    command, clock, last, before, noise, _ = memory.split((3, 1, n, n, 9 + 2 * n, 3), dim=-1)
     obs = dict(zip(names, task.observe_with(qpos, qvel, last, memory).split(sizes, dim=-1), strict=True))
     down, joints = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3), qpos[:, 7:] - task._home
     sensed = dict(zip(names[:5], (velocity, qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
@@ -112,6 +195,8 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     rest |= dict(joints_from_reference=qpos[:, 7:] - task.reference(command, clock))
     rest |= {f"true_{part}": value for part, value in sensed.items()}
     rest |= {part: sensed[part] + each for part, each in zip(sensed, noise.split(sizes[:5], dim=-1), strict=True)}
+    feet = obs.pop("feet_from_reference"), obs.pop("feet_slip")  # see the tests of them
+    assert feet[0].shape == feet[1].shape == (3, len(task.robot.legs))
     assert obs.keys() == rest.keys() and sum(sizes[:9]) == task.actor_dim
     for part, value in rest.items():
         torch.testing.assert_close(obs[part], value)
@@ -120,13 +205,11 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_reward_is_largest_on_the_reference(name: str) -> None:
-    """Of a robot that goes as commanded, on its reference; each departure costs, and tilting or sinking ends it."""
+    """Of a robot that stands as commanded, on its reference; each departure costs, and tilting or sinking ends it."""
     task, n = task_of(name), len(task_of(name).robot.joints)
     memory = task.begin(some(task, 1))
-    memory[:, :3] = torch.tensor([0.5, 0.2, 0.3])
+    memory[:, :3] = 0.0
     qpos, qvel = task._start[None, : 7 + n].clone(), torch.zeros(1, 6 + n, dtype=REAL)
-    qpos[:, 7:] = task.reference(memory[:, :3], memory[:, 3:4])
-    qvel[:, :2], qvel[:, 5] = memory[:, :2], memory[:, 2]
     action = torch.zeros(1, n, dtype=REAL)
 
     def observed(change: str = "", index: int = 0, by: float = 0.0) -> torch.Tensor:
@@ -188,11 +271,11 @@ def test_the_image_follows_the_mirrored_command(name: str) -> None:
         torch.randn(n, 3, dtype=REAL, generator=generator),
         torch.rand(n, 1, dtype=REAL, generator=generator),
     )
-    noise = torch.randn(n, 9 + 2 * model.nu, dtype=REAL, generator=generator)
-    memory = torch.cat((command, clock, last, before, noise), dim=1)
+    noise, none = torch.randn(n, 9 + 2 * model.nu, dtype=REAL, generator=generator), torch.zeros(n, 3, dtype=REAL)
+    memory = torch.cat((command, clock, last, before, noise, none), dim=1)
     turned = command * torch.tensor([1.0, -1.0, -1.0]), (clock + 0.5) % 1.0
     sensed = mirror.obs(torch.cat((noise, torch.zeros(n, task.obs_dim - noise.shape[1], dtype=REAL)), 1))
-    image = torch.cat((*turned, *map(mirror.action, (last, before)), sensed[:, : noise.shape[1]]), dim=1)
+    image = torch.cat((*turned, *map(mirror.action, (last, before)), sensed[:, : noise.shape[1]], none), dim=1)
     obs = task.observe_with(qpos, qvel, action, memory)
     seen = task.observe_with(mirror.qpos(qpos), mirror.qvel(qvel), mirror.action(action), image)
     torch.testing.assert_close(seen, mirror.obs(obs), rtol=0, atol=1e-12)

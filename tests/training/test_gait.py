@@ -1,7 +1,8 @@
-"""Gaits: motions whose six numbers are known, and those of shipped policies."""
+"""Gaits: motions whose numbers are known, and those of shipped policies."""
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -24,6 +25,7 @@ SETTLED = round(gait.SETTLING / DT)
 BIPED = """
 <mujoco>
   <default> <geom contype="1" conaffinity="0"/> <joint type="slide" axis="0 0 1"/> </default>
+  <actuator> <motor joint="right" ctrlrange="-100 100"/> <motor joint="left" ctrlrange="0 2"/> </actuator>
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="1"/>
     <body name="box" pos="0 0 1">
@@ -56,8 +58,10 @@ def steps_of(scene: Scene, duty: tuple[float, float], phase: tuple[float, float]
     return qpos
 
 
-def measured(scene: Scene, *episodes: Array) -> dict[str, gait.Foot]:
-    return gait.measure(scene, DT, episodes)
+def measured(scene: Scene, *episodes: Array) -> gait.Gait:
+    """The feet's numbers, of motions under actions of 0."""
+    parts = gait.measure(scene, DT, ((qpos, np.zeros((len(qpos), scene.nu))) for qpos in episodes))
+    return {part: numbers for part, numbers in parts.items() if part != "robot"}
 
 
 @pytest.mark.parametrize("phase", [0.5, 0.3, 0.96])
@@ -65,11 +69,23 @@ def test_numbers_of_a_known_motion(biped: Scene, phase: float) -> None:
     feet = measured(biped, steps_of(biped, (0.4, 0.2), (0.44, 0.44 + phase)))
     assert [*feet] == ["right_leg", "left_leg"]
     right, left = feet.values()
-    known = dict(steps=2.0, clearance=0.1, slip=2.0, depth=0.02)
-    assert right._asdict() == pytest.approx(known | dict(duty=0.4, phase=0.0), abs=1e-6)
-    assert left._asdict() == pytest.approx(known | dict(duty=0.2, phase=phase), abs=1e-6)
-    lines = gait.table(feet).splitlines()
-    assert lines[2].split() == ["left_leg", "0.20", "2.00", f"{phase:.2f}", "0.100", "2.00", "0.020"]
+    known = {"steps/s": 2.0, "clearance (m)": 0.1, "slip (m/s)": 2.0, "depth (m)": 0.02}
+    assert right == pytest.approx(known | {"duty": 0.4}, abs=1e-6)
+    assert left == pytest.approx(known | {"duty": 0.2}, abs=1e-6)
+    shown = "duty 0.2, steps/s 2, clearance (m) 0.1, slip (m/s) 2, depth (m) 0.02"
+    assert evaluation.gait_lines(feet).splitlines()[1].split(maxsplit=1) == ["left_leg", shown]
+
+
+def test_numbers_of_a_robot(biped: Scene) -> None:
+    """At 2 m/s its right leg is pushed down with 50 N, and goes down by 120 mm once a stride of 1 m, and up again."""
+    qpos = steps_of(biped, (0.4, 0.2), (0.0, 0.5))
+    action = np.full((len(qpos), 2), -0.5)
+    action[:, 1] = np.where(np.arange(len(qpos)) % 2, -1.0, 0.5)  # of a weak motor
+    robot = gait.measure(biped, DT, [(qpos, action)])["robot"]
+    assert robot["left-right"] == pytest.approx(0.2) and robot["diagonal"] == 0.0
+    assert robot["action change"] == pytest.approx(1.5 / np.sqrt(2))
+    assert robot["saturated"] == pytest.approx(0.25, abs=1e-3)
+    assert robot["cost of transport"] == pytest.approx(50 * 0.12 / (11 * 9.81), rel=0.05)
 
 
 def test_a_wheel_that_rolls_does_not_slip(biped: Scene) -> None:
@@ -77,10 +93,10 @@ def test_a_wheel_that_rolls_does_not_slip(biped: Scene) -> None:
     qpos[:, 0], qpos[:, 2], qpos[:, 7:9] = 0.1 * DT * np.arange(len(qpos)), 0.995, 0.2
     qpos[:, 9] = qpos[:, 0] / 0.1
     (wheel,) = measured(biped, qpos).values()
-    assert wheel.duty == 1.0 and wheel.steps == wheel.phase == wheel.clearance == 0.0
-    assert wheel.slip < 1e-4 and wheel.depth == pytest.approx(0.005)
+    assert wheel["duty"] == 1.0 and wheel["steps/s"] == wheel["clearance (m)"] == 0.0
+    assert wheel["slip (m/s)"] < 1e-4 and wheel["depth (m)"] == pytest.approx(0.005)
     qpos[:, 9] *= -1
-    assert measured(biped, qpos)["wheel"].slip == pytest.approx(0.2, rel=1e-3)
+    assert measured(biped, qpos)["wheel"]["slip (m/s)"] == pytest.approx(0.2, rel=1e-3)
 
 
 def test_a_foot_that_hardly_touches_is_none(biped: Scene) -> None:
@@ -101,8 +117,8 @@ def test_only_what_lies_between_the_first_second_and_the_end_counts(biped: Scene
     early[: SETTLED - 1, 2] = 0.2
     assert measured(biped, early) == measured(biped, qpos)
     both = measured(biped, early, qpos[:600], qpos[: SETTLED + 1])  # the last one is too short to count
-    assert both["left_leg"].duty == pytest.approx(0.4)
-    assert both["right_leg"].steps == pytest.approx((19 + 9) / 15)  # it stands when they begin
+    assert both["left_leg"]["duty"] == pytest.approx(0.4)
+    assert both["right_leg"]["steps/s"] == pytest.approx((19 + 9) / 15)  # it stands when they begin
     assert measured(biped, qpos[:5], qpos[: SETTLED + 1]) == {}
 
 
@@ -139,10 +155,12 @@ def test_depth_is_that_of_mujocos_contacts(name: str, rng: np.random.Generator) 
 def test_gait_of_shipped_policies(name: str, names: list[str]) -> None:
     env = diffsim.make(name, num_envs=2, horizon=1, max_episode_steps=180)
     feet = evaluate(env, load_policy(PACKAGE / "policies" / f"{name}.pt").network).gait()
-    assert [*feet] == names
-    for foot in feet.values():
-        assert 0.1 < foot.duty < 0.5 and 1.5 < foot.steps < 5 and 0 < foot.depth < 0.15
-        assert 0.1 < foot.clearance < 0.6 and 0 < foot.slip < 2
+    assert [*feet] == [*names, "robot"]
+    for name in names:
+        duty, steps, clearance, slip, depth = feet[name].values()
+        assert 0.1 < duty < 0.5 and 1.5 < steps < 5 and 0 < depth < 0.15 and 0.1 < clearance < 0.6 and 0 < slip < 2
+    unlike, diagonal, change, saturated, cost = feet["robot"].values()
+    assert diagonal == 0 and unlike < 0.2 and 0 < change < 1 and 0 <= saturated < 1 and 0.2 < cost < 20
 
 
 def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,8 +168,13 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
     SCRIPTS["sapo"].main(["--evaluate", path, "--eval-episodes", "2", "--device", "cpu", "--run-dir", str(tmp_path)])
     returns, finer, *table = capsys.readouterr().out.splitlines()
     found = json.loads((tmp_path / "evaluation.json").read_text())
-    feet = {name: gait.Foot(**numbers) for name, numbers in found["gait"].items()}
-    assert [*feet] == [f"foot_{k}" for k in (1, 2, 3, 4)] and "\n".join(table) == gait.table(feet)
+    parts = gait.Gait()
+    with (tmp_path / "gait.csv").open() as file:
+        for row in csv.DictReader(file):
+            parts.setdefault(row["part"], {})[row["number"]] = float(row["value"])
+    assert [*parts] == [*(f"foot_{k}" for k in (1, 2, 3, 4)), "robot"] and "\n".join(table) == evaluation.gait_lines(
+        parts
+    )
     assert returns.startswith("ant, 2 episodes")
     assert finer == f"semi_implicit with 32 substeps: return median {found['finer']['return']:.1f}, " + (
         f"{found['finer']['kept']:.1%} kept"

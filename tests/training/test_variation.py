@@ -13,6 +13,7 @@ import diffsim
 import ppo_baseline
 import shac
 from diffsim.robot.scene import FACTORS
+from diffsim.tasks import TASKS
 from diffsim.training import parse
 from diffsim.training.variation import Variation, parse_ranges
 
@@ -79,6 +80,25 @@ def test_wrong_ranges_are_refused(items: str, message: str, capsys: pytest.Captu
     with pytest.raises(ValueError, match=message.replace("(", r"\(")):
         parse_ranges([items])
     assert message in refusal(lambda: shac.main(["--env", "hopper", "--randomise", items]), capsys)
+
+
+def test_disturbances_are_the_tasks(capsys: pytest.CaptureFixture[str]) -> None:
+    """Drawn in each episode; only joystick tasks have some."""
+    asked = ["latency=0.5:1", "push=0:0.5", "mass=0.9:1.1"]
+    ranges = parse_ranges(asked, TASKS["go2"])
+    env = diffsim.make("go2", 300, factors=True)
+    Variation(env, ranges, 10, 1).set(1)
+    late = env.memory[:, -3]
+    assert 0.5 <= late.min() < 0.6 and 0.9 < late.max() <= 1 and env.task.disturbances["push"] == (0.0, 0.5)
+    assert column(env, "mass").std() > 0.01 and (column(env, "motor") == 1).all()
+    for item, message in (
+        ("latency=0:3", "'latency=0:3': must be from 0 to 2, the least one first"),
+        ("push=1:0.5", "'push=1:0.5': must be from 0 to inf, the least one first"),
+        ("push=0:inf", "must be from 0 to inf"),
+        ("mu=1:2", "choose from friction, stiffness, mass, motor, latency, push"),
+    ):
+        assert message in refusal(lambda item=item: shac.main(["--env", "go2", "--randomise", item]), capsys)
+    assert "unknown 'push'" in refusal(lambda: shac.main(["--env", "ant", "--randomise", "push=0:1"]), capsys)
 
 
 def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(tmp_path: Path) -> None:
