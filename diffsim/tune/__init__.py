@@ -59,6 +59,8 @@ def tune(
     policy, source = actor(robot, task, checkpoint)
     motion, rows = Motion(env, policy), list[Row]()
     print(f"{task.name}: {states} start states and actions of {source}; control steps of {1e3 * env.control_dt:.4g} ms")
+    if "contact" not in env.scene.features:
+        print(f"{robot} meets no ground: no contact is measured")
     contacts, stopped = contact or (task.contact,), False
     try:
         for each in contacts:
