@@ -96,7 +96,7 @@ def presets(rows: list[Cells]) -> list[Row]:
 
 def measure_extremes(args: Args, robot: str) -> Iterator[Row]:
     task = subject(robot)
-    for row in stress(motion_of(robot, 8), task, (task.contact,)):
+    for row in stress(motion_of(robot, 8), task, dict.fromkeys((task.contact, "mujoco"))):
         yield {"task": task.name} | row
 
 
