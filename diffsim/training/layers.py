@@ -103,8 +103,9 @@ class Both(nn.Module):
     def __init__(self, size: int, reflection: Reflection | None = None) -> None:
         super().__init__()
         self.size = size  # n
-        self.index: Tensor = nn.Buffer(torch.arange(size) if reflection is None else reflection.index)
-        self.sign: Tensor = nn.Buffer(torch.ones(size) if reflection is None else reflection.sign)
+        # On the CPU, where every module begins
+        self.index: Tensor = nn.Buffer(torch.arange(size) if reflection is None else reflection.index.cpu())
+        self.sign: Tensor = nn.Buffer(torch.ones(size) if reflection is None else reflection.sign.cpu())
 
     def image(self, x: Tensor) -> Tensor:
         return x.index_select(-1, self.index) * self.sign

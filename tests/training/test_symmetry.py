@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import assert_resumes, refusal
+from learners import assert_resumes, refusal, run
 from torch import Tensor, nn
 
 import diffsim
@@ -134,6 +134,19 @@ def test_training_keeps_it_and_resumes(tmp_path: Path) -> None:
     assert_alike(policy(mirror.obs(obs)), mirror.action(policy(obs)))
     mean, var = (whole["modules"]["actor"][f"normalizer.{name}"] for name in ("mean", "var"))
     assert torch.equal(mirror.obs(mean), mean) and torch.equal(var[mirror.obs.index], var) and mean.abs().max() > 0.1
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("task", ["ant", "go2"])
+@pytest.mark.parametrize("script", LEARNERS)
+def test_a_gpu_trains_and_keeps_it(script: str, task: str, tmp_path: Path) -> None:
+    """In CUDA graphs; networks are made on the CPU, and the task's mirror on the GPU."""
+    flags = f"--env {task} --symmetric --num-envs 8 --horizon 4 --iterations 6 --device cuda --quiet --eval-episodes 2"
+    run(importlib.import_module(script), tmp_path, *flags.split())
+    mirror = TASKS[task]().mirror
+    obs = torch.randn(20, len(mirror.obs.index))
+    policy = load_policy(tmp_path / "checkpoint.pt").network
+    assert_alike(policy(mirror.obs(obs)), mirror.action(policy(obs)))
 
 
 def test_statistics_are_those_of_observations_and_their_images() -> None:
