@@ -116,6 +116,7 @@ class Args(ParallelFlags):
         wrong = {
             "one process alone: a replay buffer is not shared among ranks": distributed.size() > 1,
             "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
+            "--models must be at least 2: of an ensemble some are chosen": self.models < 2,
             f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
             f"--rollout-lengths {first} {last} are the wrong way round": first > last,
             f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step": self.buffer_size < rows,
@@ -168,7 +169,7 @@ class Models(nn.Module):
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int) -> None:
         super().__init__()
-        self.models, size = args.models, obs_dim + 1
+        size = obs_dim + 1
         networks = [mlp(obs_dim + action_dim, args.model_hidden, 2 * size, nn.SiLU) for _ in range(args.models)]
         self.ensemble = Ensemble(networks)
         self.least, self.most = (nn.Parameter(torch.full((size,), bound)) for bound in LOG_VAR)
@@ -191,8 +192,7 @@ class Models(nn.Module):
     def predict(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Sampled change of the observation (B, obs_dim) and reward (B,); each elite predicts an equal part of them."""
         parts = [x.unflatten(0, (len(self.elites), -1)) for x in (obs, action)]
-        chosen = self.elites if self.models > 1 else None  # one network alone has no dimension to choose along
-        mean, log_var = (x.flatten(0, 1) for x in self(*parts, chosen))
+        mean, log_var = (x.flatten(0, 1) for x in self(*parts, self.elites))
         drawn = self.target.inverse(mean + (0.5 * log_var).exp() * torch.randn_like(mean))
         return drawn[:, :-1], drawn[:, -1]
 
@@ -200,11 +200,6 @@ class Models(nn.Module):
 def changes(batch: Transition) -> Tensor:
     """What the models predict (B, obs_dim + 1)."""
     return torch.cat((batch.next_obs - batch.obs, batch.reward.unsqueeze(1)), 1)
-
-
-def gaussian_nll(mean: Tensor, log_var: Tensor, target: Tensor) -> Tensor:
-    """-log N(target; mean, exp(log_var)) of each number."""
-    return 0.5 * ((target - mean).square() * (-log_var).exp() + log_var + math.log(2 * math.pi))
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -268,10 +263,6 @@ class MBPO:
         optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer, self.model_optimizer
         return {"grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum()}
 
-    def failed(self, obs: Tensor) -> Tensor:
-        """Whether an observation (..., obs_dim) ends its episode."""
-        return self.env.task.terminated(obs) & self.args.early_termination
-
     # Models ----------------------------------------------------------------------------------------------------------
 
     def fit(self) -> dict[str, Tensor]:
@@ -283,7 +274,7 @@ class MBPO:
             each = (self.actor.normalizer(batch.obs), batch.action, target)
             obs, action, target = (x.unflatten(0, (args.models, -1)) for x in each)
             mean, log_var = models(obs, action)
-            nll = gaussian_nll(mean, log_var, target)
+            nll = 0.5 * ((target - mean).square() * (-log_var).exp() + log_var + math.log(2 * math.pi))
             width = (models.most - models.least).sum()
             self.model_optimizer.step(nll.mean((1, 2)).sum() + BOUND_WEIGHT * width)
             losses.append(nll.detach().mean())
@@ -313,7 +304,7 @@ class MBPO:
             action, _ = self.actor(seen)
             change, reward = models.predict(seen, action)
             next_obs = obs + change
-            terminated = self.failed(next_obs)
+            terminated = self.env.task.terminated(next_obs) & args.early_termination
             self.imagined.add(Transition(obs, action, reward, next_obs, terminated.to(reward.dtype)))
             over = terminated | (age >= length)
             obs = torch.where(over.unsqueeze(1), self.real.sample(len(obs)).obs, next_obs)
@@ -398,7 +389,8 @@ def enhance(mbpo: MBPO, state: Tensor, made: Transition) -> Transition:
     # A part of the observation may be the action before, which stays as it was.
     obs = made.obs + observe(start, 0 * action) - observe(state, 0 * made.action)
     next_obs = observe(end, action)
-    reward, terminated = task.reward(next_obs, action) * finite, mbpo.failed(next_obs) | ~finite
+    terminated = task.terminated(next_obs) & args.early_termination | ~finite
+    reward = task.reward(next_obs, action) * finite
     parts = Transition(obs, action, reward, next_obs, terminated.to(reward.dtype))
     return Transition(*(x.flatten(0, 1) for x in parts))
 
