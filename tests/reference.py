@@ -342,27 +342,6 @@ def step(
     return qpos, qvel
 
 
-def momentum(scene: Scene, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-    """Linear momentum, and angular momentum about the centre of mass."""
-    links = kinematics(scene, qpos, qvel)
-    centres = np.array([link.position + link.rotation @ c for link, c in zip(links, scene.com, strict=True)])
-    velocities = np.array([link.point(link.rotation @ c)[0] for link, c in zip(links, scene.com, strict=True)])
-    linear = scene.mass[:, None] * velocities
-    angular = np.cross(centres - scene.mass @ centres / scene.mass.sum(), linear).sum(0)
-    for link, inertia in zip(links, scene.inertia, strict=True):
-        angular = angular + link.rotation @ inertia @ link.rotation.T @ link.angular_velocity
-    return linear.sum(0), angular
-
-
-def energy(scene: Scene, qpos: Array, qvel: Array) -> float:
-    """Kinetic energy and the potential of gravity and springs."""
-    links = kinematics(scene, qpos, qvel)
-    centres = np.array([link.position + link.rotation @ c for link, c in zip(links, scene.com, strict=True)])
-    stretch = np.array([joint_position(scene, i, qpos) - scene.spring_ref[i] for i in range(1, scene.nlink)])
-    potential = -scene.mass @ centres @ scene.gravity + stretch**2 @ scene.stiffness[1:] / 2
-    return float(qvel @ mass_and_bias(scene, links)[0] @ qvel / 2 + potential)
-
-
 def joint_dof(scene: Scene, link: int) -> int:
     return link - 1 + 6 * scene.floating
 

@@ -434,12 +434,6 @@ def without_ground(scene: Scene) -> Scene:
     return dataclasses.replace(scene, ground_height=-1e3)
 
 
-def in_free_flight(scene: Scene) -> Scene:
-    """The same scene, hence the same kernels, without effective limits and damping besides."""
-    wide = {"lower": np.minimum(scene.lower, -1e9), "upper": np.maximum(scene.upper, 1e9)}
-    return dataclasses.replace(without_ground(scene), damping=1e-300 * scene.damping, **wide)
-
-
 def unit(quaternion: Array) -> Array:
     return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
 

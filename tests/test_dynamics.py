@@ -23,7 +23,6 @@ from scenes import (
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
-    in_free_flight,
     leg_scene,
     parse,
     pass_limits,
@@ -208,36 +207,6 @@ def test_ball_joints_know_a_quaternion_and_its_negative_as_one(rng):
 # Laws of motion
 
 
-def halving_orders(errors):
-    """Observed orders of convergence, for errors at steps that halve from one to the next."""
-    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-
-
-@pytest.mark.parametrize("base", ["floating", "ball"])
-def test_free_flight_keeps_momentum_and_energy_to_first_order(base, rng):
-    """A tree that tumbles for a quarter of a second; gravity adds m g t, motors cannot change momentum."""
-    scene = in_free_flight(tree_scene(base, 0))
-    qpos, qvel, ctrl = free_states(scene, 1, rng)
-    t, substeps = 0.25, [256, 512, 1024]
-
-    def errors(conserved, ctrl, gained=0.0):
-        before = conserved(scene, qpos[0], qvel[0])
-        ends = [run(scene, qpos, qvel, ctrl, control_dt=t, integration=Integration(substeps=n)) for n in substeps]
-        return [
-            np.linalg.norm(conserved(scene, q[0], v[0]) - before - gained) / np.linalg.norm(before) for q, v in ends
-        ]
-
-    weight = scene.mass.sum() * scene.gravity
-    idle = -scene.motor_bias[None] / scene.gear
-    for drift in (
-        errors(lambda *state: reference.momentum(*state)[0], ctrl, gained=weight * t),
-        errors(lambda *state: reference.momentum(*state)[1], ctrl),
-        errors(reference.energy, idle),
-    ):
-        np.testing.assert_allclose(halving_orders(drift), 1.0, atol=0.1)
-        assert drift[-1] < 1e-2
-
-
 @pytest.mark.parametrize("name", ["ant", "hopper"])
 def test_motion_is_the_same_far_from_the_origin(name, rng):
     """Horizontally, 10 km away: a step's end is rounded to float32's spacing there, nothing else notices."""
@@ -263,53 +232,6 @@ def test_motion_is_the_same_far_from_the_origin(name, rng):
         np.testing.assert_array_equal(far, near)
     rounding = np.spacing(np.float32(1e4)) / 2 * steps * 1.01  # once in a control step
     np.testing.assert_allclose(far_q[:, horizontal] - 1e4, near_q[:, horizontal], rtol=0, atol=rounding)
-
-
-# Closed forms
-
-
-def closed_loop(scene, qpos, qvel, steps, substeps):
-    """Final (qpos, qvel), their inputs as leaves, after steps of 1/60 s without control."""
-    sim = Simulator(scene, 1, Integration(substeps=substeps), horizon=steps, dtype=torch.float64)
-    start = [torch.tensor([x], dtype=torch.float64, requires_grad=True) for x in (qpos, qvel)]
-    q, v = start
-    ctrl = torch.zeros(1, scene.nu, dtype=torch.float64)
-    for _ in range(steps):
-        q, v = sim.step(q, v, ctrl)
-    return q[0], v[0], start
-
-
-def test_projectile():
-    """Semi-implicit Euler falls g h t / 2 too far; all else of the parabola, and a free sphere's spin, is exact."""
-    scene, t, substeps = parse(BALL), 2.0, 16
-    position, velocity, spin = np.array([1.0, -2.0, 50.0]), np.array([3.0, 4.0, 10.0]), np.array([0.5, -2.0, 7.0])
-    qpos, qvel = [*position, 1.0, 0.0, 0.0, 0.0], [*velocity, *spin]
-    q, v, (q0, v0) = closed_loop(scene, qpos, qvel, 120, substeps)
-    h = 1 / 60 / substeps
-    expected = position + velocity * t + scene.gravity * (t * t + h * t) / 2
-    np.testing.assert_allclose(q[:3].detach(), expected, rtol=1e-12)
-    np.testing.assert_allclose(v.detach(), [*(velocity + scene.gravity * t), *spin], rtol=1e-12)
-    angle = np.linalg.norm(spin) * t
-    turned = [np.cos(angle / 2), *(np.sin(angle / 2) * spin / np.linalg.norm(spin))]
-    np.testing.assert_allclose(abs(q[3:7].detach().numpy() @ turned), 1.0, rtol=1e-12)
-
-    (dz_dq,) = torch.autograd.grad(q[2], q0, retain_graph=True)
-    (dz_dv,) = torch.autograd.grad(q[2], v0, retain_graph=True)
-    np.testing.assert_allclose(dz_dq[0], np.eye(7)[2], atol=1e-12)
-    np.testing.assert_allclose(dz_dv[0], t * np.eye(6)[2], atol=1e-12)
-    # The quaternion's scalar part is cos(t |spin| / 2).
-    (dw_dv,) = torch.autograd.grad(q[3], v0)
-    turning = -t / 2 * np.sin(angle / 2) * spin / np.linalg.norm(spin)
-    np.testing.assert_allclose(dw_dv[0, 3:], turning, atol=1e-12)
-
-
-def test_ball_rests_at_the_depth_that_carries_it():
-    scene = parse(BALL)
-    weight = scene.mass[0] * 9.81
-    qpos, qvel = np.array([[0.0, 0.0, 0.1005, 1.0, 0.0, 0.0, 0.0]]), np.zeros((1, 6))
-    q, v = run(scene, qpos, qvel, np.zeros((1, 0)), steps=240)
-    np.testing.assert_allclose(0.1 - q[0, 2], weight / scene.k_n, rtol=1e-6)
-    np.testing.assert_allclose(v, 0, atol=1e-8)
 
 
 # Contact law

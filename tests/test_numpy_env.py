@@ -224,14 +224,3 @@ def test_modes_of_rendering() -> None:
         diffsim.make("hopper", render_mode="depth")  # type: ignore[arg-type]
     with pytest.raises(RuntimeError, match="without a render_mode"):
         diffsim.make("hopper").render()
-
-
-def test_record_video(tmp_path: Any) -> None:
-    pytest.importorskip("moviepy")
-    env = wrappers.RecordVideo(gymnasium.make(HOPPER, render_mode="rgb_array", max_episode_steps=3), str(tmp_path))
-    env.reset(seed=0)
-    draw(env)
-    while not any(env.step(np.zeros(3, np.float32))[2:4]):
-        pass
-    env.close()
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]

@@ -144,20 +144,14 @@ def test_learning_rates_decay_linearly() -> None:
         "--num-envs 2 --integrator extrapolated --substeps 2 --eval-every 2 --threads 1",
     ],
 )
-def test_unusual_settings_train(arguments: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
     words = "--env-id", "cartpole", *arguments.split(), "--iterations", 3, "--eval-episodes", 1
     checkpoint = run(shac, tmp_path, *words)
     modules, args = checkpoint["modules"], checkpoint["args"]
-    assert checkpoint["iteration"] == 3 and modules["actor_optimizer"]["skipped"] == 0
-    assert modules["actor_optimizer"]["lr"].item() == pytest.approx(
-        args["actor_lr"] + (args["final_lr"] - args["actor_lr"]) * 2 / 3
-    )
+    lr = args["actor_lr"] + (args["final_lr"] - args["actor_lr"]) * 2 / 3  # of the last of three iterations
+    assert modules["actor_optimizer"]["lr"].item() == pytest.approx(lr)
+    assert modules["actor_optimizer"]["skipped"] == 0
     assert all(weight.isfinite().all() for weight in modules["critic"].values())
-    if "general" in arguments:
-        assert args["target_alpha"] == 0.995 and args["actor_hidden"] == (256, 128)
-        assert args["iterations"] == 3 and args["num_envs"] == 3
-    out = capsys.readouterr().out
-    assert "3/3" in out and "it/s" in out and "return median" in out
 
 
 def test_a_deterministic_policy_has_no_noise() -> None:

@@ -18,7 +18,7 @@ start, results = threading.Barrier(4), []
 
 def first_steps():
     start.wait()
-    env = diffsim.make("cartpole", 2, seed=0, threads=1)
+    env = diffsim.make("cartpole", 2, seed=0, threads=1, block=1)
     action = torch.full((2, 1), 0.3, requires_grad=True)
     results.append(torch.autograd.grad(env.step(action)[1].sum(), action)[0].tolist())
 

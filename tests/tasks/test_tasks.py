@@ -85,14 +85,9 @@ def test_which_robots_cannot_fall() -> None:
 
 @every_task
 def test_sizes(name: str) -> None:
-    task, model = TASKS[name], load(name)
+    task = TASKS[name]
     assert (task.substeps, task.episode_length, task.obs_dim, task.min_height) == SIZES[name]
     assert (task.name, task.asset, task.control_dt) == (name, f"{name}.xml", 1 / 60)
-    instance = task()
-    qpos, qvel = instance.reset(torch.rand(3, task.num_random))
-    assert (qpos.shape, qvel.shape) == ((3, model.nq), (3, model.nv))
-    obs = instance.observe(qpos, qvel, torch.zeros(3, model.nu))
-    assert obs.shape == (3, task.obs_dim) and obs.dtype == torch.float32
 
 
 def random_states(name: str, shape: tuple[int, ...], rng: np.random.Generator) -> tuple[torch.Tensor, ...]:

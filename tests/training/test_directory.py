@@ -17,7 +17,6 @@ from diffsim.training.directory import (
     ProgressFile,
     ProgressLog,
     check_writable,
-    column,
 )
 
 
@@ -28,18 +27,6 @@ def read(path: Path) -> list[dict[str, str]]:
 
 def row(iteration: int, **values: float) -> dict[str, float]:
     return {"iteration": iteration, "control_steps": 10 * iteration, "seconds": 0.5} | values
-
-
-def test_columns_are_named_after_scalars() -> None:
-    names = {
-        "charts/episodic_return": "return",
-        "charts/episodic_length": "length",
-        "charts/SPS": "charts_SPS",
-        "eval/return": "eval_return",
-        "losses/actor": "losses_actor",
-        "time/update_actor": "time_update_actor",
-    }
-    assert {name: column(name) for name in names} == names
 
 
 def test_columns_join_when_they_first_have_a_value(tmp_path: Path) -> None:

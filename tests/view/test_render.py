@@ -25,7 +25,6 @@ import diffsim.tasks
 import shac
 import view
 from diffsim import Scene, load_scene
-from diffsim.training.evaluation import Evaluation
 from diffsim.view import render
 from diffsim.view.render import Renderer, film, save_video
 
@@ -219,16 +218,6 @@ def test_a_film_is_drawn_at_most_thirty_times_a_second(opengl: None, tmp_path: P
     for dt, steps, frames, fps in ((1 / 60, 9, 5, 30.0), (1 / 50, 6, 3, 25.0), (1 / 25, 3, 3, 25.0)):
         video, rate = read_mp4(film(tmp_path / "film.mp4", HOPPER, np.zeros((steps, 6)), dt, size=(32, 16)))
         assert len(video) == frames and rate == fps and video.shape[1:] == (16, 32, 3)
-
-
-def test_ten_seconds_of_the_median_episode_are_filmed() -> None:
-    qpos = torch.arange(3.0).reshape(1, 3, 1) + torch.zeros(1000, 3, 1)
-    lengths = torch.tensor([1000, 700, 1000])
-    evaluation = Evaluation(torch.tensor([5.0, 1.0, 3.0]), lengths, None, qpos, qpos, HOPPER, 1 / 60)
-    shown, action = evaluation.median_episode()
-    assert shown.shape == action.shape == (600, 1) and (shown == 2).all()
-    evaluation.lengths[2] = 40
-    assert len(evaluation.median_episode()[0]) == 40 and len(evaluation.median_episode(0.5)[0]) == 30
 
 
 def test_an_mp4_asked_for_is_written_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
