@@ -83,7 +83,7 @@ class MuJoCoWarp(diffsim.Simulator):
             self._advance = partial(wp.capture_launch, capture.graph, wp.stream_from_torch(self.device))
 
     @torch.no_grad()
-    def step(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor) -> tuple[Tensor, Tensor]:
+    def advance(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor) -> tuple[Tensor, Tensor]:
         """As a Simulator's; a robot that was put elsewhere since the last step, by a reset, has no warm start."""
         moved = (qpos != self._qpos).any(1) | (qvel != self._qvel).any(1)
         self._warmstart.masked_fill_(moved[:, None], 0.0)

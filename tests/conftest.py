@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gc
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +35,12 @@ def pytest_collection_finish() -> None:
     """What the imports made stays: looking through it again and again took a tenth of the tests' time."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The name with which messages of scripts begin."""
+    monkeypatch.setattr(sys, "argv", ["script.py"])
 
 
 @pytest.fixture

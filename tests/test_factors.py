@@ -199,7 +199,7 @@ def test_wrong_factors_and_forces_are_refused():
 
 
 def test_kernels_without_factors_and_forces_do_not_know_them():
-    scene = leg_scene(grounded=True)
+    scene = task_scene("hopper")
     plain, varied, forced = source(scene), source(scene, varied=True), source(scene, forced=True)
     for name in ("contact_constants_adjoint", "limit_constants_gain", "(var_m).carried"):
         assert name in varied and name not in plain

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -103,12 +102,6 @@ def test_mixture_is_of_prefixes() -> None:
 
 
 # The search
-
-
-@pytest.fixture(autouse=True)
-def called_gps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its messages begin with the script's name."""
-    monkeypatch.setattr(sys, "argv", ["gps.py"])
 
 
 @pytest.fixture(scope="module")

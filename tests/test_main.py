@@ -26,11 +26,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
 
 
-@pytest.fixture(autouse=True)
-def named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["diffsim"])
-
-
 @pytest.fixture
 def trained(tiny_run: Path) -> Path:
     return tiny_run / "checkpoint.pt"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -104,7 +103,6 @@ def test_from_another_directory(
     (run,), there = (home / "runs").iterdir(), str(home / "examples" / "own_robot.py")
     path = run / "checkpoint.pt"
     missing = f"no such file: examples/own_robot.py in {tmp_path}; give its path, in scripts --env path/to/own_robot.py"
-    monkeypatch.setattr(sys, "argv", ["script.py"])
     for words in (["--evaluate", path], ["--resume", path, "--iterations", "9"]):
         assert (
             refusal(lambda words=words: ppo_baseline.main([*map(str, words), *FEW]), capsys) == f"script.py: {missing}"

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import shutil
 import signal
-import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -45,11 +44,6 @@ COMMON_SCALARS = (
 @pytest.fixture(scope="module", params=SCRIPTS)
 def script(request: pytest.FixtureRequest) -> ModuleType:
     return SCRIPTS[request.param]
-
-
-@pytest.fixture(autouse=True)
-def named(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [f"{script.__name__}.py"])
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""view.py: videos, pages and curves of a run; mistakes and full disks are one line and leave no file."""
+"""script.py: videos, pages and curves of a run; mistakes and full disks are one line and leave no file."""
 
 from __future__ import annotations
 
@@ -19,17 +19,12 @@ from diffsim import __main__ as command
 from diffsim.training import load_policy, make_policy_env
 
 
-@pytest.fixture(autouse=True)
-def named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["view.py"])
-
-
 def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one line with which view.py ends, maybe after what it has found."""
     with pytest.raises(SystemExit) as exit:
         view.main(words)
     error = capsys.readouterr().err
-    assert exit.value.code == 2 and error.startswith("view.py: ") and error.count("\n") == 1
+    assert exit.value.code == 2 and error.startswith("script.py: ") and error.count("\n") == 1
     return error
 
 
@@ -121,7 +116,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, hard))
         options = [*"--episodes 3 --seconds 0.5 --size 64 48".split(), *flags.format(tmp_path).split()]
-        assert refused([str(tiny_run), *options], capsys).startswith(f"view.py: cannot write {path}: ")
+        assert refused([str(tiny_run), *options], capsys).startswith(f"script.py: cannot write {path}: ")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_text() == "an older file" and [*tmp_path.iterdir()] == [path]
@@ -132,7 +127,7 @@ def test_missing_matplotlib_is_one_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     line = refusal(lambda: view.main([str(tiny_run), "--plot", "a.png"]), capsys)
-    assert line == "view.py: --plot needs matplotlib: pip install matplotlib"
+    assert line == "script.py: --plot needs matplotlib: pip install matplotlib"
 
 
 @pytest.mark.filterwarnings("error")

@@ -39,6 +39,9 @@ def test_a_step_is_mujoco_s_and_ours(name: peer.Name, share: float, tolerance: f
     assert touching and other.lost() == 0 and not other.nonfinite.any()
     qvel = torch.tensor([0.0, 2e5])[:, None] * torch.eye(env.scene.nv)[0]
     assert (other.step(env.qpos, qvel, action)[0][1] == env.qpos[1]).all() and other.nonfinite.tolist() == [False, True]
+    env.sim = other
+    env.advance(action)
+    assert torch.equal(env.qpos, other._qpos)  # which an environment steps, too
 
 
 def test_the_commands(tmp_path: Path) -> None:

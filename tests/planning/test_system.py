@@ -75,16 +75,6 @@ def test_tangents_of_a_free_joint(rng: np.random.Generator) -> None:
     torch.testing.assert_close(system.retract(x, step)[:, 3:7], turned, rtol=0, atol=1e-12)
 
 
-def test_jacobians_do_not_know_a_quaternions_length(rng: np.random.Generator) -> None:
-    system = task_system("ant")
-    x, u = random_states(system, rng)
-    expected = system.jacobians(x, u)
-    longer = x.clone()
-    longer[:, 3:7] *= 1 + 1e-4
-    atol = 1e-8 * expected.abs().max().item()
-    torch.testing.assert_close(system.jacobians(longer, u), expected, rtol=1e-8, atol=atol)
-
-
 def test_a_trajectory_that_blows_up_stays_where_it_was() -> None:
     system = task_system("cartpole")
     wild, before = torch.tensor([[0.0], [math.nan], [0.0]]).double(), system.steps

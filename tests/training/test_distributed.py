@@ -69,12 +69,11 @@ def test_as_many_processes_resume_as_were_saved(
     directory: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = directory / "shac" / "checkpoint.pt"
-    monkeypatch.setattr(sys, "argv", ["shac.py"])
     line = refusal(lambda: shac.main(["--resume", str(path), "--iterations", "9"]), capsys)
-    assert line == f"shac.py: {path} was trained by 2 processes, not 1"
+    assert line == f"script.py: {path} was trained by 2 processes, not 1"
     monkeypatch.setenv("WORLD_SIZE", "3")
     line = refusal(lambda: shac.main(["--env", "cartpole", "--num-envs", "4"]), capsys)
-    assert line == "shac.py: --num-envs 4 cannot be split evenly among 3 processes"
+    assert line == "script.py: --num-envs 4 cannot be split evenly among 3 processes"
     monkeypatch.setenv("RANK", "1")  # which leaves it to the first to say so
     with pytest.raises(SystemExit) as exit:
         shac.main(["--env", "cartpole", "--num-envs", "4"])

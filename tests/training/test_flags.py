@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import get_type_hints
@@ -27,7 +26,6 @@ from diffsim.training.evaluation import make_env
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["script.py"])
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 

@@ -124,7 +124,7 @@ def test_learners_without_gradient_vary_too(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(Variation, "set", watch)
     flags = "--env hopper --randomise mass=0.5:2 --num-envs 16 --horizon 8 --iterations 2 --redraw 1 --quiet --epochs 1"
-    flags += " --integrator implicit"  # whose kernels with factors other tests compile
+    flags += " --contact mujoco"  # whose kernels with factors other tests compile
     run(ppo_baseline, tmp_path, *flags.split(), "--device", "cpu", "--minibatch-size", "64", "--eval-episodes", "2")
     assert len(seen) == 2 and not torch.equal(*seen)
     mass = FACTORS.index("mass")
