@@ -15,7 +15,6 @@ from scenes import (
     HINGE,
     INTEGRATORS,
     SHOULDER,
-    SOFT,
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
@@ -30,7 +29,6 @@ from scenes import (
     without_ground,
 )
 
-from diffsim.env import DiffEnv
 from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
@@ -169,31 +167,6 @@ def test_limit_lets_go_of_a_joint_that_returns_fast(integrator):
         slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
         spring = -scene.stiffness[1] * h / inertia  # of 1e-300
         np.testing.assert_allclose(slopes, [spring, 1, 3 * h / inertia], rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", SOFT)
-def test_gradcheck_through_policy_reward_and_three_control_steps(name, rng):
-    """With respect to at most 16 numbers, each of which moves every action."""
-    scene, task = task_scene(name), TASKS[name](dtype=torch.float64)
-    qpos, qvel, _ = (torch.tensor(x) for x in acting_states(scene, 2, rng))
-    features = torch.tensor(rng.normal(size=(task.obs_dim, 2))) / task.obs_dim
-    count = min(scene.nu, 8)
-    mixture = torch.tensor(rng.normal(size=(count, scene.nu))) / count**0.5
-
-    def total_reward(policy):
-        # gradcheck holds on to its first graph while it makes others, so each has an environment of its own.
-        env = DiffEnv(task, scene, 2, seed=0, horizon=3, dtype=torch.float64, early_termination=False)
-        # Of a motion to track the reward is zero far from it.
-        obs, total = env.detach() if task.num_memory else env.set_state(qpos, qvel), 0.0
-        for _ in range(3):
-            obs, reward, _, _, _ = env.step(torch.tanh(obs @ features @ policy @ mixture))
-            total = total + reward.sum()
-        return total
-
-    policy = torch.tensor(0.5 * rng.normal(size=(2, count)), requires_grad=True)
-    assert torch.autograd.gradcheck(total_reward, policy, eps=1e-6, atol=1e-6, rtol=1e-6)
-    (gradient,) = torch.autograd.grad(total_reward(policy), policy)
-    assert gradient.norm() > 1e-3
 
 
 def test_a_free_joint_is_three_slides_and_a_ball(rng):

@@ -129,23 +129,6 @@ def test_a_batch_is_the_tensors_batch_in_arrays() -> None:
     np.testing.assert_array_equal(some[~mask], before[torch.from_numpy(~mask)])
 
 
-@pytest.mark.parametrize("block, tolerance", [(None, 1e-4), (1, 0.0)])
-def test_a_batch_agrees_with_single_environments(block: int | None, tolerance: float) -> None:
-    """From equal states: to rounding in a block, and in every bit where one environment is stepped at a time."""
-    batch = gymnasium.make_vec(HOPPERS, num_envs=3, block=block, early_termination=False)
-    batch.reset(seed=0)
-    singles = [gymnasium.make(HOPPER, early_termination=False) for _ in range(3)]
-    for k, single in enumerate(singles):
-        single.reset(seed=0)
-        inner = single.unwrapped.env
-        inner.set_state(*(x[k : k + 1] for x in (batch.unwrapped.qpos, batch.unwrapped.qvel)))
-    for actions in random_actions(12, 3, 3):
-        obs, rewards, *_ = batch.step(actions)
-        for single, action, *expected in zip(singles, actions, obs, rewards, strict=True):
-            for found, wanted in zip(single.step(action), expected, strict=False):
-                np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
-
-
 def test_actions_of_other_types_and_seeds() -> None:
     env = gymnasium.make_vec(HOPPERS, num_envs=2)
     results = []

@@ -15,7 +15,6 @@ from scenes import (
     pendulum,
     robot,
     tendon,
-    tree_scene,
     without,
 )
 
@@ -73,39 +72,6 @@ def test_ball_joint_becomes_three_links():
     np.testing.assert_allclose(scene.motor_bias, [0, -6])
     assert (scene.nq, scene.nv, scene.nball) == (5, 4, 1)
     assert scene.features == {"ball", "slide", "stiffness", "damping", "motor"}
-
-
-@pytest.mark.parametrize("base", ["floating", "fixed", "planar", "ball"])
-def test_links_are_where_mujoco_has_them(base, rng):
-    """Centres of mass of the bodies and of the spheres that touch the ground, in random poses."""
-    scene = tree_scene(base, 3)
-    model, data = scene.mj_model, mujoco.MjData(scene.mj_model)
-    spheres = 0
-    for qpos in free_states(scene, 5, rng)[0]:
-        data.qpos = qpos
-        mujoco.mj_forward(model, data)
-        links = reference.kinematics(scene, qpos, np.zeros(scene.nv))
-        whole = sum(m * (x.position + x.rotation @ c) for m, x, c in zip(scene.mass, links, scene.com, strict=True))
-        np.testing.assert_allclose(whole / scene.mass.sum(), data.subtree_com[0], atol=1e-12)
-        found = {
-            tuple(np.round([*(links[i].position + links[i].rotation @ c), r], 9))
-            for i, c, r in zip(scene.contact_link, scene.contact_position, scene.contact_radius, strict=True)
-        }
-        expected = set()
-        for g in range(1, model.ngeom):
-            axes, size = data.geom_xmat[g].reshape(3, 3), model.geom_size[g]
-            offsets = {
-                mujoco.mjtGeom.mjGEOM_SPHERE: [np.zeros(3)],
-                mujoco.mjtGeom.mjGEOM_CAPSULE: [axes[:, 2] * size[1], -axes[:, 2] * size[1]],
-                mujoco.mjtGeom.mjGEOM_BOX: [
-                    axes @ (size * (i, j, k)) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)
-                ],
-            }[mujoco.mjtGeom(model.geom_type[g])]
-            radius = 0.0 if len(offsets) == 8 else size[0]
-            expected |= {tuple(np.round([*(data.geom_xpos[g] + o), radius], 9)) for o in offsets}
-        assert found <= expected
-        spheres += len(found)
-    assert spheres > 0
 
 
 def test_box_touches_with_its_corners():

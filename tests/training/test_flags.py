@@ -164,17 +164,6 @@ def test_the_command_line_is_before_the_task_is_before_the_class() -> None:
     assert (args.iterations, args.num_envs, args.actor_hidden, args.target_alpha) == (500, 3, (256, 128), 0.995)
 
 
-@pytest.mark.parametrize("env", ["cartpole", "ant"])
-def test_a_switch_can_be_turned_on_and_off_whatever_its_default(env: str) -> None:
-    """Observations are normalized for the ant and not for the cartpole."""
-    for word, value in (("--normalize-obs", True), ("--no-normalize-obs", False)):
-        assert parse(bptt.Args, ["--env", env, word]).normalize_obs == value
-    quiet = parse(shac.Args, ["--env", env, "--quiet", "--no-critic", "--no-cuda-graph"])
-    assert (quiet.quiet, quiet.critic, quiet.cuda_graph) == (True, False, False)
-    for word, value in (("--quiet", True), ("--no-quiet", False)):
-        assert parse(shac.Args, ["--resume", str(save(quiet)), word]).quiet == value
-
-
 def test_the_command_line_is_before_the_checkpoint_is_before_the_task() -> None:
     arguments = "--env cartpole --device cpu --num-envs 5 --gamma 0.9 --stop-after 5 --run-dir there --accuracy fast"
     path = save(parse(shac.Args, arguments.split()))
