@@ -40,9 +40,7 @@ def test_a_terrain_is_refused() -> None:
         System(diffsim.make("hopper", 1, terrain=incline(10.0)))
 
 
-@pytest.mark.parametrize(
-    "name", ["cartpole", "hopper", "ant", "walker", pytest.param("swimmer", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", ["cartpole", "hopper", "ant"])
 def test_jacobians_are_those_of_differences(
     name: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
