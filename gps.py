@@ -1,10 +1,10 @@
 """Guided policy search (Levine and Koltun 2013, https://proceedings.mlr.press/v28/levine13.html).
 
-Trajectory optimisation finds a good trajectory and feedback around it: a guide. Samples of guides lead an
-importance-sampled policy search (Algorithm 1). The planner takes exact Jacobians from the simulator's backward pass.
+An example and feedback around it are a guide. Samples of guides lead an importance-sampled policy search (Algorithm 1),
+which teaches a small network without a clock to act like the example.
 
-    python gps.py --env cartpole --seed 1                   train; writes runs/cartpole__gps__1__<time>/
-    python gps.py --env hopper --demonstration hop.npz      plan from a recorded trajectory
+    python gps.py --env walker --seed 1                     learn from the shipped example; writes runs/<run>/
+    python gps.py --env walker --demonstration my_walk.npz  from another one, best a policy's (docs/gps.md)
     python gps.py --resume <run>/checkpoint.pt              continue an interrupted run exactly
     python gps.py --evaluate <run>/checkpoint.pt            evaluate its best policy
 """
@@ -12,25 +12,25 @@ importance-sampled policy search (Algorithm 1). The planner takes exact Jacobian
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers, nearest_feedback
+from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
-from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration
+from diffsim.planning.demonstration import follow_demonstration, load_demonstration
 from diffsim.planning.ilqr import Plan, ilqr
 from diffsim.planning.lbfgs import maximise
-from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import REAL, System
 from diffsim.tasks import find_task
+from diffsim.tasks.base import ASSETS
 from diffsim.training import distributed, evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
 from diffsim.training.flags import Flags
@@ -38,92 +38,76 @@ from diffsim.training.layers import ObsNormalizer
 from diffsim.training.ranges import Count, Natural, NonNegative, Positive, Repeats
 from diffsim.training.run import Run
 
-# Of feedback: states of a fit; how far a guide teaches, and over which distance guides mix; last steps of a guide that
-# do not teach, as what comes after them costs nothing; the largest action before tanh that is taught
-LESSONS, REACH, BLEND, TAIL, BOUND = 20_000, 0.5, 0.1, 20, 2.0
+TRACKING = 0.05  # weight of the squared deviation from the example's states, in the guides alone (Section 6)
+STORED = 3  # times --active, the samples of S that are kept to choose from
 # fmt: off
-COLUMNS = ("variant", "horizon", "reward", "action_cost", "window", "tracking", "spread", "hidden", "noise", "perturb")
-PER_TASK = {
-    "cartpole":     ("full",     240, "native", 1e-3,  0, 5e-2, 1.0,  50, 0.10, 0.0),
-    "hopper":       ("feedback", 500, "target", 1e-1, 50, 5e-4, 3.0,  50, 0.10, 0.1),
-    "half_cheetah": ("feedback", 500, "target", 1e-1, 50, 5e-4, 3.0,  50, 0.10, 0.1),
-    "ant":          ("feedback", 500, "target", 1e-2, 50, 5e-4, 3.0, 100, 0.10, 0.1),
-    "humanoid":     ("feedback", 500, "target", 1e-1, 50, 5e-4, 30., 200, 0.03, 0.1),
-    "swimmer":      ("feedback", 500, "target", 1e-2, 80, 5e-4, 1.0, 200, 0.01, 0.1),
-    "walker":       ("feedback", 500, "target", 1e-1, 50, 5e-4, 3.0,  50, 0.10, 0.1),
+COLUMNS = ("horizon", "control_dt", "action_cost", "hidden", "noise", "pretraining")
+PER_TASK: dict[str, tuple[float, ...]] = {
+    "cartpole": (240, 1 / 60, 1e-3,  50, 0.10, 1500),
+    "hopper":   (500, 0.02,   1e-1,  50, 0.10,  200),
+    "humanoid": (500, 1 / 60, 1e-1, 200, 0.01,  200),
+    "swimmer":  (500, 0.05,   1e-2,  50, 0.10,  200),
+    "walker":   (500, 0.01,   1e-1,  50, 0.10,  200),
 }
-# The paper's reward: v_x* [m/s], p_y* [m], its weight w_h, and that of the trunk's squared rotation, which is ours
+# The paper's reward: v_x* [m/s], p_y* [m], its weight w_h, and that of the trunk's squared rotation, which is ours.
+# Other tasks have their own.
 TARGETS = {
-    "hopper": (1.5, 1.25, 10.0, 1.0), "half_cheetah": (3.0, 0.8, 1.0, 0.1), "ant": (3.0, 0.75, 10.0, 0.1),
-    "humanoid": (4.2, 1.04, 10.0, 0.1), "swimmer": (2.0, 0.0, 0.0, 0.0), "walker": (1.2, 1.35, 10.0, 10.0),
+    "hopper":   (1.5, 1.25, 10.0, 1.0),
+    "humanoid": (4.2, 1.04, 10.0, 0.1),
+    "swimmer":  (2.0, 0.0,   0.0, 0.0),
+    "walker":   (1.2, 1.35, 10.0, 10.0),
 }
 # fmt: on
+EXAMPLES = ASSETS / "examples"  # by task; benchmarks/gps_examples.py records them
 
 
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults: of a task that is not in the table."""
 
-    MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "imitation", "lbfgs_iterations", "perturb")
+    MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "lbfgs_iterations")
 
-    variant: Literal["full", "feedback"] = "feedback"
-    """full: the paper's algorithm; feedback: its first iterations imitate the guides' feedback (ours; per task)"""
     iterations: Count = 80
     """iterations K of the policy search"""
     horizon: Repeats = 500
     """control steps T of a trajectory (per task)"""
     control_dt: Positive = 1 / 60
-    """seconds of a control step, which the --substeps divide"""
-    reward: Literal["native", "target"] = "native"
-    """the task's own reward, or the paper's: squared errors of velocity and height (Search.reward; per task)"""
+    """seconds of a control step, which the --substeps divide (per task)"""
     action_cost: Positive = 1e-3
-    """w_u: cost of the squared action before tanh, in both rewards (per task)"""
+    """w_u: cost of the squared action before tanh (per task)"""
     demonstration: Path | None = None
-    """start from this trajectory instead of --restarts: an .npz with qpos (T+1, nq), qvel (T+1, nv), action (T, nu)"""
-    restarts: Repeats = 16
-    """random action sequences from which trajectory optimisation starts; the best are kept"""
-    window: Natural = 0
-    """plan by windows of so many control steps, each a fifth of it later than the last (0: at once; per task)"""
-    guides: Repeats = 1
-    """guiding distributions n, from as many of the best trajectories"""
-    screening: Repeats = 40
-    """iLQR iterations of all restarts"""
-    ilqr_iterations: Repeats = 300
-    """further iLQR iterations of the best"""
-    tracking: NonNegative = 5e-4
-    """weight of the squared deviation from the example in the initial guiding distributions (Section 6; per task)"""
-    spread: NonNegative = 3.0
-    """the guides' standard deviation relative to the policy's (0: as of exp(reward), the paper's; per task)"""
+    """the example, or several: .npz of qpos (T+1, nq), qvel (T+1, nv), action (T, nu), a row a step (per task)"""
+    ilqr_iterations: Natural = 0
+    """iterations of trajectory optimisation that improve the example, and can make it unlearnable (docs/gps.md)"""
     guiding_samples: Repeats = 40
     """trajectories drawn from the guiding distributions"""
     adaptive: Natural = 0
     """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
     adaptive_iterations: Repeats = 50
     """iLQR iterations of an adaptation"""
-    perturb: NonNegative = 0.1
-    """the policy's samples start away from the guides', by a normal part of the plan's deviations (per task)"""
     hidden: Repeats = 50
     """units of the policy's hidden layer (per task)"""
     noise: Positive = 0.1
-    """the policy's standard deviation, relative to that of the planned actions over time (per task)"""
+    """the policy's standard deviation, relative to that of the example's actions over time (per task)"""
     pretraining: Repeats = 1500
-    """L-BFGS iterations of the fit to the guiding samples; a tenth of them for feedback's later fits"""
+    """L-BFGS iterations of the fit to the guiding samples (per task)"""
     samples: Repeats = 10
     """trajectories of the policy per iteration"""
     active: Repeats = 100
     """trajectories in the active set S_k"""
-    stored: Repeats = 300
-    """trajectories kept to choose from"""
     lbfgs_iterations: Repeats = 60
     """L-BFGS iterations of each of an iteration's two optimisations"""
-    regularizer_bounds: tuple[NonNegative, NonNegative] = (1e-4, 1.0)
+    regularizer_bounds: tuple[NonNegative, NonNegative] = (1e-6, 1e-2)
     """w_r starts at their geometric mean and is changed by factors of ten between them; 0 0: no regularizer"""
-    imitation: Natural = 20
-    """feedback: the first so many iterations imitate the guides, the others search"""
 
     def task_defaults(self) -> dict[str, Any]:
-        own = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
-        return own | {"eval_every": 10, "eval_episodes": 50}
+        task, own = find_task(self.env), dict[str, Any](eval_every=10, eval_episodes=50)
+        if self.env not in PER_TASK:
+            return own
+        own |= dict(zip(COLUMNS, PER_TASK[self.env], strict=True))
+        preset = task.integration(self.accuracy, self.contact).substeps / task.control_dt
+        substeps = math.ceil(preset * PER_TASK[self.env][1] - 1e-6)
+        return own | {"substeps": substeps, "demonstration": EXAMPLES / f"{self.env}.npz"}
 
     def check(self) -> None:
         super().check()
@@ -133,18 +117,14 @@ class Args(Flags):
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if (seen := find_task(self.env).actor_dim) is not None:
             fail(f"{self.env} shows its actor the first {seen} numbers of an observation, and this policy takes all")
-        if self.reward == "target" and self.env not in TARGETS:
-            fail(f"--reward target is known of {', '.join(TARGETS)}; {self.env} has --reward native")
-        most = max(2, self.guides)
-        least = dict(horizon=2, guiding_samples=most, restarts=self.guides, samples=most)
-        least |= dict(active=self.guiding_samples + self.samples, stored=self.active)
+        if self.demonstration is None:
+            fail(f"--demonstration must be an example for {self.env}; shipped are those of {', '.join(PER_TASK)}")
+        least = dict(horizon=2, guiding_samples=2, samples=2, active=self.guiding_samples + self.samples)
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 fail(f"--{name.replace('_', '-')} must be at least {bound}, not {getattr(self, name)}")
         if self.regularizer_bounds[0] > self.regularizer_bounds[1]:
             fail(f"--regularizer-bounds must be two numbers in order, not {self.regularizer_bounds}")
-        if self.demonstration and self.guides > 1:
-            fail("--demonstration is one trajectory: --guides must be 1")
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------
@@ -154,12 +134,13 @@ class Search:
     """Algorithm 1, line by line, and all that its next iteration depends on."""
 
     guided = True  # whether S begins with the guides
+    starts = 2  # of line 7
     NUMBERS = "w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         self.system = System(env, args.threads or None)
-        self.grounds = [self.system]  # what guides are planned on, --guides on each
+        self.grounds = [self.system]  # of each guide
         self.cost = AfterStep(self.system, lambda x, u: -self.reward(x, u))
         self.rng = torch.Generator().manual_seed(args.seed)  # on the CPU: the same numbers for every device
         self.guides: list[LinearGaussian] = []  # pi_G1 to pi_Gn
@@ -170,21 +151,24 @@ class Search:
         self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
         self.control_steps = self.plan_steps = self.nonfinite = 0
         self.S = SampleSet(self.system, self.network)
-        self.lessons: tuple[Tensor, ...] = ()  # what feedback fits
-        self.student = self.network.theta  # the last of feedback's fits
 
-    def prepare(self, say: Callable[[str], None], file: Callable[[], Path]) -> dict[str, float]:
-        """Lines 1 to 4. Tells its progress, writes the plan to a file as soon as it exists, returns metrics."""
-        args, policy, plans = self.args, self.network, self.plans(say, file)
-        self.plan_return = -sum(plan.cost.min().item() for plan in plans) / len(plans)
+    def prepare(self, say: Callable[[str], None]) -> dict[str, float]:
+        """Lines 1 to 4; returns metrics."""
+        args, policy = self.args, self.network
+        try:
+            examples = self.examples()
+            plans = [self.plan(*example) for example in examples]
+        except ValueError as error:
+            fail(error)
+        self.grounds = [ground for ground, *_ in examples]
+        self.plan_return = -sum(plan.cost.item() for plan in plans) / len(plans)
         policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
-        for ground, plan in zip(self.grounds, plans, strict=True):  # line 1: guides about DDP solutions
-            self.guides += self.guide(ground, plan, say)
-        self.plan_steps = sum(ground.steps for ground in self.grounds)
+        self.guides = [*map(self.guide, self.grounds, plans)]  # line 1: guides about DDP solutions
+        self.plan_steps = sum(ground.steps for ground in {*self.grounds})
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
         policy.standardise(guiding.obs, guiding.u)
-        policy.theta = self.student = self.pretrain(guiding)  # line 3: initialise theta*
+        policy.theta = self.pretrain(guiding)  # line 3: initialise theta*
         self.S.samples = guiding.pick(slice(0))  # line 4: build S from the guides and theta*
         if self.guided:
             self.S.append(guiding, *self.guides)
@@ -192,27 +176,25 @@ class Search:
         own = self.draw(policy.theta, self.S.best)
         self.S.append(own, policy.theta)
         self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
-        say(f"return of guides {mean:.2f} +- {std:.2f}, of the pretrained policy {own.returns.mean():.2f}")
-        if args.variant == "feedback":
-            self.learn(guiding.pick(slice(0, args.samples * len(plans), len(plans))))  # more would outweigh own ones
-            self.learn(own)
-        return self.metrics(own) | {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
+        say(f"returns: example {self.plan_return:.1f}, guides {mean:.1f} +- {std:.1f}, policy {own.returns.mean():.1f}")
+        guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
+        return self.metrics(own) | guides | {"gps/guides_action": guiding.u.tanh().abs().mean().item()}
 
     def iterate(self, iteration: int) -> dict[str, float]:
         """Lines 6 to 17; returns metrics."""
         args, policy, S = self.args, self.network, self.S
         active = S.choose(args.active, args.samples)  # line 6: choose S_k
-        imitating = args.variant == "feedback" and iteration <= args.imitation  # line 7: theta_k <- arg max Phi
-        theta, metrics = self.imitate() if imitating else self.optimise(S.samples.pick(active))
-        source, before = len(S.generators), len(S.samples.u)
+        theta, metrics = self.optimise(S.samples.pick(active))  # line 7: theta_k <- arg max Phi
+        source = len(S.generators)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
         active = torch.cat((active, S.append(new, theta)))
         if iteration <= args.adaptive:
             active = torch.cat((active, self.adapt()))  # line 9: generate adaptive guiding samples
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
-        if better:  # its samples may have been lucky: confirm it with as many again
-            active = torch.cat((active, S.append(self.draw(theta, source))))
-            better, values = self.estimate(theta, active)
+        if better:  # ten samples do not see that one in ten falls: confirm it with more, and with all of theta*'s
+            S.append(self.draw(theta, source, args.guiding_samples))
+            own = (S.samples.source == source) | (S.samples.source == S.best)
+            better, values = self.estimate(theta, torch.cat((active, own.nonzero().flatten())).unique())
         metrics |= values | {"gps/accepted": float(better), "gps/regularizer": self.w_r}
         low, high = args.regularizer_bounds
         if better:  # line 11
@@ -221,51 +203,23 @@ class Search:
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
             S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
-        if imitating:
-            metrics["gps/near"] = self.learn(S.samples.pick(slice(before, None)))
-        S.prune(args.stored)
+        S.prune(STORED * args.active)
         return metrics | self.metrics(new)
 
-    def plans(self, say: Callable[[str], None], file: Callable[[], Path]) -> list[Plan]:
-        """Line 1: a plan for each ground."""
-        plan = self.plan(self.system, say)
-        save_demonstration(self.system, plan.x[0], plan.u[0], file())
-        return [plan]
+    def examples(self) -> list[tuple[System, Tensor, Tensor]]:
+        """Trajectories x (T + 1, nx), u (T, nu), and what each is planned on."""
+        assert (path := self.args.demonstration) is not None
+        return [(self.system, x, u) for x, u in load_demonstration(self.system, path, self.args.horizon)]
 
-    def plan(self, system: System, say: Callable[[str], None], row: int = 0, steps: int = 0) -> Plan:
-        """Trajectory optimisation from random action sequences or a demonstration; the best results.
+    def plan(self, ground: System, x: Tensor, u: Tensor) -> Plan:
+        """Line 1: an example as this simulator follows it, and as iLQR improves it."""
+        return ilqr(ground, self.cost, *follow_demonstration(ground, x, u, TRACKING), self.args.ilqr_iterations)
 
-        Args:
-            row, steps: which trajectory of the demonstration, and so many steps of it (0: all) are followed.
-        """
-        args, T = self.args, self.args.horizon
-
-        def show(iteration: int, costs: Tensor) -> None:
-            if iteration % 10 == 9:
-                say(f"planning, iteration {iteration + 1}: cost {costs.min():.2f}, {len(costs)} trajectories")
-
-        first = min(args.window or T, T)
-        try:
-            if args.demonstration:
-                x, u = load_demonstration(system, args.demonstration, steps or T, row)
-                x, u = follow_demonstration(system, x, u, args.tracking)
-            else:
-                u = starting_actions(args.restarts, first, system.nu, system.control_dt, self.rng).to(system.device)
-                x, u = best_of_random_starts(system, self.cost, system.start()[0], u, args.guides, args.screening, show)
-        except ValueError as error:
-            fail(error)
-        x, u = receding_horizon(system, self.cost, x, u, T, max(first // 5, 1), 8, self.rng)
-        return ilqr(system, self.cost, x, u, args.ilqr_iterations, show=show)
-
-    def guide(self, ground: System, plan: Plan, say: Callable[[str], None]) -> list[LinearGaussian]:
-        """Line 1: controllers about a plan, with Section 6's tracking term."""
-        cost = Sum((self.cost, Tracking(ground, plan.x, plan.u, self.args.tracking)))
-        guides = maximum_entropy_controllers(ground, cost, plan, self.network.sigma, self.args.spread)
-        returns = ", ".join(f"{-cost:.2f}" for cost in plan.cost)
-        say(f"planned in {ground.steps:,} control steps: returns {returns}")
-        for mu in [guide.mu for guide in guides if guide.mu > 1e-2]:
-            say(f"warning: a guide's Q_uu needed mu = {mu:.1e}; it is far from an optimum")
-        return guides
+    def guide(self, ground: System, plan: Plan) -> LinearGaussian:
+        """Line 1: exp(reward) about a plan, times Section 6's tracking term and the policy's noise."""
+        noise = 0.5 / self.network.sigma.square()
+        cost = Sum((self.cost, Tracking(ground, plan.x, plan.u, TRACKING, noise)))
+        return maximum_entropy_controllers(ground, cost, plan)[0]
 
     def sample_guides(self) -> Samples:
         """Line 2. The floor of all later rewards lies as far below the worst step as that one below the best."""
@@ -283,51 +237,25 @@ class Search:
     def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
         """Line 7, from two starts (Section 5): theta*, and theta* fitted to the sample of the highest reward."""
         policy, iterations, top = self.network, self.args.lbfgs_iterations, S.returns.argmax()
-        mixture, reward = S.log_mixture, S.reward / self.scale
-        starts = policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)
-
-        def objective(theta: Tensor) -> Tensor:
-            return sparse(lambda log_pi: phi(log_pi, mixture, reward, self.w_r), policy, theta, S)
-
-        ends = [maximise(objective, theta, iterations) for theta in starts]
-        start = int(ends[1][1] > ends[0][1])
+        value = self.objective(S.log_mixture, S.reward / self.scale)
+        starts = [policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)][: self.starts]
+        ends = [maximise(lambda theta: sparse(value, policy, theta, S), theta, iterations) for theta in starts]
+        start = max(range(len(ends)), key=lambda i: ends[i][1])
         return ends[start][0], {"gps/phi": ends[start][1], "gps/start": start}
 
-    def imitate(self) -> tuple[Tensor, dict[str, float]]:
-        """Line 7 of feedback, in place of Phi: the theta whose mean actions are likeliest under the guides."""
-        index = torch.randperm(len(self.lessons[0]), generator=self.rng)[:LESSONS]
-        obs, u, inverse = (part[index.to(part.device)] for part in self.lessons)
-
-        def objective(theta: Tensor) -> Tensor:
-            e = inverse @ (u - self.network.mean(theta, obs)).unsqueeze(-1)  # counts by what it costs: L L' ~ Q_uu^-1
-            return 1 - (1 + e.square().sum((1, 2))).sqrt().mean()  # beyond a standard deviation linearly
-
-        fit, value = maximise(objective, self.student, self.args.pretraining // 10)
-        self.student = (self.student + fit) / 2  # a fit alone swings with what its policy visited last
-        return self.student, {"gps/lessons": len(u), "gps/error": -value}
-
-    def learn(self, samples: Samples) -> float:
-        """Adds the guides' feedback at the states near them to the lessons; returns the share of these states."""
-        x = samples.x[:, :-1].flatten(0, 1)
-        guides = [guide.first(max(len(guide.u) - TAIL, 1)) for guide in self.guides]
-        # By the step that looks most like a state, as the policy does not see the time
-        u, L, distance = nearest_feedback(self.system, guides, x, self.network.obs_std, BOUND, BLEND)
-        near = distance <= REACH  # far away feedback means nothing
-        new = samples.obs.flatten(0, 1)[near], u[near], torch.linalg.inv(L[near])
-        self.lessons = tuple(map(torch.cat, zip(self.lessons, new, strict=True))) if self.lessons else new
-        return near.double().mean().item()
+    def objective(self, mixture: Tensor, reward: Tensor) -> Callable[[Tensor], Tensor]:
+        """Phi () of log pi (m, T), for samples of this mixture and these rewards (m, T)."""
+        return lambda log_pi: phi(log_pi, mixture, reward, self.w_r)
 
     def adapt(self) -> Tensor:
-        """Line 9: guides of exp(reward / eta) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
+        """Line 9: guides of exp(reward) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
         args, system, policy, before = self.args, self.system, self.network, self.system.steps
         guides, theta = self.adapted or self.guides, policy.theta
         x, u = torch.stack([g.x for g in guides]), torch.stack([g.u for g in guides])
-        eta = torch.stack([g.eta for g in self.guides]).mean()
-        surprisal = Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma, eta.item())
+        surprisal = Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma)
         cost = Sum((self.cost, surprisal))
         plan = ilqr(system, cost, x, u, args.adaptive_iterations, mu=1e-3)
-        made = maximum_entropy_controllers(system, cost, plan, policy.sigma, 1.0)
-        self.adapted = [g._replace(L=g.L * (eta / g.eta).sqrt(), eta=eta) for g in made]  # not a temperature of its own
+        self.adapted = maximum_entropy_controllers(system, cost, plan)
         self.plan_steps += system.steps - before
         return self.S.append(self.follow(self.adapted, args.samples, len(self.S.generators)), *self.adapted)
 
@@ -349,7 +277,7 @@ class Search:
 
     def metrics(self, samples: Samples) -> dict[str, float]:
         objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
-        objective["charts/episodic_return"] = samples.native.sum(1).mean()
+        objective["charts/episodic_return"] = self.system.reward(samples.x[:, 1:], samples.u).sum(1).mean()
         metrics = {name: value.item() for name, value in objective.items()}
         return metrics | {"sim/nonfinite": self.nonfinite, "sim/model_steps": self.plan_steps}
 
@@ -358,7 +286,7 @@ class Search:
     def reward(self, x: Tensor, u: Tensor) -> Tensor:
         """What is optimised (Section 6): reward (...) of u (..., nu), which led to x (..., nx)."""
         system, cost = self.system, self.args.action_cost * u.square().sum(-1)
-        if self.args.reward == "native":
+        if self.args.env not in TARGETS:
             return system.reward(x, u) - cost
         target_velocity, target_height, height_weight, attitude_weight = TARGETS[self.args.env]
         if system.scene.floating:
@@ -377,9 +305,8 @@ class Search:
         """What the estimator needs of trajectories; a diverged step earns the floor, so that it does not rule Phi."""
         self.nonfinite += int((~finite[:, -1]).sum())
         reward = torch.where(finite, self.reward(x[:, 1:], u), self.floor).clamp(min=self.floor)
-        native = torch.where(finite, self.system.reward(x[:, 1:], u), 0.0)
         sources, log_q = torch.full((len(u),), source, device=u.device), u.mT[:, :0]
-        return Samples(x, self.system.observe(x[:, :-1]), u, reward, native, sources, log_q)
+        return Samples(x, self.system.observe(x[:, :-1]), u, reward, sources, log_q)
 
     def roll_out(self, system: System, theta: Tensor, noise: Tensor, start: Tensor, source: int = -1) -> Samples:
         """Trajectories of a policy with standard normal noise (m, T, nu), from start (1 or m, nx)."""
@@ -389,26 +316,18 @@ class Search:
 
         return self.measure(*system.rollout(start.expand(len(noise), -1), self.args.horizon, act), source)
 
-    def draw(self, theta: Tensor, source: int = -1) -> Samples:
-        """Trajectories of a policy, --samples of them; those without a source do not join S."""
-        count = self.args.samples
+    def draw(self, theta: Tensor, source: int = -1, count: int = 0) -> Samples:
+        """So many trajectories of a policy, by default --samples; those without a source do not join S."""
+        count = count or self.args.samples
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
-        return self.roll_out(self.system, theta, noise, self.starts(count), source)
-
-    def starts(self, count: int) -> Tensor:
-        """(count, nx) near the guides' start. They have no part in the importance weights."""
-        system, x = self.system, torch.cat([guide.x[:-1] for guide in self.guides])
-        if not self.args.perturb:
-            return x[:1].expand(count, -1)
-        away = torch.randn(count, system.nd, generator=self.rng, dtype=REAL).to(x.device)
-        return system.retract(x[:1].expand(count, -1), self.args.perturb * system.difference(x, x[:1]).std(0) * away)
+        return self.roll_out(self.system, theta, noise, self.guides[0].x[:1], source)
 
     def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
         """So many trajectories of guides in equal shares, numbered from the first source on."""
         self.control_steps += count * self.args.horizon
         shares = [self.noise(len(range(i, count, len(guides)))) for i in range(len(guides))]
-        grounds = [ground for ground in self.grounds for _ in range(self.args.guides)]
-        parts = [self.measure(*g.sample(grounds[i], shares[i]), first + i) for i, g in enumerate(guides)]
+        each = enumerate(zip(guides, self.grounds, shares, strict=True), first)
+        parts = [self.measure(*guide.sample(ground, noise), source) for source, (guide, ground, noise) in each]
         return Samples(*map(torch.cat, zip(*parts, strict=True)))
 
     @torch.no_grad()
@@ -421,7 +340,8 @@ class Search:
         (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
         fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & self.args.early_termination).int()
         alive = fallen.cumsum(1) - fallen == 0
-        returns, lengths, forward, speed = (S.native * alive).sum(1), alive.sum(1), system.task.forward_column, None
+        returns, lengths = (system.reward(S.x[:, 1:], S.u) * alive).sum(1), alive.sum(1)
+        forward, speed = system.task.forward_column, None
         if forward is not None:
             x = S.x[..., forward]
             distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
@@ -429,6 +349,7 @@ class Search:
         qpos, action = S.x[:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
         others = dict(without_noise=without_noise, plan=self.plan_return, guides=self.guide_return[0])
         others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
+        others |= dict(worst=S.returns.min().item(), action=S.u.tanh().abs().mean().item())
         return Evaluation(returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
 
     @property
@@ -438,16 +359,14 @@ class Search:
 
     def state_dict(self) -> dict[str, Any]:
         state = {name: getattr(self, name) for name in self.NUMBERS} | {"rng": self.rng.get_state()}
-        guides, adapted = ([tuple(guide) for guide in guides] for guides in (self.guides, self.adapted))
-        return state | {"guides": guides, "adapted": adapted, "lessons": self.lessons, "student": self.student}
+        return state | {"guides": packed(self.guides), "adapted": packed(self.adapted)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         for name in self.NUMBERS:
             setattr(self, name, state[name])
-        device = self.system.device
         for name in ("guides", "adapted"):
-            setattr(self, name, [LinearGaussian(*(t.to(device) for t in guide)) for guide in state[name]])
-        self.lessons, self.student = tuple(t.to(device) for t in state["lessons"]), state["student"].to(device)
+            setattr(self, name, unpacked(state[name], self.system.device))
+        self.grounds = [self.system] * len(self.guides)
         self.rng.set_state(state["rng"])
 
 
@@ -491,7 +410,6 @@ class Samples(NamedTuple):
     obs: Tensor  # (m, T, obs_dim) on which u acted
     u: Tensor  # (m, T, nu)
     reward: Tensor  # (m, T), bounded from below
-    native: Tensor  # (m, T) the task's own
     source: Tensor  # (m,) index of the generator it came from
     log_q: Tensor  # (m, n, T) log density of its prefixes under each generator
 
@@ -549,27 +467,33 @@ class SampleSet:
         return score.argsort(descending=True, stable=True)[:active].sort().values
 
     def prune(self, stored: int) -> None:
-        """Keeps so many: the initial guides', those of theta*, the best-scored others; drops generators without any."""
-        if len(self.samples.u) <= stored:
-            return
-        score = self.score() + 2e9 * (self.samples.source < self.initial) + 1e9 * (self.samples.source == self.best)
-        kept = self.samples.pick(score.argsort(descending=True, stable=True)[:stored].sort().values)
-        used = torch.tensor(sorted({*kept.source.tolist(), self.best}), device=score.device)
+        """Keeps so many: theta*'s, the initial guides', the best-scored others; drops generators without any."""
+        kept = self.samples.pick(self.choose(stored, stored))
+        used = torch.tensor(sorted({*kept.source.tolist(), self.best}), device=kept.u.device)
         index = torch.full((len(self.generators),), -1, device=used.device)
         index[used] = torch.arange(len(used), device=used.device)
         self.samples = kept._replace(source=index[kept.source], log_q=kept.log_q[:, used])
         self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
 
     def state_dict(self) -> dict[str, Any]:
-        generators = [tuple(g) if isinstance(g, LinearGaussian) else (g,) for g in self.generators]
-        return dict(samples=tuple(self.samples), generators=generators, best=self.best, initial=self.initial)
+        return dict(
+            samples=tuple(self.samples), generators=packed(self.generators), best=self.best, initial=self.initial
+        )
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        device = self.system.device
-        self.samples = Samples(*(tensor.to(device) for tensor in state["samples"]))
-        stored = ([tensor.to(device) for tensor in generator] for generator in state["generators"])
-        self.generators = [LinearGaussian(*tensors) if len(tensors) > 1 else tensors[0] for tensors in stored]
+        self.samples = Samples(*(tensor.to(self.system.device) for tensor in state["samples"]))
+        self.generators = unpacked(state["generators"], self.system.device)
         self.best, self.initial = state["best"], state["initial"]
+
+
+def packed(generators: Sequence[LinearGaussian | Tensor]) -> list[tuple[Tensor, ...]]:
+    """As a checkpoint holds them."""
+    return [tuple(g) if isinstance(g, LinearGaussian) else (g,) for g in generators]
+
+
+def unpacked(stored: list[tuple[Tensor, ...]], device: torch.device) -> list[Any]:
+    moved = ([tensor.to(device) for tensor in tensors] for tensors in stored)
+    return [LinearGaussian(*tensors) if len(tensors) > 1 else tensors[0] for tensors in moved]
 
 
 # The policy -----------------------------------------------------------------------------------------------------------
@@ -636,7 +560,7 @@ def train(args: Args, learner: type[Search] = Search) -> None:
     run = Run(args)
     search = run.restore(learner(args, run.eval_env))
     if run.iteration == 0:
-        run.log(search.prepare(run.message, lambda: run.directory / "plan.npz"), search.control_steps)
+        run.log(search.prepare(run.message), search.control_steps)
     for iteration in run:  # lines 5 to 18
         before = search.control_steps
         run.log(search.iterate(iteration), search.control_steps - before)

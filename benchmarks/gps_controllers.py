@@ -1,22 +1,19 @@
 """Policies of guided policy search beside their guides on terrain (Figures 3 to 5).
 
-    python benchmarks/gps_controllers.py runs/gps/walker__feedback-short__1 runs/gps/humanoid__spread-3__1
+    python benchmarks/gps_controllers.py runs/gps/walker__incline__1 runs/gps/walker__rough__1
 
-Takes runs of gps.py and gps_variants.py in folders TASK__CASE__SEED. DDP is the guide's controller by time, TBDP that
-of the step that looks most alike. They and the policy get heights over the ground, and none sees the terrain.
+Takes runs of gps.py and gps_variants.py in folders TASK__CASE__SEED. DDP is the first guide's controller by time, TBDP
+that of the step of all guides that looks most alike. None sees the terrain. A trajectory counts as walked if the robot
+stands to its end (the root never sinks FALL below its start's height over the ground) and comes at least FAR as far as
+the guides.
 
-- walked: the share that stands to the end (the root never sinks FALL below its start's height over the
-  ground) and comes at least 90 % as far as the guides. A slope or step begins at ten places 10 cm apart, so that a
-  robot meets it in ten phases of its gait; rough ground has ten seeds.
-- seconds, of humanoids, also from perturbed starts: until the task says that it fell, at most 8.
-
-Writes gps_controllers.csv and, with --update-results, the tables of docs/gps_terrain.md.
+Writes gps_controllers.csv and, with --update-results, the table of docs/gps.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from statistics import mean
 
@@ -26,28 +23,24 @@ from gps_variants import CASES, Ground, VariantArgs, gps, named_terrains
 from tables import Row, grouped, markdown, numbers
 from torch import Tensor
 
-from diffsim.planning import REAL, nearest_feedback
 from diffsim.training import checkpoint
 from diffsim.training.evaluation import make_env
 
 Act = Callable[[int, Tensor], Tensor]
-Found = tuple[Tensor, Tensor, Tensor]  # x (m, T + 1, nx), u (m, T, nu) and which steps are finite (m, T)
-Trial = tuple[str, float, Callable[[Act], Found]]  # kind, size, and the trajectories of a controller
 Rows = list[dict[str, str]]
 
-KEY = ("env", "variant", "seed", "kind", "size", "controller")
+KEY = ("env", "variant", "seed", "kind", "terrain", "controller")
 CONTROLLERS = ("policy", "ddp", "tbdp")
-COUNT = 20  # trajectories of each size, but over terrain
-PLACES, SEEDS = [0.5 + 0.1 * i for i in range(10)], range(1000, 1010)  # of slopes and steps [m], of rough ground
-FALL, FAR, SECONDS = 0.45, 0.9, 8.0  # m; of the guides' way; s
-TERRAINS: dict[str, tuple[str, Sequence[float]]] = {  # names as named_terrains takes them, and sizes
-    "incline (degrees)": ("incline:{size:g}:{place:g}", (-10.0, -5.0, -2.5, 0.0, 2.5, 5.0, 10.0)),
-    "step (cm)": ("step:{size:g}:{place:g}", (-5.0, -2.0, 2.0, 5.0)),
-    "rough, 1 m (degrees)": ("rough:{size:g}:1:{seed}:{start}", (5.0, 10.0)),
-    "rough, 2 m (degrees)": ("rough:{size:g}:2:{seed}:{start}", (5.0, 10.0)),
-}
-RUNNING = (0.05, 0.1, 0.2), (3.0, 5.0, 10.0)  # a humanoid's perturbed starts, and degrees of rough ground
-GROUNDS = {"feedback-short": "level", "feedback-slope": "one slope", "feedback-guides": "11 terrains"}  # of training
+FALL, FAR = 0.45, 0.9  # m; of the guides' way
+COUNT = 10  # trajectories over each terrain, from the same start with the policy's noise
+
+
+def terrains(degrees: int) -> dict[str, list[str]]:
+    """What is walked over: an incline of so many degrees that begins at ten places, and four rough grounds."""
+    return {
+        f"incline of {degrees}°": [f"incline:{degrees}:{0.5 * place}" for place in range(1, 11)],
+        f"rough ground of {degrees}°": [f"rough:{degrees}:{size}:{seed}" for size in (1, 2) for seed in (1001, 1002)],
+    }
 
 
 def load_search(path: Path) -> gps.Search:
@@ -61,110 +54,74 @@ def load_search(path: Path) -> gps.Search:
 
 
 def controllers(search: gps.Search) -> dict[str, Act]:
+    """Their mean actions at step t, of states (m, nx)."""
     system, policy, guide = search.system, search.network, search.guides[0]
     return {
         "policy": lambda _, x: policy.mean(policy.theta, system.observe(x)),
         "ddp": lambda t, x: guide.mean(system, t, x),
-        "tbdp": lambda _, x: nearest_feedback(system, search.guides, x, policy.obs_std)[0],
+        "tbdp": nearest(search),
     }
 
 
-# Trials ---------------------------------------------------------------------------------------------------------------
+def nearest(search: gps.Search) -> Act:
+    """The feedback of the guides' step whose observation is nearest, in deviations of observations.
+
+    The place along x does not count: it is not observed, and a guide's is that of its own terrain.
+    """
+    system, scale = search.system, search.network.obs_std
+    path, u, K = (torch.cat(parts) for parts in zip(*((g.x[:-1], g.u, g.K) for g in search.guides), strict=True))
+    looks = system.observe(path) / scale
+
+    def act(_: int, x: Tensor) -> Tensor:
+        own = system.observe(x) / scale
+        t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").argmin(1)
+        away = system.difference(x, path[t])
+        away[:, system.task.forward_column] = 0.0
+        return u[t] + (K[t] @ away.unsqueeze(-1)).squeeze(-1)
+
+    return act
 
 
-def starts(search: gps.Search, sizes: Sequence[float], steps: int) -> Iterator[Trial]:
-    """Starts differ by a normal vector of a size times the standard deviation of each coordinate over the plan."""
-    system, path = search.system, search.guides[0].x[:-1]
-    draws = torch.randn(COUNT, system.nd, generator=torch.Generator().manual_seed(gps.SEED), dtype=REAL)
-    away = system.difference(path, path[:1]).std(0) * draws
-    for size in sizes:
-        start = system.retract(path[:1].expand(COUNT, -1), size * away)
-        yield "start", size, partial(system.rollout, start, steps)
-
-
-def over(search: gps.Search, steps: int, terrain: str, size: float, count: int = 10, start: float = 0.5) -> Trial:
-    places = list(zip(PLACES, SEEDS, strict=False))[:count]
-    name = TERRAINS[terrain][0]
-    names = [name.format(size=size, place=place, seed=seed, start=start) for place, seed in places]
-    system, x = Ground(search.env, named_terrains(*names), 1), search.guides[0].x[:1].expand(len(names), -1)
-    return terrain, size, partial(system.rollout, x, steps)
-
-
-def walking(search: gps.Search) -> Iterator[Trial]:
-    for terrain, (_, sizes) in TERRAINS.items():
-        yield from (over(search, search.args.horizon, terrain, size) for size in sizes)
-
-
-def running(search: gps.Search) -> Iterator[Trial]:
-    steps, (sizes, degrees) = min(round(SECONDS / search.system.control_dt), search.args.horizon), RUNNING
-    yield from starts(search, sizes, steps)
-    for terrain in [*TERRAINS][2:]:
-        yield from (over(search, steps, terrain, size, 4, 1.0) for size in degrees)
-
-
-# Measures -------------------------------------------------------------------------------------------------------------
-
-
-def walked(search: gps.Search, x: Tensor, u: Tensor, finite: Tensor) -> Tensor:
-    height = 2 if search.system.scene.floating else 1
+def walked(search: gps.Search, x: Tensor, finite: Tensor) -> Tensor:
+    """(m,) of trajectories x (m, T + 1, nx)."""
+    height, forward = 2 if search.system.scene.floating else 1, search.system.task.forward_column
     up = (x[:, 1:, height] > x[:, :1, height] - FALL) & finite
-    far = FAR * mean((guide.x[-1, 0] - guide.x[0, 0]).item() for guide in search.guides)
-    return up.all(1) & (x[:, -1, 0] - x[:, 0, 0] >= far)
-
-
-def seconds(search: gps.Search, x: Tensor, u: Tensor, finite: Tensor) -> Tensor:
-    system = search.system
-    up = ~system.task.terminated(system.observe(x[:, 1:])) & finite
-    return up.cumprod(1).sum(1) * system.control_dt
-
-
-MEASURES = {"walked": (walking, walked), "seconds": (running, seconds)}
+    way = mean((guide.x[-1, forward] - guide.x[0, forward]).item() for guide in search.guides)
+    return up.all(1) & (x[:, -1, forward] - x[:, 0, forward] >= FAR * way)
 
 
 def measure(path: Path) -> Iterator[Row]:
-    """Of a run: one row for each trial and controller."""
+    """Of a run: one row for each terrain and controller."""
     path = checkpoint_of(path)
     about, search = dict(zip(KEY, path.parent.name.split("__"), strict=False)), load_search(path)
-    name = "seconds" if about["env"] == "humanoid" else "walked"
-    trials, value = MEASURES[name]
-    for kind, size, roll in trials(search):
-        for controller, act in controllers(search).items():
-            row = about | dict(kind=kind, size=f"{size:g}", controller=controller)
-            yield row | {name: value(search, *roll(act)).double().mean().item()}
+    steps, sigma = search.args.horizon, search.network.sigma
+    noise = sigma * search.noise(COUNT, torch.Generator().manual_seed(gps.SEED))
+    start, acts = search.guides[0].x[:1].expand(COUNT, -1), controllers(search)
+    for kind, names in terrains(3 if about["env"] == "humanoid" else 10).items():
+        for terrain, (name, act) in product(names, acts.items()):
+            ground = Ground(search.env, named_terrains(terrain), 1)
+            x, _, finite = ground.rollout(start, steps, lambda t, x, act=act: act(t, x) + noise[:, t])  # type: ignore[misc]
+            share = walked(search, x, finite).double().mean().item()
+            yield about | dict(kind=kind, terrain=terrain, controller=name, walked=share)
 
 
-# Tables ---------------------------------------------------------------------------------------------------------------
-
-
-def beside(rows: Rows, column: str, measure: str, form: str) -> list[Row]:
-    """A line for each trial, a column for each of `column`: means over seeds, policy / DDP / TBDP."""
+def table(rows: Rows) -> list[Row]:
+    """A line for each kind of terrain, a column for each training: means over places, seeds; policy / DDP / TBDP."""
     result = list[Row]()
-    for (trial,), here in grouped((row for row in rows if row.get(measure)), "trial").items():
-        line: dict[str, object] = {"trial": trial}
-        for (name,), own in grouped(here, column).items():
+    for (kind,), here in grouped(rows, "kind").items():
+        line: dict[str, object] = {"terrain": kind}
+        for (name,), own in grouped(here, "variant").items():
             kinds = grouped(own, "controller")
-            line[name] = " / ".join(f"{mean(numbers(kinds[each,], measure)):{form}}" for each in CONTROLLERS)
+            line[name] = " / ".join(f"{mean(numbers(kinds[each,], 'walked')):.0%}" for each in CONTROLLERS)
         result.append(line)
     return result
-
-
-def printed(rows: Rows) -> dict[str, list[Row]]:
-    """The tables by their names in the page."""
-    rows = [row | {"trial": f"{row['kind']} {row['size']}"} for row in rows]
-    walks = [row | {"trained on": name} for case, name in GROUNDS.items() for row in rows if row["variant"] == case]
-    walks += [row | {"trial": "all"} for row in walks]
-    return {
-        "gps terrain": beside(walks, "trained on", "walked", ".0%"),
-        "gps humanoid": beside(rows, "variant", "seconds", ".1f"),
-    }
 
 
 def main(args: CheckpointFlags) -> None:
     for path in args.measured:
         for row in measure(path):
             args.keep("gps_controllers", row, KEY)
-    for name, table in printed(args.read("gps_controllers")).items():
-        args.publish(name, markdown(table), "gps_terrain.md", everywhere=True)
+    args.publish("gps terrain", markdown(table(args.read("gps_controllers"))), "gps.md", everywhere=True)
 
 
 if __name__ == "__main__":

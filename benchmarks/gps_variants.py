@@ -1,11 +1,10 @@
-"""Guided policy search as the paper compares it (Figure 2), and over terrains, with a plan and guides on each.
+"""Guided policy search as the paper compares it (Figure 2), and over terrains, with an example and guides on each.
 
-    python benchmarks/gps_variants.py --case dagger --env hopper --demonstration benchmarks/plans/hopper_500.npz
-    python benchmarks/gps_variants.py --env walker --horizon 160 --terrain level incline:10 step:-5
+    python benchmarks/gps_variants.py --case dagger --env hopper
+    python benchmarks/gps_variants.py --env walker --terrain incline:10 --demonstration slope.npz
 
-Takes the flags of gps.py, too. --resume and --evaluate take the checkpoints of this script. A plan.npz of several
-terrains is a demonstration for each of them; on another terrain, planning starts with the first window of its first
-trajectory.
+Takes the flags of gps.py, too. --resume and --evaluate take the checkpoints of this script. A demonstration of several
+terrains says by `terrain` which trajectory is over which one.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -24,16 +22,18 @@ from tables import ROOT
 from torch import Tensor
 
 from diffsim import DiffEnv
-from diffsim.planning import REAL, Plan, System, save_demonstration
+from diffsim.planning import REAL, System
 from diffsim.robot.scene import Array, Scene, TerrainError
-from diffsim.terrain import Elevation, incline, root, rough, step
+from diffsim.terrain import Elevation, incline, rough, step
 from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import Evaluation
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
 
-Case = Literal["guided", "unregularized", "nonguided", "policy-gradient", "dagger"]
+Ablation = Literal["one-start", "unregularized", "effective-samples", "nonguided", "restart", "single-example"]
+Case = Literal["guided", Ablation, "policy-gradient", "dagger"]
+LEAST = 5.0  # effective samples: half of what the policy draws
 MAKERS: dict[str, Callable[..., Array]] = {
     "level": lambda: incline(0.0),
     "incline": incline,
@@ -53,16 +53,15 @@ class VariantArgs(gps.Args):
     """train on each, with its own guides: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
 
     def task_defaults(self) -> dict[str, Any]:
-        paper = {} if self.case == "guided" else {"variant": "full", "perturb": 0.0}
         bounds = {"regularizer_bounds": (0.0, 0.0)} if self.case == "unregularized" else {}
-        return super().task_defaults() | paper | bounds
+        return super().task_defaults() | bounds
 
     def check(self) -> None:
         super().check()
         if not self.terrain:
             fail("--terrain needs at least one name: level, incline:DEGREES, step:CM or rough:DEGREES")
         for name in ("samples", "guiding_samples"):
-            if getattr(self, name) < (least := self.guides * len(self.terrain)):
+            if getattr(self, name) < (least := len(self.terrain)):
                 fail(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
         if self.adaptive and len(self.terrain) > 1:
             fail("--adaptive takes one --terrain")
@@ -100,8 +99,7 @@ def named_terrains(*names: str) -> Array:
 class Ground(System):
     """A robot over a terrain (K, 2), or trajectory i of a rollout over number i % M of (M, K, 2).
 
-    The root's height in a state is that over the ground below. Feedback by similarity does not heed its place along x,
-    as a guide's is that of its own terrain.
+    The root's height in a state is that over the ground below.
     """
 
     def __init__(self, env: DiffEnv, terrain: Array, threads: int | None = None) -> None:
@@ -110,7 +108,6 @@ class Ground(System):
         self.profiles = scene.terrain
         self._elevations: dict[int, Elevation] = {}
         super().__init__(env, threads, scene)
-        self.counts[: self.nv] -= torch.tensor(root(scene)[1][: self.nv]).to(self.counts)
 
     def copies(self, count: int, first: int = 0) -> Scene:
         """The scene of so many trajectories from number `first` on."""
@@ -151,26 +148,21 @@ class Search(gps.Search):
 
     def __init__(self, args: VariantArgs, env: DiffEnv) -> None:
         super().__init__(args, env)
-        self.grounds = [self.over(name) for name in args.terrain]
-        self.system = self.over(*args.terrain) if len(self.grounds) > 1 else self.grounds[0]
+        if args.terrain != ("level",):
+            self.system = self.over(*args.terrain)
 
-    def over(self, *names: str) -> System:
-        return (
-            self.system if names == ("level",) else Ground(self.env, named_terrains(*names), self.args.threads or None)
-        )
+    def over(self, *names: str) -> Ground:
+        return Ground(self.env, named_terrains(*names), self.args.threads or None)
 
-    def plans(self, say: Callable[[str], None], file: Callable[[], Path]) -> list[Plan]:
-        args, known, plans = self.args, list[str](), list[Plan]()
-        if args.demonstration and args.demonstration.is_file():
-            with np.load(args.demonstration) as example:
-                known = example["terrain"].tolist() if "terrain" in example else ["level"]
-        for name, ground in zip(args.terrain, self.grounds, strict=True):
-            say(f"planning over {name}")
-            start = (known.index(name), args.horizon) if name in known else (0, args.window or args.horizon)
-            plans.append(self.plan(ground, say, *start))
-            x, u = (torch.stack([getattr(plan, part)[0] for plan in plans]) for part in "xu")
-            save_demonstration(self.system, x, u, file(), terrain=args.terrain[: len(plans)])
-        return plans
+    def examples(self) -> list[tuple[System, Tensor, Tensor]]:
+        path, trajectories = self.args.demonstration, [(x, u) for _, x, u in super().examples()]
+        assert path is not None
+        with np.load(path) as example:
+            known = example["terrain"].tolist() if "terrain" in example else ["level"] * len(trajectories)
+        if missing := [name for name in self.args.terrain if name not in known]:
+            fail(f"{path} has no trajectory over {missing[0]}, only over {', '.join(dict.fromkeys(known))}")
+        grounds = {name: self.over(name) if len(self.args.terrain) > 1 else self.system for name in self.args.terrain}
+        return [(grounds[name], *pair) for name, pair in zip(known, trajectories, strict=True) if name in grounds]
 
     def evaluate(self) -> Evaluation:
         found = super().evaluate()
@@ -184,10 +176,46 @@ class Search(gps.Search):
 # The variants ---------------------------------------------------------------------------------------------------------
 
 
+class OneStart(Search):
+    """Line 7 from theta* alone."""
+
+    starts = 1
+
+
+class EffectiveSamples(Search):
+    """Tang and Abbeel 2010: in place of the regularizer a bound on the effective samples of each step (footnote 4)."""
+
+    def objective(self, mixture: Tensor, reward: Tensor) -> Callable[[Tensor], Tensor]:
+        def value(log_pi: Tensor) -> Tensor:
+            effective = 1 / gps.log_weights(log_pi, mixture).softmax(0).square().sum(0)
+            return gps.phi(log_pi, mixture, reward, 0.0) - (LEAST - effective).clamp(min=0).square().sum()
+
+        return value
+
+
 class NonGuided(Search):
     """S begins without the guides; they only pretrain the policy."""
 
     guided = False
+
+
+class Restart(NonGuided):
+    """The policy's samples start at any state of the guides, which are no guides otherwise."""
+
+    def draw(self, theta: Tensor, source: int = -1, count: int = 0) -> gps.Samples:
+        count = count or self.args.samples
+        x = torch.cat([guide.x[:-1] for guide in self.guides])
+        start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
+        self.control_steps += count * self.args.horizon
+        return self.roll_out(self.system, theta, self.noise(count), start, source)
+
+
+class SingleExample(NonGuided):
+    """Pretrained on the example alone, without samples about it."""
+
+    def pretrain(self, guiding: gps.Samples) -> Tensor:
+        obs = self.system.observe(torch.stack([guide.x[:-1] for guide in self.guides]))
+        return super().pretrain(guiding._replace(obs=obs, u=torch.stack([guide.u for guide in self.guides])))
 
 
 class PolicyGradient(NonGuided):
@@ -219,8 +247,17 @@ class DAgger(NonGuided):
         return self.metrics(new)
 
 
-CASES: dict[Case, type[Search]] = {"guided": Search, "unregularized": Search, "nonguided": NonGuided}
-CASES |= {"policy-gradient": PolicyGradient, "dagger": DAgger}
+CASES: dict[Case, type[Search]] = {
+    "guided": Search,
+    "one-start": OneStart,
+    "unregularized": Search,
+    "effective-samples": EffectiveSamples,
+    "nonguided": NonGuided,
+    "restart": Restart,
+    "single-example": SingleExample,
+    "policy-gradient": PolicyGradient,
+    "dagger": DAgger,
+}
 
 main = script(
     VariantArgs,

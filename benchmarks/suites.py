@@ -28,6 +28,7 @@ READ: dict[str, Callable[[Sequence[float]], float]] = {
     "last": lambda values: values[-1],
     "mean": mean,
     "most": max,
+    "sum": sum,
 }
 SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "mean": lambda values: f"{mean(values):.0f}",

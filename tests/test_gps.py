@@ -12,23 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import assert_refuses, assert_same, refusal, run
+from learners import assert_refuses, assert_same, read_progress, run
 from torch import Tensor
 
 import diffsim
 import gps
-from diffsim.planning import LinearGaussian, load_demonstration
+from diffsim.planning import LinearGaussian, System, save_demonstration
 from diffsim.training import evaluate, load_policy, make_policy_env, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env
 from gps import log_mixture, phi, sparse
 
 SMALL = (
-    "--env cartpole --horizon 30 --restarts 3 --screening 4 --ilqr-iterations 20 --pretraining 40 --hidden 8 "
-    "--guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 4 "
-    "--lbfgs-iterations 5 --eval-every 2 --eval-episodes 3 --quiet"
+    "--env cartpole --horizon 30 --pretraining 40 --hidden 8 --guiding-samples 8 --samples 4 --active 16 "
+    "--iterations 4 --lbfgs-iterations 5 --eval-every 2 --eval-episodes 3 --quiet"
 ).split()
-TINY = [*SMALL, *"--horizon 8 --ilqr-iterations 3 --pretraining 5 --iterations 2 --eval-episodes 1".split()]
+TINY = [*SMALL, *"--horizon 8 --pretraining 5 --iterations 2 --eval-episodes 1".split()]
 
 
 def normal(rng: np.random.Generator, *shape: int) -> Tensor:
@@ -46,7 +45,7 @@ def make_search(env: str, flags: str = "") -> gps.Search:
 
 
 def a_policy(rng: np.random.Generator, env: str = "cartpole") -> tuple[gps.Policy, Tensor]:
-    policy = make_search(env, "--hidden 5").network
+    policy = make_search(env, "--demonstration none.npz --hidden 5").network
     nu, inputs = len(policy.sigma), len(policy.observed)
     policy.obs_mean, policy.obs_std = normal(rng, inputs), 1 + normal(rng, inputs).abs()
     policy.u_std, policy.sigma = torch.full((nu,), 2.0).double(), torch.full((nu,), 0.5).double()
@@ -81,7 +80,7 @@ def test_gradient_of_phi_is_that_of_appendix_a(w_r: float, rng: np.random.Genera
     (appendix,) = torch.autograd.grad((errors * mean).sum(), leaf)
     assert (gradient - appendix).norm() / appendix.norm() < 1e-10
 
-    S = gps.Samples(obs, obs, u, reward, reward, reward[:, 0], log_q)
+    S = gps.Samples(obs, obs, u, reward, reward[:, 0], log_q)
     value = sparse(lambda log_pi: phi(log_pi, mixture, reward, w_r), policy, leaf, S)
     torch.testing.assert_close(value.detach(), objective(theta), rtol=1e-14, atol=0)
     torch.testing.assert_close(torch.autograd.grad(value, leaf)[0], gradient, rtol=1e-10, atol=1e-13)
@@ -138,14 +137,14 @@ def test_reward_of_the_paper(monkeypatch: pytest.MonkeyPatch) -> None:
     u = torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64)
     expected = -(0.01 * 5.25 + 0.5**2 + 10 * (1.25 + 0.1 - 1.2) ** 2 + 0.2**2)
     assert search.reward(x, u).item() == pytest.approx(expected)
-    search = make_search("ant", "--action-cost 0.01")
+    search = make_search("ant", "--demonstration none.npz --action-cost 0.01")
     x, u = search.system.start()[0], torch.ones(8, dtype=torch.float64)
     x[15], turn = 3.0, 4 * x[4:7].square().sum().item()
     expected = -(0.01 * 8 + 2.0**2 + 10 * (x[2].item() - 0.5) ** 2 + 0.1 * turn)
     assert search.reward(x, u).item() == pytest.approx(expected)
-    native = make_search("hopper", "--reward native --action-cost 0.01")
-    x, u = native.system.start(), torch.ones(1, 3, dtype=torch.float64)
-    torch.testing.assert_close(native.reward(x, u), native.system.reward(x, u) - 0.03)
+    native = make_search("cartpole", "--action-cost 0.01")
+    x, u = native.system.start(), torch.ones(1, 1, dtype=torch.float64)
+    torch.testing.assert_close(native.reward(x, u), native.system.reward(x, u) - 0.01)
 
 
 def test_policy_does_not_look_at_the_action_before(rng: np.random.Generator) -> None:
@@ -189,55 +188,6 @@ def test_guides_reproduce_the_plan(search: gps.Search) -> None:
     assert abs(mean - plan) < 0.01 * abs(plan) and 0 < std < 0.01 * abs(plan)
 
 
-def test_lessons_end_where_the_guides_are_far(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the policy that they teach errs less, in the units of the guides' covariance."""
-    monkeypatch.setattr(gps, "TAIL", 0)  # else the states after it are far
-    samples = search.measure(*search.guides[0].sample(search.system, 0.1 * search.noise(2)))
-    assert search.learn(samples) == 1.0 and [len(part) for part in search.lessons] == [60, 60, 60]
-    x = samples.x.clone()
-    x[1, 12:, 2:] += 100.0
-    assert search.learn(samples._replace(x=x, obs=search.system.observe(x[:, :-1]))) == 42 / 60
-    obs, u, inverse = search.lessons
-    assert len(u) == 102
-    search.student = search.network.theta
-    theta, metrics = search.imitate()
-    before = search.network.theta
-    assert search.student is theta
-    fit = 2 * theta - before  # half of it is the last one
-    last, half, fitted = (
-        (inverse @ (u - search.network.mean(t, obs)).unsqueeze(-1)).norm(dim=1) for t in (before, theta, fit)
-    )
-    assert metrics["gps/error"] == pytest.approx((1 + fitted.square()).sqrt().mean().item() - 1)
-    assert fitted.mean() < half.mean() < last.mean()
-
-
-def test_perturbed_starts(search: gps.Search) -> None:
-    """They differ by the plan's deviations, whatever theta: without --perturb all samples start where the guides do."""
-    path, system = search.guides[0].x[:-1], search.system
-    assert (search.draw(search.network.theta).x[:, 0] == path[0]).all()
-    search.args.perturb, search.args.samples = 0.3, 400
-    away = system.difference(search.draw(search.network.theta).x[:, 0], path[:1].expand(400, -1))
-    expected = 0.3 * system.difference(path, path[:1]).std(0)
-    assert (expected > 0).all()
-    torch.testing.assert_close(away.std(0) / expected, torch.ones_like(expected), atol=0.12, rtol=0.0)
-    assert (away.mean(0).abs() < 0.2 * expected).all()
-    torch.testing.assert_close(torch.corrcoef(away.mT), torch.eye(len(expected)).to(away), atol=0.2, rtol=0.0)
-
-
-def test_lessons_are_means_of_the_guides_within_the_bound(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gps, "BLEND", 10.0)
-    other = search.guides[0]._replace(u=search.guides[0].u + 1.0)
-    monkeypatch.setattr(search, "guides", [search.guides[0], other])
-    monkeypatch.setattr(search, "lessons", ())
-    monkeypatch.setattr(gps, "TAIL", 0)
-    S = search.measure(*search.guides[0].sample(search.system, 0 * search.noise(1)))
-    bound = 0.5 * other.u.abs().max().item()
-    monkeypatch.setattr(gps, "BOUND", bound)
-    search.learn(S)
-    expected = (other.u - 1.0).clamp(-bound, bound) / 2 + other.u.clamp(-bound, bound) / 2
-    torch.testing.assert_close(search.lessons[1], expected)
-
-
 def test_active_set(search: gps.Search) -> None:
     """All guiding samples, the newest of the best policy, and a planted sample of high weight."""
     other = search.network.theta + 0.01
@@ -268,7 +218,7 @@ def test_adapted_guides_leave_room_for_the_best_policys_own_samples(search: gps.
 def test_densities_of_the_set_are_those_of_its_generators(search: gps.Search) -> None:
     """After all appending and pruning, and each sample was more likely where it came from than it is elsewhere."""
     S = search.S.samples
-    assert len(S.u) <= 24
+    assert len(S.u) <= 48
     for j, generator in enumerate(search.S.generators):
         torch.testing.assert_close(S.log_q[:, j], search.S.log_density(generator, S), rtol=1e-9, atol=1e-9)
     own = S.log_q[torch.arange(len(S.u)), S.source, -1]
@@ -295,9 +245,9 @@ def test_rows_and_files_of_a_run(trained: Path, rows: list[dict[str, str]]) -> N
     assert arguments["hidden"] == 8 and arguments["action_cost"] == 1e-3
     steps = [int(row["control_steps"]) for row in rows]
     assert steps[0] == 30 * (8 + 4)  # guiding samples and the policy's own
-    # Before a proposal is accepted it is drawn again; a rejection draws the best policy's samples again.
+    # Before a proposal is accepted, as many as of the guides are drawn; a rejection draws the best policy's again.
     for drawn, row in zip(np.diff(steps) // 30, rows[1:], strict=True):
-        assert drawn in ((4 + 4,) if row["gps_accepted"] == "1.0" else (4 + 4, 4 + 4 + 4))
+        assert drawn in ((4 + 8,) if row["gps_accepted"] == "1.0" else (4 + 4, 4 + 8 + 4))
     assert [bool(row["eval_return"]) for row in rows] == [False, False, True, False, True]
     assert all(row["return"] and row["gps_objective"] and row["sim_model_steps"] for row in rows)
     assert not list(trained.glob("*.tmp"))
@@ -347,36 +297,10 @@ def test_an_evaluation_ends_where_the_robot_falls() -> None:
         assert evaluation.returns[e].item() == pytest.approx(returns[e][1], rel=1e-6)
 
 
-def test_feedback(tmp_path: Path) -> None:
-    """It learns the guides' lessons, and S has its guide."""
-    modules = run(gps, tmp_path, *TINY, "--variant", "feedback")["modules"]
-    assert len(modules["learner"]["lessons"]) == 3 and modules["S"]["initial"] == 1
-
-
-def test_an_interrupted_run_keeps_its_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the moment that it exists, and the next run can start from it."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    plans = list[Tensor]()
-    with monkeypatch.context() as patch:
-        plan = gps.Search.plan
-        patch.setattr(gps.Search, "plan", lambda *args: (made := plan(*args), plans.append(made.x[0]))[0])
-        patch.setattr(gps.Search, "guide", interrupt)
-        with pytest.raises((KeyboardInterrupt, SystemExit)):
-            gps.main([*TINY, "--run-dir", str(tmp_path / "run")])
-    assert [path.name for path in (tmp_path / "run").iterdir()] == ["plan.npz"]
-    x, _ = load_demonstration(make_search("cartpole").system, tmp_path / "run" / "plan.npz", 8)
-    assert torch.equal(x, plans[0])
-    run(gps, tmp_path / "run", *TINY, "--demonstration", tmp_path / "run" / "plan.npz")
-
-
 @pytest.mark.gpu
-@pytest.mark.parametrize("variant", ["full", "feedback"])
-def test_a_gpu_plans_and_learns_as_the_cpu_does(variant: str, tmp_path: Path) -> None:
-    """The same plan, the same samples, and policies that differ by rounding alone."""
-    flags = [*TINY, "--variant", variant, *"--adaptive 1 --adaptive-iterations 2 --device".split()]
+def test_a_gpu_learns_as_the_cpu_does(tmp_path: Path) -> None:
+    """The same guides, the same samples, and policies that differ by rounding alone."""
+    flags = [*TINY, *"--ilqr-iterations 3 --adaptive 1 --adaptive-iterations 2 --device".split()]
     one, other = (run(gps, tmp_path / device, *flags, device)["modules"] for device in ("cpu", "cuda"))
     for part in ("x", "u", "K", "L"):
         place = LinearGaussian._fields.index(part)
@@ -386,32 +310,55 @@ def test_a_gpu_plans_and_learns_as_the_cpu_does(variant: str, tmp_path: Path) ->
 
 
 def test_seeds_and_adaptive_guides(tmp_path: Path) -> None:
-    arguments = [*TINY, *"--guides 2 --adaptive 1 --adaptive-iterations 2 --stored 60 --seed".split()]
+    """Of two examples."""
+    system, path = make_search("cartpole").system, tmp_path / "two.npz"
+    u = torch.tensor([0.1, -0.1], dtype=torch.float64).view(2, 1, 1).expand(2, 8, 1)
+    x, _, _ = system.rollout(system.start().expand(2, -1), 8, lambda t, _: u[:, t])
+    save_demonstration(system, x, u, path)
+    arguments = [*TINY, "--demonstration", path, *"--adaptive 1 --adaptive-iterations 2 --seed".split()]
     one, other = (run(gps, tmp_path / str(seed), *arguments, seed)["modules"] for seed in (1, 2))
     assert not torch.equal(one["network"]["theta"], other["network"]["theta"])
     assert len(one["learner"]["guides"]) == len(one["learner"]["adapted"]) == one["S"]["initial"] == 2
     assert sum(len(generator) > 1 for generator in one["S"]["generators"]) == 4
 
 
-def test_control_steps_of_another_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """They are the search's, the plan's, the evaluation's, and those of whatever plays the policy."""
-    path = tmp_path / "run" / "checkpoint.pt"
-    run(gps, path.parent, *TINY, *"--control-dt 0.05 --substeps 12 --spread 0 --perturb 0".split())
-    saved = load_policy(path)
-    env, state = make_policy_env(saved, 1), load(path, "gps")
+def test_control_steps_of_another_length(tmp_path: Path) -> None:
+    """They are the search's, the evaluation's, and those of whatever plays the policy."""
+    path, example = tmp_path / "run" / "checkpoint.pt", tmp_path / "slow.npz"
+    system = System(diffsim.make("cartpole", 1, control_dt=0.05))
+    u = torch.tensor([0.1, -0.1], dtype=torch.float64).repeat(4).view(8, 1)
+    x, _, _ = system.rollout(system.start(), 8, lambda t, _: u[t : t + 1])
+    save_demonstration(system, x[0], u, example)
+    run(gps, path.parent, *TINY, *"--control-dt 0.05 --substeps 12 --demonstration".split(), example)
+    env, state = make_policy_env(load_policy(path), 1), load(path, "gps")
     search = gps.Search(gps.Args(**state["args"]), make_env(gps.Args(**state["args"]), 1))
     restore(search, state)
     assert env.control_dt == search.system.control_dt == search.evaluate().control_dt == 0.05
-    assert search.guides[0].eta == 1.0 and np.load(path.parent / "plan.npz")["control_dt"] == 0.05
-    plan = ["--demonstration", str(path.parent / "plan.npz")]
-    assert "has control steps of 0.05 s, not of 0.01667 s" in refusal(lambda: gps.main([*TINY, *plan]), capsys)
 
 
-def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
+def test_an_example_is_where_the_guides_start(tmp_path: Path) -> None:
     path, qpos = tmp_path / "demo.npz", np.linspace((0.3, 3.0), (0.5, 2.8), 9)
-    np.savez(path, qpos=qpos, qvel=np.zeros((9, 2)), action=np.full((8, 1), 0.1))
+    np.savez(path, qpos=qpos, qvel=np.zeros((9, 2)), action=np.linspace(0.1, 0.2, 8)[:, None])
     search = run(gps, tmp_path / "run", *TINY, "--demonstration", path)["modules"]["learner"]
     assert search["guides"][0][0][0].tolist() == [0.3, 3.0, 0.0, 0.0]
+
+
+def test_the_noise_of_guides_is_at_most_the_policys() -> None:
+    """exp(reward) and the tracking of states make it smaller."""
+    search = make_search("hopper", "--horizon 20")
+    search.prepare(lambda message: None)
+    for covariance in search.guides[0].L @ search.guides[0].L.mT:
+        assert (torch.linalg.eigvalsh(search.network.sigma.square().diag() - covariance) > 0).all()
+
+
+def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
+    """From the first second of the shipped example, and from a policy that falls behind it."""
+    flags = "--env hopper --horizon 50 --pretraining 8 --iterations 12 --eval-every 12 --quiet".split()
+    run(gps, tmp_path, *flags)
+    rows = read_progress(tmp_path)
+    guides, spread, before = (float(rows[0][f"gps_{name}"]) for name in ("guides", "guides_std", "objective"))
+    assert before < guides - 10 * spread
+    assert float(rows[-1]["eval_objective"]) > guides - 2 * spread
 
 
 @pytest.mark.parametrize(
@@ -420,12 +367,18 @@ def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
         ("--horizon 1", "--horizon must be at least 2, not 1"),
         ("--guiding-samples 1", "--guiding-samples must be at least 2, not 1"),
         ("--active 20", "--active must be at least 50, not 20"),
-        ("--guides 17 --guiding-samples 20", "--restarts must be at least 17, not 16"),
         ("--resume {trained}/checkpoint.pt --control-dt 0.02", "has --control-dt 0.016666666666666666, not 0.02"),
         ("--regularizer-bounds 1 0.1", "--regularizer-bounds must be two numbers in order"),
-        ("--reward target", "--reward target is known of hopper, half_cheetah, ant, humanoid, swimmer, walker; cart"),
         ("--demonstration {file}.npz", "no such trajectory: {file}.npz"),
-        ("--demonstration {file} --guides 2", "--demonstration is one trajectory: --guides must be 1"),
+        ("--demonstration {file}", "{file} is not an .npz with qpos, qvel and action"),
+        (
+            "--demonstration {hopper} --control-dt 0.02",
+            "{hopper}: qpos has shape (521, 6) of float32, must be ",
+        ),
+        ("--demonstration {hopper}", "{hopper} has control steps of 0.02 s, not of 0.01667 s"),
+        ("--horizon 999", "cartpole.npz: qpos has shape (261, 2) of float32, must be at least (1000, 2) for 999 steps"),
+        ("--demonstration {holes}", "{holes}: qvel holds numbers that are not finite"),
+        ("--env ant", "--demonstration must be an example for ant; shipped are those of cartpole, hopper, "),
         ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
         ("--evaluate {file}", "{file} is not a whole checkpoint of gps.py"),
         ("--resume {trained}/checkpoint.pt --hidden 9", "has --hidden 8, not 9"),
@@ -435,7 +388,13 @@ def test_a_demonstration_is_where_the_guides_start(tmp_path: Path) -> None:
 def test_bad_input_is_one_line_and_exit_code_2(
     arguments: str, message: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert_refuses(gps, f"--env cartpole {arguments}", message, trained, tmp_path, capsys)
+    hopper, holes = gps.EXAMPLES / "hopper.npz", tmp_path / "holes.npz"
+    np.savez(holes, qpos=np.zeros((300, 2)), qvel=np.full((300, 2), np.nan), action=np.zeros((299, 1)))
+    arguments, message = (
+        text.replace("{hopper}", f"{hopper}").replace("{holes}", f"{holes}") for text in (arguments, message)
+    )
+    env = "" if "--env" in arguments else "--env cartpole "
+    assert_refuses(gps, env + arguments, message, trained, tmp_path, capsys)
 
 
 def test_torchrun_is_refused(

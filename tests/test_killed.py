@@ -27,8 +27,8 @@ FLAGS = {
     "ppo_baseline": f"{WINDOWS} --minibatch-size 40 --epochs 2",
     "pfpn": f"{WINDOWS} --minibatch-size 40 --epochs 2 --particles 7",
     "pods": "--num-envs 5 --horizon 16 --candidates 3 --epochs 2 --batch-size 32 --order 2",
-    "gps": "--horizon 30 --restarts 3 --screening 4 --ilqr-iterations 8 --pretraining 20 --hidden 8 --samples 4 "
-    "--guiding-samples 8 --active 16 --stored 60 --lbfgs-iterations 4 --guides 2 --adaptive 1 --adaptive-iterations 2",
+    "gps": "--horizon 30 --pretraining 20 --hidden 8 --samples 4 "
+    "--guiding-samples 8 --active 16 --lbfgs-iterations 4 --adaptive 1 --adaptive-iterations 2",
     "mbpo": f"{REPLAY} --seed-steps 8 --models 3 --elites 2 --model-hidden 16 16 --model-updates 3 --branches 20 "
     "--updates 5",
     "sac_baseline": f"{REPLAY} --seed-steps 20",

@@ -5,9 +5,8 @@ The physics knows nothing of this package, and it knows nothing of training.
 
 from __future__ import annotations
 
-from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers, nearest_feedback
+from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration
 from diffsim.planning.ilqr import Cost, Plan, backward_pass, follow, ilqr, step_jacobian
-from diffsim.planning.restarts import best_of_random_starts, receding_horizon, starting_actions
 from diffsim.planning.system import REAL, System

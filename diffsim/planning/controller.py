@@ -24,13 +24,8 @@ class LinearGaussian(NamedTuple):
     x: Tensor  # (T + 1, nx)
     u: Tensor  # (T, nu)
     K: Tensor  # (T, nu, 2nv)
-    L: Tensor  # (T, nu, nu) Cholesky factor of the covariance eta Q_uu^-1
-    eta: Tensor  # () the temperature of exp(-cost / eta), of which this is the I-projection
+    L: Tensor  # (T, nu, nu) Cholesky factor of the covariance Q_uu^-1
     mu: Tensor  # () regularisation of the pass that made it; 0 unless Q_uu was not positive definite
-
-    def first(self, steps: int) -> LinearGaussian:
-        """Its first steps."""
-        return self._replace(x=self.x[: steps + 1], u=self.u[:steps], K=self.K[:steps], L=self.L[:steps])
 
     def mean(self, system: System, t: int | slice, x: Tensor) -> Tensor:
         """(..., nu) at states x (..., nx) of step t, or (..., steps, nx) of a slice of steps."""
@@ -53,50 +48,11 @@ class LinearGaussian(NamedTuple):
         return system.rollout(self.x[0].expand(len(noise), -1), noise.shape[1], act)
 
 
-def nearest_feedback(
-    system: System, guides: list[LinearGaussian], x: Tensor, scale: Tensor, bound: float = math.inf, blend: float = 0
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The feedback of the controllers' steps that look most like states, whatever the time.
-
-    The place along x is not observed. It counts for the feedback alone, so that a late policy catches up, and on a
-    terrain not at all, as a guide's place belongs to its own terrain.
-
-    Args:
-        x: (m, nx) states.
-        scale: (obs_dim,) of observations, in which their differences are measured.
-        bound: of each controller's actions.
-        blend: b > 0 gives a mean over the controllers, with weights exp(-(d / b)^2) of their nearest steps at distance
-            d; 0 gives the action of the nearest one.
-
-    Returns:
-        Actions (m, nu); L (m, nu, nu) of the nearest step of all, and its root mean square distance (m,).
-    """
-    own, parts = system.observe(x) / scale, []
-    for guide in guides:
-        path = guide.x[: len(guide.u)]
-        looks = system.observe(path) / scale
-        distance, t = torch.cdist(own, looks, compute_mode="donot_use_mm_for_euclid_dist").min(1)
-        tangent = (system.difference(x, path[t]) * system.counts).unsqueeze(-1)
-        u = (guide.u[t] + (guide.K[t] @ tangent).squeeze(-1)).clamp(-bound, bound)
-        parts.append((u, guide.L[t], distance / own.shape[1] ** 0.5))
-    u, L, distance = (torch.stack(part) for part in zip(*parts, strict=True))
-    nearest = distance.argmin(0), torch.arange(len(x), device=x.device)
-    weight = torch.softmax(-(distance / blend).square(), 0).unsqueeze(-1) if blend else None
-    return u[nearest] if weight is None else (weight * u).sum(0), L[nearest], distance[nearest]
-
-
 @torch.no_grad()
-def maximum_entropy_controllers(
-    system: System, cost: Cost, plan: Plan, sigma: Tensor, spread: float
-) -> list[LinearGaussian]:
-    """The I-projections of exp(-cost / eta) about R optimised trajectories (Levine and Koltun 2013, section 4.1).
+def maximum_entropy_controllers(system: System, cost: Cost, plan: Plan) -> list[LinearGaussian]:
+    """The I-projections of exp(-cost) about R optimised trajectories (Levine and Koltun 2013, section 4.1).
 
-    Their k is left out: it vanishes where iLQR converged.
-
-    Args:
-        cost: of which the plan's trajectories are optima.
-        sigma, spread: eta is such that no motor's median standard deviation over time is beyond spread sigma (nu,); 1,
-            the paper's, for spread 0.
+    Their k is left out: it vanishes where iLQR converged. The cost is in nats.
     """
     f_z = step_jacobian(system, plan.x, plan.u)
     quadratic = cost.quadratic(plan.x, plan.u, f_z)
@@ -106,7 +62,5 @@ def maximum_entropy_controllers(
         mu = torch.where(gains.ok, mu, (4 * mu).clamp(min=1e-6))
         gains = backward_pass(f_z, *quadratic, mu)
     covariance = torch.linalg.inv(gains.Q_uu + 1e-9 * torch.eye(system.nu, dtype=REAL, device=mu.device))
-    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt().median(1).values  # (R, nu)
-    eta = (spread * sigma / std).amin(-1).square() if spread else torch.ones_like(mu)
-    L = torch.linalg.cholesky(eta.view(-1, 1, 1, 1) * symmetric(covariance))
-    return [LinearGaussian(*tensors) for tensors in zip(plan.x, plan.u, gains.K, L, eta, mu, strict=True)]
+    L = torch.linalg.cholesky(symmetric(covariance))
+    return [LinearGaussian(*tensors) for tensors in zip(plan.x, plan.u, gains.K, L, mu, strict=True)]

@@ -49,29 +49,29 @@ class Tracking(NamedTuple):
     system: System
     x: Tensor  # (R, T + 1, nx)
     u: Tensor  # (R, T, nu)
-    weight: float
+    weight: float  # of states
+    action_weight: Tensor  # (nu,)
 
     def value(self, x: Tensor, u: Tensor) -> Tensor:
         dx = self.system.difference(x[..., :-1, :], self.x[:, None, :-1])
-        return self.weight * (dx.square().sum(-1) + (u - self.u[:, None]).square().sum(-1))
+        du = u - self.u[:, None]
+        return self.weight * dx.square().sum(-1) + (self.action_weight * du.square()).sum(-1)
 
     def quadratic(self, x: Tensor, u: Tensor, f_z: Tensor) -> tuple[Tensor, Tensor]:
         dx = self.system.difference(x[:, :-1], self.x[:, :-1])
-        gradient = 2 * self.weight * torch.cat((dx, u - self.u), -1)
-        eye = torch.eye(f_z.shape[-1], dtype=f_z.dtype, device=f_z.device)
-        return gradient, (2 * self.weight * eye).expand(*u.shape[:2], -1, -1)
+        slope = 2 * torch.cat((self.action_weight.new_full((dx.shape[-1],), self.weight), self.action_weight))
+        return slope * torch.cat((dx, u - self.u), -1), slope.diag().expand(*u.shape[:2], -1, -1)
 
 
 class Surprisal(NamedTuple):
-    """The weighted negative log density of the actions under a policy of the states, normal about its mean."""
+    """The negative log density of the actions under a policy of the states, normal about its mean."""
 
     system: System
     mean: Callable[[Tensor], Tensor]  # (..., nu) of x (..., nx)
     sigma: Tensor  # (nu,)
-    weight: float
 
     def value(self, x: Tensor, u: Tensor) -> Tensor:
-        return -self.weight * gaussian_log_prob(u, self.mean(x[..., :-1, :]), self.sigma)
+        return -gaussian_log_prob(u, self.mean(x[..., :-1, :]), self.sigma)
 
     def quadratic(self, x: Tensor, u: Tensor, f_z: Tensor) -> tuple[Tensor, Tensor]:
         """Gauss-Newton of |(u - mean(x)) / sigma|^2 / 2."""
@@ -83,7 +83,7 @@ class Surprisal(NamedTuple):
         eye = torch.eye(nu, dtype=u.dtype, device=u.device).expand(*u.shape[:2], -1, -1)
         e_z = torch.cat((-slopes, eye), -1) / self.sigma.unsqueeze(-1)
         e = ((u - mean.detach()) / self.sigma).unsqueeze(-1)
-        return self.weight * (e_z.mT @ e).squeeze(-1), self.weight * e_z.mT @ e_z
+        return (e_z.mT @ e).squeeze(-1), e_z.mT @ e_z
 
 
 class Sum(NamedTuple):

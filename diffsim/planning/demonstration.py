@@ -17,10 +17,10 @@ from diffsim.planning.system import REAL, System
 PERIOD = 1 / 60  # s: the control step of a file that does not tell it
 
 
-def load_demonstration(system: System, path: Path, steps: int, row: int = 0) -> tuple[Tensor, Tensor]:
+def load_demonstration(system: System, path: Path, steps: int) -> list[tuple[Tensor, Tensor]]:
     """States (steps + 1, nx) and actions (steps, nu) of an .npz of qpos, qvel and action in [-1, 1], a row a step.
 
-    Of a file of several trajectories, which has a first dimension for them, number `row`.
+    A file of several trajectories has a first dimension for them.
 
     Raises:
         ValueError: no such file, not of this robot or control step, shorter than steps, or not finite real numbers.
@@ -38,16 +38,17 @@ def load_demonstration(system: System, path: Path, steps: int, row: int = 0) -> 
         raise ValueError(f"{path} has control steps of {control_dt:.4g} s, not of {system.control_dt:.4g} s")
     parts, sizes = [], {"qpos": (steps + 1, system.nq), "qvel": (steps + 1, system.nv), "action": (steps, system.nu)}
     for name, (rows, width) in sizes.items():
-        array = arrays[name][row] if arrays[name].ndim == 3 else arrays[name]
-        if array.ndim != 2 or array.shape[1] != width or len(array) < rows or array.dtype.kind not in "fiu":
+        array = arrays[name][None] if arrays[name].ndim == 2 else arrays[name]
+        if array.ndim != 3 or array.shape[2] != width or array.shape[1] < rows or array.dtype.kind not in "fiu":
             found = f"{arrays[name].shape} of {array.dtype}"
             raise ValueError(f"{path}: {name} has shape {found}, must be at least ({rows}, {width}) for {steps} steps")
         if not np.isfinite(array).all():
             raise ValueError(f"{path}: {name} holds numbers that are not finite")
-        parts.append(torch.tensor(array, dtype=REAL))
+        parts.append(torch.tensor(array[:, :rows], dtype=REAL, device=system.device))
+    if len({len(part) for part in parts}) > 1:
+        raise ValueError(f"{path}: qpos, qvel and action hold {', '.join(str(len(p)) for p in parts)} trajectories")
     qpos, qvel, action = parts
-    x, u = torch.cat((qpos[: steps + 1], qvel[: steps + 1]), -1), torch.atanh(action.clamp(-0.995, 0.995))[:steps]
-    return x.to(system.device), u.to(system.device)
+    return list(zip(torch.cat((qpos, qvel), -1), torch.atanh(action.clamp(-0.995, 0.995)), strict=True))
 
 
 def save_demonstration(system: System, x: Tensor, u: Tensor, path: Path, **others: Any) -> None:
@@ -66,7 +67,8 @@ def follow_demonstration(system: System, x: Tensor, u: Tensor, weight: float) ->
     """
     x, u = x.unsqueeze(0), u.unsqueeze(0)
     f_z, zero = step_jacobian(system, x, u), x.new_zeros(1)
-    gains = backward_pass(f_z, *Tracking(system, x, u, weight).quadratic(x, u, f_z), zero)
+    cost = Tracking(system, x, u, weight, x.new_full((system.nu,), weight))
+    gains = backward_pass(f_z, *cost.quadratic(x, u, f_z), zero)
     xs, us, finite = follow(system, x, u, gains, zero)
     if not bool(finite.all()):
         raise ValueError("no controller follows the demonstration to its end")

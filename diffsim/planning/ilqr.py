@@ -8,7 +8,6 @@ line search in one batch.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import torch
@@ -16,7 +15,6 @@ from torch import Tensor
 
 from diffsim.planning.system import REAL, System
 
-Show = Callable[[int, Tensor], None]  # (iteration, costs (R,))
 ALPHAS = 0.5 ** torch.arange(11, dtype=REAL)  # step sizes of the line search
 
 
@@ -138,17 +136,15 @@ def change_mu(mu: Tensor, delta: Tensor, more: Tensor, less: Tensor) -> tuple[Te
 
 
 @torch.no_grad()
-def ilqr(
-    system: System, cost: Cost, x: Tensor, u: Tensor, iterations: int, mu: float = 1.0, show: Show | None = None
-) -> Plan:
+def ilqr(system: System, cost: Cost, x: Tensor, u: Tensor, iterations: int, mu: float = 1.0) -> Plan:
     """Optimises R trajectories of the system, x (R, T + 1, nx) and u (R, T, nu), side by side.
 
-    mu is the initial regularisation; each trajectory has its own. `show` is called after each iteration.
+    mu is the initial regularisation; each trajectory has its own.
     """
     total = cost.value(x.unsqueeze(1), u.unsqueeze(1)).sum(-1).squeeze(1)
     mus, delta = torch.full_like(total, mu), torch.ones_like(total)
     moving, fresh = torch.ones_like(total, dtype=torch.bool), True
-    for iteration in range(iterations):
+    for _ in range(iterations):
         if fresh:
             f_z = step_jacobian(system, x, u)
             quadratic = cost.quadratic(x, u, f_z)
@@ -163,8 +159,6 @@ def ilqr(
         scale = 1 + total.abs()
         level, flat = gains.d1.abs() < 1e-7 * scale, (step > 0) & (before - total < 1e-6 * scale) & (mus < 1e-4)
         moving = moving & ~(level | flat | (mus > 1e10))
-        if show:
-            show(iteration, total)
         fresh = bool((step > 0).any())
         if not bool(moving.any()):
             break

@@ -35,7 +35,6 @@ class System:
 
     Attributes:
         observed: (obs_dim,) 1 where an observation is of the state, 0 where it is of the action before.
-        counts: (nd,) 0 for coordinates that feedback by similarity does not heed, 1 elsewhere.
         steps: control steps simulated so far, over all trajectories.
     """
 
@@ -53,7 +52,6 @@ class System:
         start = self.start()
         still, moved = (self._observe(start, action.unsqueeze(0)) for action in (self._no_action, self._no_action + 1))
         self.observed = (still == moved)[0].to(REAL)
-        self.counts = torch.ones(self.nd, dtype=REAL, device=self.device)
 
     def simulator(self, num_envs: int) -> Simulator:
         if num_envs not in self._simulators:

@@ -1,11 +1,10 @@
-"""benchmarks/gps_controllers.py on a small run: what is kept, what falls, and the tables."""
+"""benchmarks/gps_controllers.py on a small run: what walks, what falls, and the table."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import gps_controllers as controllers
-import numpy as np
 import pytest
 import torch
 from common import DOCS, RESULTS, CheckpointFlags
@@ -16,15 +15,15 @@ from tables import markdown, read_csv
 import gps
 
 SMALL = (
-    "--env hopper --horizon 12 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 --samples 2 "
-    "--guiding-samples 4 --active 8 --stored 8 --iterations 1 --lbfgs-iterations 2 --eval-every 0 --eval-episodes 1"
+    "--env hopper --horizon 12 --pretraining 5 --hidden 8 --samples 2 --guiding-samples 4 --active 8 --iterations 1 "
+    "--lbfgs-iterations 2 --eval-every 0 --eval-episodes 1 --quiet"
 ).split()
 
 
 @pytest.fixture(scope="module")
 def hopper(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("runs") / "hopper__feedback__1"
-    run(gps, directory, *SMALL, "--quiet")
+    directory = tmp_path_factory.mktemp("runs") / "hopper__full__1"
+    run(gps, directory, *SMALL)
     return directory
 
 
@@ -34,43 +33,23 @@ def search(hopper: Path) -> gps.Search:
 
 
 def test_the_command(hopper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plan walks over level ground; a second call draws from the csv file alone."""
-    incline, _ = controllers.TERRAINS["incline (degrees)"]
-    monkeypatch.setattr(controllers, "TERRAINS", {"incline (degrees)": (incline, (0.0, 60.0))})
+    """The guide hops over level ground; a second call draws from the csv file alone."""
+    monkeypatch.setattr(controllers, "terrains", lambda degrees: {"some": ["level", "incline:60:-1"]})
     controllers.main(CheckpointFlags(checkpoints=(hopper,), output=tmp_path))
-    rows = {(row["size"], row["controller"]): row for row in read_csv(tmp_path / "gps_controllers.csv")}
-    assert len(rows) == 6 and rows["0", "ddp"]["walked"] == "1"
+    rows = {(row["terrain"], row["controller"]): row for row in read_csv(tmp_path / "gps_controllers.csv")}
+    assert len(rows) == 6 and rows["level", "ddp"]["walked"] == "1" and rows["incline:60:-1", "ddp"]["walked"] == "0"
     before = (tmp_path / "gps_controllers.csv").read_bytes()
     controllers.main(CheckpointFlags(draw_only=True, output=tmp_path))
     assert before == (tmp_path / "gps_controllers.csv").read_bytes()
 
 
-def test_walkers_fall_on_a_steep_slope(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plan walks over level ground; on 60 degrees the robot that starts on the slope does not."""
-    monkeypatch.setattr(controllers, "PLACES", [-0.5, 0.5])
-    incline, _ = controllers.TERRAINS["incline (degrees)"]
-    monkeypatch.setattr(controllers, "TERRAINS", {"incline (degrees)": (incline, (0.0, 60.0))})
-    level, steep = (roll(controllers.controllers(search)["ddp"]) for _, _, roll in controllers.walking(search))
-    torch.testing.assert_close(level[0][1, -1], search.guides[0].x[-1], rtol=1e-3, atol=1e-3)
-    assert controllers.walked(search, *level).tolist() == [True, True]
-    assert controllers.walked(search, *steep).tolist() == [False, True]
-    x, u, finite = level
-    x[0, 5, 1] = -1.0  # it falls, and stands up again
-    assert controllers.walked(search, x, u, finite).tolist() == [False, True]
-
-
-def test_humanoids_run_until_they_fall(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(controllers, "COUNT", 4)
-    monkeypatch.setattr(controllers, "RUNNING", ((0.0, 99.0), (3.0,)))
-    found = {
-        (kind, size): controllers.seconds(search, *roll(controllers.controllers(search)["ddp"]))
-        .double()
-        .round(decimals=6)
-        for kind, size, roll in controllers.running(search)
-    }
-    assert found["start", 0.0].tolist() == [0.2] * 4 and found["start", 99.0].min() < 0.2
-    assert [len(each) for each in found.values()] == [4] * 4
-    assert found["rough, 1 m (degrees)", 3.0].tolist() == [0.2] * 4  # level for the first metre
+def test_who_falls_or_stays_behind_has_not_walked(search: gps.Search) -> None:
+    x = search.guides[0].x.expand(4, -1, -1).clone()
+    finite = torch.ones(4, 12, dtype=torch.bool)
+    x[1, 5, 1] = x[1, 0, 1] - controllers.FALL - 0.01  # it falls, and stands up again
+    finite[2, 3] = False
+    x[3, -1, 0] = 0.89 * x[3, -1, 0]
+    assert controllers.walked(search, x, finite).tolist() == [True, False, False, False]
 
 
 def test_controllers_by_time_and_by_what_looks_alike(search: gps.Search) -> None:
@@ -78,37 +57,33 @@ def test_controllers_by_time_and_by_what_looks_alike(search: gps.Search) -> None
     torch.testing.assert_close(act["tbdp"](0, guide.x[8:9]), guide.u[8:9])
     torch.testing.assert_close(act["ddp"](8, guide.x[8:9]), guide.u[8:9])
     assert not torch.equal(act["ddp"](0, guide.x[8:9]), guide.u[8:9])
+    away = torch.zeros_like(guide.x[8:9])
+    away[0, 0], away[0, 4] = 3.0, 1e-4  # the place does not count
+    torch.testing.assert_close(act["tbdp"](0, guide.x[8:9] + away), guide.u[8:9] + 1e-4 * guide.K[8, :, 4])
 
 
-def test_terrains_are_ten_places_or_seeds(search: gps.Search, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = list[np.ndarray]()
-    monkeypatch.setattr(controllers, "named_terrains", lambda *names: made.append(named_terrains(*names)) or made[-1])
-    assert len(list(controllers.walking(search))) == len(made) == 15
-    for profiles in made:
-        assert len(profiles) == 10 and all((p[p[:, 0] < 0.5, 1] == 0).all() for p in profiles)
-        assert len({p.tobytes() for p in profiles}) == 10
+def test_terrains_are_ten_places_and_four_seeds() -> None:
+    for degrees in (3, 10):
+        found = controllers.terrains(degrees)
+        assert [len(names) for names in found.values()] == [10, 4]
+        assert len({named_terrains(name).tobytes() for names in found.values() for name in names}) == 14
 
 
 def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
+    shares = {"rough": (1.0, 0.0, 0.5), "incline": (0.5, 0.25, 1.0)}
     rows = [
-        dict(env="walker", variant=case, seed=str(seed), kind="step (cm)", size=size, controller=name)
-        | dict(walked=str(share), seconds="")
-        for case, shares in (("feedback-guides", (1.0, 0.0, 0.5)), ("feedback-slope", (0.5, 0.25, 1.0)))
-        for size in ("5", "-5")
-        for name, share in zip(controllers.CONTROLLERS, shares, strict=True)
+        dict(env="walker", variant=case, seed=str(seed), kind=kind, terrain=kind, controller=name, walked=str(share))
+        for case, own in shares.items()
+        for kind in ("a", "b")
+        for name, share in zip(controllers.CONTROLLERS, own, strict=True)
         for seed in (1, 2)
     ]
-    rows += [row | {"seed": "3", "size": "5", "walked": "1"} for row in rows[:6:2]]
-    tables = controllers.printed(rows)
-    assert not tables["gps humanoid"]
-    up, _, everywhere = tables["gps terrain"]
-    assert up["one slope"] == everywhere["one slope"] == "50% / 25% / 100%"
-    assert up["11 terrains"] == "100% / 33% / 67%" and everywhere["11 terrains"] == "100% / 20% / 60%"
+    rows += [rows[0] | {"seed": "3", "walked": "0.4"}]
+    first, second = controllers.table(rows)
+    assert first == {"terrain": "a", "rough": "80% / 0% / 50%", "incline": "50% / 25% / 100%"}
+    assert second["rough"] == "100% / 0% / 50%"
 
 
-def test_pages_have_the_tables_of_the_csv_file() -> None:
-    tables = controllers.printed(read_csv(RESULTS / "cpu" / "gps_controllers.csv"))
-    page = (DOCS / "gps_terrain.md").read_text()
-    assert all(f"<!-- {name} -->\n{markdown(table)}<!--" in page for name, table in tables.items())
-    row = next(row for row in tables["gps terrain"] if row["trial"] == "incline (degrees) 10")
-    assert row["one slope"] == "50% / 60% / 100%"  # the figure of the claim on Figure 3
+def test_the_page_has_the_table_of_the_csv_file() -> None:
+    table = markdown(controllers.table(read_csv(RESULTS / "cpu" / "gps_controllers.csv")))
+    assert f"<!-- gps terrain -->\n{table}<!--" in (DOCS / "gps.md").read_text()

@@ -12,28 +12,20 @@ import numpy as np
 import pytest
 import torch
 from gps_variants import Ground, named_terrains
-from learners import assert_same, read_progress, refusal, run
+from learners import assert_same, refusal, run
 from planning.systems import jacobian_errors
 from scenes import task_scene
 
 import diffsim
-from diffsim.planning import LinearGaussian, System, nearest_feedback, save_demonstration
+from diffsim.planning import save_demonstration
 from diffsim.terrain import Elevation, incline, rough, step
 from diffsim.training import parse
-from diffsim.training.checkpoint import load, restore
 from diffsim.view import render
 
 SLOPES = "level", "incline:15:-1", "incline:-15:-1"  # all but the first begin behind the start
 SMALL = (
-    "--env hopper --horizon 8 --window 4 --restarts 1 --screening 1 --ilqr-iterations 1 --pretraining 5 --hidden 8 "
-    "--guiding-samples 6 --samples 6 --active 12 --stored 16 --lbfgs-iterations 2 --iterations 2 --eval-every 0 "
-    "--eval-episodes 2 --perturb 0 --quiet"
-).split()
-
-TINY = (
-    "--env cartpole --horizon 8 --restarts 3 --screening 4 --ilqr-iterations 3 --pretraining 5 --hidden 8 "
-    "--guiding-samples 8 --samples 4 --active 16 --stored 24 --iterations 2 --lbfgs-iterations 5 --eval-episodes 1 "
-    "--quiet"
+    "--env hopper --horizon 8 --pretraining 5 --hidden 8 --guiding-samples 6 --samples 6 --active 12 "
+    "--lbfgs-iterations 2 --iterations 2 --eval-every 0 --eval-episodes 2 --quiet"
 ).split()
 
 
@@ -43,14 +35,7 @@ def hopper(**options: Any) -> diffsim.DiffEnv:
 
 def make_search(*flags: str) -> gps_variants.Search:
     args = parse(gps_variants.VariantArgs, [*SMALL, "--device", "cpu", *flags])
-    return gps_variants.Search(args, diffsim.make("hopper", 1))
-
-
-def restored(path: Path) -> gps_variants.Search:
-    state = load(path / "checkpoint.pt", "gps_variants")
-    search = gps_variants.Search(gps_variants.VariantArgs(**state["args"]), diffsim.make("hopper", 1))
-    restore(search, state)
-    return search
+    return gps_variants.Search(args, diffsim.make("hopper", 1, control_dt=0.02, substeps=20))
 
 
 # Names ----------------------------------------------------------------------------------------------------------------
@@ -92,6 +77,7 @@ def test_terrains_in_one_array_keep_their_heights() -> None:
         ("--terrain", "--terrain needs at least one name: level, incline:DEGREES"),
         ("--terrain level step:1 step:2 --samples 2", "--samples must be at least 3, not 2"),
         ("--terrain level step:1 --adaptive 1", "--adaptive takes one --terrain"),
+        ("--terrain step:1", "hopper.npz has no trajectory over step:1, only over level"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
@@ -143,34 +129,29 @@ def test_several_terrains_at_once() -> None:
         together.jacobians(x[:, 0], u[:, 0])
 
 
-def test_the_place_does_not_count_for_feedback_by_similarity(rng: np.random.Generator) -> None:
-    """A guide's own is that of its own terrain; over level ground feedback heeds it."""
-    level, over = System(hopper()), Ground(hopper(), incline(10.0))
-    x, u = level.start()[0].expand(3, -1), torch.tensor(rng.normal(size=(2, 3)))
-    K = torch.tensor(rng.normal(size=(2, 3, 12)))
-    guide = LinearGaussian(x, u, K, torch.eye(3).double().expand(2, 3, 3), u.sum(), u.sum())
-    near, scale = x[:1] + 0.01 * torch.tensor(rng.normal(size=(1, 12))), torch.ones(len(level.observed)).double()
-    far = near + 2.0 * torch.eye(12).double()[:1]
-    one, other = (nearest_feedback(over, [guide], state, scale)[0][0] for state in (near, far))
-    assert torch.equal(one, other)
-    torch.testing.assert_close(one, u[0] + K[0, :, 1:] @ (near - x[:1])[0, 1:])
-    one, other = (nearest_feedback(level, [guide], state, scale)[0][0] for state in (near, far))
-    torch.testing.assert_close(other - one, 2.0 * K[0, :, 0])
-
-
 # The search -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_search_on_several_terrains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A guide on each, which is sampled there; trajectory i of the policy goes over terrain i % 3; a plan of each."""
-    taught, learn = list[list[int]](), gps_variants.Search.learn
-    with monkeypatch.context() as patch:
-        patch.setattr(gps_variants.Search, "learn", lambda s, S: (taught.append(S.source.tolist()), learn(s, S))[1])
-        run(gps_variants, tmp_path, *SMALL, "--terrain", *SLOPES)
-    assert taught[0] == [0, 1]  # every third of 0, 0, 1, 1, 2, 2
-    search = restored(tmp_path)
+@pytest.fixture(scope="module")
+def slopes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An example over each of SLOPES."""
+    system, found = make_search(), []
+    for name in SLOPES:
+        ground = Ground(hopper(control_dt=0.02), named_terrains(name))
+        noise = 0.2 * torch.randn(8, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        found.append(ground.rollout(ground.start(), 8, lambda t, _, noise=noise: noise[t : t + 1])[:2])
+    x, u = (torch.cat(parts) for parts in zip(*found, strict=True))
+    path = tmp_path_factory.mktemp("examples") / "slopes.npz"
+    save_demonstration(system.system, x, u, path, terrain=SLOPES)
+    return path
+
+
+def test_a_search_on_several_terrains(tmp_path: Path, slopes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A guide on each, which is sampled there; trajectory i of the policy goes over terrain i % 3."""
+    search = make_search("--terrain", *SLOPES, "--demonstration", str(slopes))
+    search.prepare(lambda message: None)
+    search.iterate(1)
     assert len(search.guides) == search.S.initial == 3
-    assert search.plan_steps == int(float(read_progress(tmp_path)[0]["sim_model_steps"]))
     monkeypatch.setattr(search, "noise", lambda count, rng=None: torch.zeros(count, 8, 3).double())
     S, own = search.follow(search.guides, 6), search.draw(search.network.theta)
     for i, guide in enumerate(search.guides):
@@ -179,12 +160,10 @@ def test_a_search_on_several_terrains(tmp_path: Path, monkeypatch: pytest.Monkey
         alone = search.roll_out(search.grounds[i], search.network.theta, search.noise(1), guide.x[:1])
         torch.testing.assert_close(own.x[i::3], alone.x.expand(2, -1, -1))
     assert not any(torch.allclose(own.x[0], own.x[i]) for i in (1, 2))
-    plan = np.load(tmp_path / "plan.npz")
-    assert tuple(plan["terrain"]) == SLOPES and plan["action"].shape == (3, 8, 3)
-    again = make_search("--terrain", *SLOPES[::-1], "--demonstration", str(tmp_path / "plan.npz"))
-    again.args.ilqr_iterations = 0  # each is the start of its own terrain's guide, and is followed to its end
-    for made, guide in zip(again.plans(print, lambda: tmp_path / "again.npz"), search.guides[::-1], strict=True):
-        torch.testing.assert_close(made.x[0], guide.x)
+    again = make_search("--terrain", *SLOPES[::-1], "--demonstration", str(slopes))
+    again.prepare(lambda message: None)
+    for made, guide in zip(again.guides[::-1], search.guides, strict=True):
+        torch.testing.assert_close(made.x, guide.x)
     evaluation = search.evaluate()  # beside these two one without noise, which is the first
     world = evaluation.qpos[0, :, 1] - search.guides[0].x[0, 1]
     torch.testing.assert_close(world, torch.tensor([1.0, -1.0]).double() * math.tan(math.radians(15.0)))
@@ -195,26 +174,13 @@ def test_a_search_on_several_terrains(tmp_path: Path, monkeypatch: pytest.Monkey
         np.testing.assert_allclose(films[-1][0, :3], named_terrains(name)[0])
 
 
-def test_a_resumed_search_is_the_same(tmp_path: Path) -> None:
-    whole = run(gps_variants, tmp_path / "whole", *SMALL, "--terrain", *SLOPES[:2])
-    run(gps_variants, tmp_path / "parts", *SMALL, "--terrain", *SLOPES[:2], "--stop-after", 1)
+def test_a_resumed_search_is_the_same(tmp_path: Path, slopes: Path) -> None:
+    flags = [*SMALL, "--terrain", *SLOPES[:2], "--demonstration", slopes]
+    whole = run(gps_variants, tmp_path / "whole", *flags)
+    run(gps_variants, tmp_path / "parts", *flags, "--stop-after", 1)
     gps_variants.main(["--resume", str(tmp_path / "parts" / "checkpoint.pt")])
     parts = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)
     assert_same(parts["modules"], whole["modules"])
-
-
-def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None:
-    """Its first window is followed, and the rest is planned."""
-    path, system = tmp_path / "level.npz", System(diffsim.make("hopper", 1))
-    u = 0.1 * torch.ones(1, 8, 3).double()
-    x, _, _ = system.rollout(system.start(), 8, lambda t, _: u[:, t])
-    save_demonstration(system, x[0], u[0], path)
-    search = make_search(*"--terrain level step:-20:0.01 --demonstration".split(), str(path))
-    search.args.ilqr_iterations = 0
-    level, down = search.plans(print, lambda: tmp_path / "plan.npz")
-    torch.testing.assert_close(level.x, x)
-    assert down.x.shape == x.shape and not torch.allclose(down.u, u)
-    torch.testing.assert_close(search.grounds[1].rollout(down.x[:, 0], 8, lambda t, _: down.u[:, t])[0], down.x)
 
 
 # The variants ---------------------------------------------------------------------------------------------------------
@@ -222,11 +188,37 @@ def test_a_plan_of_level_ground_begins_those_of_terrains(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("case", list(gps_variants.CASES))
 def test_variants(case: str, tmp_path: Path) -> None:
-    modules = run(gps_variants, tmp_path, *TINY, "--case", case)["modules"]
-    search, S, guided = modules["learner"], modules["S"], case in ("guided", "unregularized")
+    modules = run(gps_variants, tmp_path, *SMALL, "--case", case)["modules"]
+    search, S = modules["learner"], modules["S"]
+    guided = case in ("guided", "one-start", "unregularized", "effective-samples")
     assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
     assert (search["w_r"] == 0) == (case == "unregularized")
-    assert len(search["lessons"]) == {"dagger": 2}.get(case, 0)
-    assert case != "dagger" or len(search["lessons"][0]) == 8 + 2 * 4
     moved = not torch.equal(modules["network"]["theta"], S["generators"][S["best"]][0])
     assert moved == (case in ("policy-gradient", "dagger"))
+
+
+def test_effective_samples_are_bounded_from_below() -> None:
+    """Phi falls by the square of what is missing to LEAST, at each step."""
+    search = gps_variants.EffectiveSamples(make_search().args, diffsim.make("hopper", 1))
+    log_pi, reward = torch.zeros(12, 4).double(), torch.ones(12, 4).double()
+    even, alone = torch.zeros(12, 4).double(), 99.0 * (torch.arange(12) > 0).double()[:, None].expand(12, 4)
+    value = search.objective(even, reward)(log_pi)
+    assert value.item() == pytest.approx(4.0)
+    assert search.objective(alone, reward)(log_pi).item() == pytest.approx(4.0 - 4 * (gps_variants.LEAST - 1) ** 2)
+
+
+def test_restarts_begin_anywhere_on_the_guides(tmp_path: Path) -> None:
+    search = gps_variants.Restart(make_search().args, diffsim.make("hopper", 1, control_dt=0.02, substeps=20))
+    search.prepare(lambda message: None)
+    path, starts = search.guides[0].x[:-1], search.draw(search.network.theta, count=40).x[:, 0]
+    assert torch.cdist(starts, path).min(1).values.max() == 0 and len(starts.unique(dim=0)) > 4
+
+
+def test_a_single_example_has_no_noise() -> None:
+    """Its policy acts at the example's states as the example does, however the guides' samples differ."""
+    args = make_search("--pretraining", "300").args
+    search = gps_variants.SingleExample(args, diffsim.make("hopper", 1, control_dt=0.02, substeps=20))
+    search.prepare(lambda message: None)
+    guide, policy = search.guides[0], search.network
+    error = (policy.mean(policy.theta, search.system.observe(guide.x[:-1])) - guide.u) / policy.sigma
+    assert error.abs().max() < 0.05

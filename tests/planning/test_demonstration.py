@@ -20,11 +20,11 @@ def write(path: Path, steps: int, **changes: np.ndarray) -> Path:
 
 
 def test_reading(tmp_path: Path) -> None:
-    x, u = load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 9), 6)
+    ((x, u),) = load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 9), 6)
     assert x.tolist() == [[0.0, 0.0, 1.0, 1.0]] * 7
     torch.testing.assert_close(torch.tanh(u), torch.full((6, 1), 0.5).double())
     bounds = np.array([[1.0], [-1.0]])  # whose atanh is infinite
-    u = load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 2, action=bounds), 2)[1]
+    ((_, u),) = load_demonstration(task_system("cartpole"), write(tmp_path / "a.npz", 2, action=bounds), 2)
     torch.testing.assert_close(torch.tanh(u), torch.tensor([[0.995], [-0.995]]).double())
 
 
@@ -33,11 +33,11 @@ def test_several_trajectories_in_one_file(tmp_path: Path, rng: np.random.Generat
     x, u = normal(rng, 3, 7, 4), 0.1 * normal(rng, 3, 6, 1)
     save_demonstration(system, x, u, path, terrain=["a", "b", "c"])
     assert np.load(path)["terrain"].tolist() == ["a", "b", "c"]
-    for row in range(3):
-        found = load_demonstration(system, path, 5, row)
+    for row, found in enumerate(load_demonstration(system, path, 5)):
         torch.testing.assert_close(found, (x[row, :6], u[row, :5]))
+    assert row == 2
     save_demonstration(system, x[1], u[1], path)
-    torch.testing.assert_close(load_demonstration(system, path, 6), (x[1], u[1]))
+    torch.testing.assert_close(load_demonstration(system, path, 6), [(x[1], u[1])])
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,7 @@ def test_several_trajectories_in_one_file(tmp_path: Path, rng: np.random.Generat
         ({"qpos": np.zeros((9, 2))}, r"qpos has shape \(9, 2\).*, must be at least \(10, 2\) for 9 steps"),
         ({"qvel": np.zeros((20, 3))}, r"qvel has shape \(20, 3\).*, must be at least \(10, 2\)"),
         ({"action": np.zeros((1, 2, 20, 1))}, r"action has shape \(1, 2, 20, 1\)"),
+        ({"action": np.zeros((2, 9, 1))}, "qpos, qvel and action hold 1, 1, 2 trajectories"),
         ({"qpos": np.full((20, 2), np.nan)}, "qpos holds numbers that are not finite"),
         ({"qpos": np.full((20, 2), 1j)}, r"qpos has shape \(20, 2\) of complex128"),
         ({"control_dt": np.array([0.02, 0.02])}, "is not an .npz with qpos, qvel and action"),
@@ -63,7 +64,7 @@ def test_a_plan_is_of_its_own_control_step(tmp_path: Path) -> None:
     slow = System(diffsim.make("cartpole", 1, control_dt=0.05))
     x, u = torch.ones(10, 4).double(), torch.zeros(9, 1).double()
     save_demonstration(slow, x, u, path)
-    assert torch.equal(load_demonstration(slow, path, 9)[0], x)
+    assert torch.equal(load_demonstration(slow, path, 9)[0][0], x)
     with pytest.raises(ValueError, match=r"has control steps of 0.05 s, not of 0.01667 s"):
         load_demonstration(usual, path, 9)
     with pytest.raises(ValueError, match=r"has control steps of 0.01667 s, not of 0.05 s"):

@@ -1,0 +1,119 @@
+"""Examples for gps.py: what a controller without a clock does, recorded.
+
+    python shac.py --env benchmarks/gps_examples.py:WalkerExample --num-envs 64 --iterations 600 --actor-hidden 64 \
+        --critic-lr 1e-3 --run-dir runs/walker
+    python benchmarks/gps_examples.py --env walker --runs runs/walker --to diffsim/assets/examples/walker.npz
+    python benchmarks/gps_examples.py --env swimmer --to diffsim/assets/examples/swimmer.npz
+
+The tasks here have gps.py's reward and control steps, and a fall ends an episode. Several runs act one after the other,
+each for an equal share of the steps. The swimmer's controller is a travelling wave, a formula.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from diffsim.planning import System
+from diffsim.tasks.hopper import Hopper
+from diffsim.tasks.walker import Walker
+from diffsim.training import command, fail, load_policy, parse
+from diffsim.training.evaluation import make_env
+
+ALIVE = 3.0  # per step: a fall costs the rest of the episode
+
+
+class HopperExample(Hopper):
+    """Hops at 1.5 m/s."""
+
+    name = "hopper_example"
+    control_dt = 0.02
+    substeps = 20
+    min_height = -0.35
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        error = (obs[..., 5] - 1.5).square() + 10.0 * obs[..., 0].square() + obs[..., 1].square()
+        return ALIVE - error - 0.1 * action.square().sum(-1)
+
+
+class WalkerExample(Walker):
+    """Walks at 1.2 m/s."""
+
+    name = "walker_example"
+    control_dt = 0.01
+    substeps = 10
+    min_height = -0.35
+    speed, height = 1.2, -0.05  # m/s; m over that of the start
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        error = (obs[..., 8] - self.speed).square() + 10.0 * (obs[..., 0] - self.height).square()
+        return ALIVE - error - 10.0 * obs[..., 1].square() - 0.1 * action.square().sum(-1)
+
+
+class OtherWalkerExample(WalkerExample):
+    """Another gait: slower, on bent knees."""
+
+    name = "other_walker_example"
+    speed, height = 0.6, -0.15
+
+
+# Recording ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Args:
+    to: Path  # the file, an .npz
+    env: str = "walker"  # task of gps.py
+    runs: tuple[Path, ...] = ()  # runs of any script, whose policies act one after the other
+    terrain: tuple[str, ...] = ("level",)  # a trajectory over each, by the names of gps_variants.py
+    steps: int = 520  # control steps
+
+
+def wave(x: Tensor) -> Tensor:
+    """Actions before tanh of a swimmer: the front joint oscillates, and the back one follows by a phase."""
+    raise NotImplementedError
+
+
+@command
+def main(args: Args) -> None:
+    import gps_variants  # shac.py, which takes tasks from this file, would not find it
+
+    words = ["--env", args.env, "--device", "cpu", "--demonstration", str(args.to)]
+    flags = parse(gps_variants.VariantArgs, words)
+    search = gps_variants.Search(flags, make_env(flags, 1))
+    policies = [load_policy(run / "checkpoint.pt").network.double() for run in args.runs]
+    if not policies and args.env != "swimmer":
+        fail(f"--runs must name at least one run: only the swimmer has a formula, not {args.env}")
+    found = list[list[Tensor]]()
+    for name in args.terrain:
+        system = search.system if name == "level" else search.over(name)
+
+        def act(t: int, x: Tensor, system: System = system) -> Tensor:
+            if not policies:
+                return wave(x)
+            action = policies[t * len(policies) // args.steps](system.observe(x))
+            return torch.atanh(action.clamp(-0.995, 0.995))
+
+        start = system.start()
+        if not policies:
+            start = system.rollout(start + 0.1, 200, act)[0][:, -1]  # on its cycle
+            start[:, :2] = 0.0
+        x, u, finite = system.rollout(start, args.steps, act)
+        if not bool(finite.all()):
+            fail(f"over {name} the motion is not finite")
+        value = search.reward(x[:, 1 : flags.horizon + 1], u[:, : flags.horizon]).sum().item()
+        print(f"{name}: {x[0, -1, 0] - x[0, 0, 0]:.2f} m, return {value:.1f}")
+        found.append([part[0].float() for part in (*x.split((system.nq, system.nv), -1), u.tanh())])
+    args.to.parent.mkdir(parents=True, exist_ok=True)
+    qpos, qvel, action = (torch.stack(parts).squeeze(0).numpy() for parts in zip(*found, strict=True))
+    about = dict(control_dt=np.float64(flags.control_dt), terrain=np.array(args.terrain))
+    np.savez_compressed(args.to, qpos=qpos, qvel=qvel, action=action, **about)  # type: ignore[arg-type]
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
