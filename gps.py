@@ -117,7 +117,7 @@ class Args(Flags):
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if (seen := find_task(self.env).actor_dim) is not None:
             fail(f"{self.env} shows its actor the first {seen} numbers of an observation, and this policy takes all")
-        if self.demonstration is None:
+        if not (self.demonstration or self.resume or self.evaluate):
             fail(f"--demonstration must be an example for {self.env}; shipped are those of {', '.join(PER_TASK)}")
         least = dict(horizon=2, guiding_samples=2, samples=2, active=self.guiding_samples + self.samples)
         for name, bound in least.items():
@@ -267,12 +267,9 @@ class Search:
         values = [phi(log_p, mixture, S.reward, 0.0).item() for log_p in log_pi]
         if not all(map(math.isfinite, values)):
             raise FloatingPointError(f"the value estimates are {values}: no active sample has a finite density")
-        log_w = log_weights(log_pi[0], mixture)
-        weights, guided = torch.softmax(log_w, 0), S.source < self.S.initial
-        nats = -log_w[guided, -1].mean().item() if self.S.initial else math.nan
-        metrics = {"gps/estimate": values[0], "gps/best_estimate": values[1], "gps/guide_nats": nats}
-        metrics["gps/ess"] = (1.0 / weights.square().sum(0)).mean().item()
-        metrics["gps/guide_share"] = (weights[guided].sum() / weights.sum()).item()
+        weights = torch.softmax(log_weights(log_pi[0], mixture), 0).sum(1)
+        share = (weights[S.source < self.S.initial].sum() / weights.sum()).item()
+        metrics = {"gps/estimate": values[0], "gps/best_estimate": values[1], "gps/guide_share": share}
         return values[0] > values[1], metrics
 
     def metrics(self, samples: Samples) -> dict[str, float]:
@@ -476,9 +473,8 @@ class SampleSet:
         self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
 
     def state_dict(self) -> dict[str, Any]:
-        return dict(
-            samples=tuple(self.samples), generators=packed(self.generators), best=self.best, initial=self.initial
-        )
+        numbers = {"best": self.best, "initial": self.initial}
+        return numbers | {"samples": tuple(self.samples), "generators": packed(self.generators)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.samples = Samples(*(tensor.to(self.system.device) for tensor in state["samples"]))

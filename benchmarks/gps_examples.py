@@ -75,8 +75,15 @@ class Args:
 
 
 def wave(x: Tensor) -> Tensor:
-    """Actions before tanh of a swimmer: the front joint oscillates, and the back one follows by a phase."""
-    raise NotImplementedError
+    """A swimmer's actions (n, 2) before tanh in states x (n, 10), found by a cross-entropy search for the return.
+
+    The front joint oscillates with a limited amplitude about a straight course; the back one follows, later and wider.
+    """
+    yaw, front, back, front_speed, back_speed = x[:, [2, 3, 4, 8, 9]].unbind(-1)
+    q, rate = front - 0.2 * yaw, front_speed / 18.4  # rad
+    first = -0.0725 * q + 0.0077 * (1 - (q.square() + rate.square()) / 1.435**2) * front_speed
+    second = 0.0854 * (2.055 * (0.946 * q + 0.323 * rate) - back) - 0.0045 * back_speed
+    return torch.stack((first, second), -1)
 
 
 @command
