@@ -29,7 +29,7 @@ def tune(
     checkpoint: Path | None = None,
     contact: tuple[Contact, ...] = (),
     device: str = "cpu",
-    states: Count = 16,
+    states: Count = 32,
     output: Path = Path("tune.png"),
     csv: Path | None = None,
     extremes: bool = False,

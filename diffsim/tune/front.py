@@ -48,7 +48,8 @@ def settings(task: type[Task], contact: str) -> list[Setting]:
     """What is measured on a contact model: the task's presets, and others around its default."""
     presets = task.presets(contact)
     default = presets["default"]
-    counts = sorted({max(1, round(factor * default.substeps)) for factor in FACTORS})
+    factors = (*FACTORS, 8.0) if default.constrained else FACTORS  # whose default has fewer substeps
+    counts = sorted({max(1, round(factor * default.substeps)) for factor in factors})
     if default.constrained:
         ends = *ENDS, (default.passes, default.tolerance)
         found = [default._replace(substeps=n, passes=passes, tolerance=end) for n in counts for passes, end in ends]
