@@ -42,7 +42,8 @@ PER_TASK = {
     "humanoid_imitation": ((256, 128), (128, 128), 2e-3, 5e-4, 0.995, 64, 2000),
 }
 # fmt: on
-BALANCING = {"g1": {"horizon": 16, "initial_log_std": -2.0, "initial_gain": 0.01}}  # it falls before it learns to walk
+STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01}  # near the pose from which a robot learns to walk
+BEGINNING = {"go1": STANDING, "go2": STANDING, "g1": STANDING | {"horizon": 16}}
 
 
 @dataclass
@@ -98,7 +99,7 @@ class Args(WindowFlags):
             values = {name: value for name, value in values.items() if name == "iterations"}
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
             values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
-        return super().task_defaults() | values | BALANCING.get(self.env, {})
+        return super().task_defaults() | values | BEGINNING.get(self.env, {})
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

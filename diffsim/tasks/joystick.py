@@ -58,14 +58,14 @@ def quadruped(order: Sequence[str]) -> Robot:
     legs = tuple(
         Leg(
             (f"{name}_thigh", f"{name}_hip"),
-            {f"{name}_thigh": 0.19, f"{name}_calf": -0.38},
+            {f"{name}_thigh": 0.22, f"{name}_calf": -0.44},
             (0.19 if name[0] == "F" else -0.19, 0.14 if name[1] == "L" else -0.14),
             0.0 if name in ("FL", "RR") else 0.5,
         )
         for name in order
     )
     joints = tuple(f"{name}_{part}" for name in order for part in ("hip", "thigh", "calf"))
-    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.065, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
+    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.075, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
 
 
 def humanoid() -> Robot:
@@ -273,7 +273,7 @@ class Joystick(Task):
         calm = 0.5 * score(velocity[..., 2].square(), 0.5) + 0.2 * score(angular[..., :2].square().sum(-1), 4.0)
         level = 0.4 * score(gravity[..., :2].square().sum(-1), 0.1)
         level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
-        gait = 0.5 * score(error.square().sum(-1), 0.3) + score(change.square().mean(-1), 0.2)
+        gait = 1.2 * score(error.square(), 0.05).mean(-1) + score(change.square().mean(-1), 0.2)
         feet = 0.4 * score(lift.square(), 0.0004).mean(-1) + 0.15 * slip.mean(-1)
         return self.alive - 0.5 * speed - 0.25 * yaw - calm - level - gait - feet
 
