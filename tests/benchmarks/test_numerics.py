@@ -19,13 +19,17 @@ SETTINGS = read_csv(RESULTS / "cpu" / "numerics_presets.csv")
 
 def test_the_page_has_the_tables_of_the_csv_files(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     page, cpu = (DOCS / "numerics.md").read_text(), RESULTS / "cpu"
-    for part in ("presets", "promise"):
+    for part in ("presets", "promise", "extremes"):
         numerics.main(numerics.Args(parts=(part,), draw_only=True, output=cpu, figures=tmp_path))
         printed = capsys.readouterr().out.partition("\n\n")[0]
         assert f"<!-- {part} -->\n{printed}\n<!-- /{part} -->" in page and "(none yet)" not in printed
     assert (tmp_path / "numerics.png").is_file()
     extremes.main(extremes.Args(parts=("newton",), draw_only=True, output=cpu))
     assert f"<!-- newton -->\n{capsys.readouterr().out.strip()}\n<!-- /newton -->" in page
+
+
+def test_every_task_is_driven_to_extremes() -> None:
+    assert {row["task"] for row in read_csv(RESULTS / "cpu" / "numerics_extremes.csv")} == {*diffsim.TASKS}
 
 
 def test_the_page_is_short() -> None:
@@ -58,9 +62,7 @@ def test_accurate_is_more_accurate_and_fast_is_faster() -> None:
 def test_more_substeps_never_cost_less() -> None:
     for _, own in grouped(SETTINGS, "task", "kind").items():
         costs = [float(row["us with gradient"]) for row in sorted(own, key=substeps)]
-        assert all(a <= 1.03 * b for a, b in zip(costs, costs[1:], strict=False)), (
-            own
-        )  # repeated timings differ by that
+        assert all(a <= 1.03 * b for a, b in zip(costs, costs[1:], strict=False)), own  # timings differ by that
 
 
 def substeps(row: Cells) -> int:
