@@ -33,9 +33,10 @@ from tables import Cells, Row, grouped
 import diffsim
 from diffsim.sim.integration import PASSES
 from diffsim.tasks import Accuracy, find_task
-from diffsim.training import Count
+from diffsim.training import Count, load_policy, parse
+from diffsim.training.checkpoint import POLICIES
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.monitor import apart
+from diffsim.training.monitor import Monitor, apart
 from diffsim.tune import actor, subject
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row as Measured
@@ -48,7 +49,7 @@ PROMISED = ("robot", "chosen", "error", "error on 200 others", "speed", "default
 USUAL = f", {PASSES} passes"  # of all presets on MuJoCo's contact
 WIDE = 4  # panels in a row of the picture
 SHOWN = ("task", "preset", "setting", "speed", "state 0.5 s", "gradient 8", "gradient 32")
-ITERATIONS, TURNS = 60, 2  # of trainings with and without the monitor
+TURNS, REPLAYS = 2, 20  # of trainings and of replays after each
 SEEDS, WARNING = 3, r"iteration (\d+): with \d+ times .* is (\S+) m or rad"  # of trainings that cheat
 CHEAT = "--integrator implicit --theta 1 --substeps 2".split()
 
@@ -140,27 +141,36 @@ def promised(rows: list[Cells]) -> list[Row]:
     return [{name: row[name] for name in PROMISED} for row in rows]
 
 
-def train(task: str, *flags: object) -> tuple[float, float, str]:
-    """Of a training's first iterations: all seconds, those of an iteration, and what it prints."""
+def train(task: str, *flags: object) -> tuple[float, str]:
+    """Of a training's first 99 iterations: seconds of one, and what it prints."""
     with TemporaryDirectory() as folder:
         words = [tables.ROOT / "shac.py", "--env", task, "--device", "cpu", "--eval-every", 0, "--save-every", 0]
-        words += ["--run-dir", folder, "--stop-after", *flags]
-        begin = time.perf_counter()
+        words += ["--run-dir", folder, "--stop-after", 99, *flags]
         done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, check=True)
-        whole = time.perf_counter() - begin
         seconds = [float(row["seconds"]) for row in tables.read_csv(Path(folder) / "progress.csv")]
-    half = len(seconds) // 2
-    return whole, (seconds[-1] - seconds[half - 1]) / (len(seconds) - half), done.stdout + done.stderr
+    return (seconds[-1] - seconds[len(seconds) // 2]) / (
+        len(seconds) - 1 - len(seconds) // 2
+    ), done.stdout + done.stderr
 
 
 def measure_monitor(args: Args, robot: str) -> Iterator[Row]:
-    """A replay takes what trainings with one in each iteration take longer than those without any, in turn."""
-    pairs = [[train(robot, ITERATIONS, "--monitor", n) for n in (0, 1)] for _ in range(TURNS + 1)][1:]  # now compiled
-    iteration = median(without[1] for without, _ in pairs)
-    replay = median((own[0] - without[0]) / ITERATIONS for without, own in pairs)
+    """Iterations of trainings in turn with replays of the shipped policy, whose length depends on no policy."""
+    parsed = parse(ParallelFlags, ["--env", robot, "--device", "cpu"])
+    policy = load_policy(POLICIES / f"{robot}.pt").network
+    iterations, replays = list[float](), list[float]()
+    for _ in range(TURNS):
+        iterations.append(train(robot, "--monitor", 0)[0])
+        env = diffsim.make(robot, parsed.num_envs, seed=0)
+        env.reset(seed=0)
+        watch = Monitor(parsed, env)
+        for _ in range(REPLAYS):
+            begin = time.perf_counter()
+            watch.replay(policy)
+            replays.append(time.perf_counter() - begin)
+    iteration, replay = median(iterations), median(replays)
     row: dict[str, object] = {"task": robot, "iteration (ms)": 1e3 * iteration, "replay (ms)": 1e3 * replay}
-    row["share"] = f"{replay / (ParallelFlags.monitor * iteration):.1%}"
-    found = [re.findall(WARNING, train(robot, 99, "--seed", seed, *CHEAT)[2]) for seed in range(1, SEEDS + 1)]
+    row["share"] = f"{replay / (parsed.monitor * iteration):.2%}"
+    found = [re.findall(WARNING, train(robot, "--seed", seed, *CHEAT)[1]) for seed in range(1, SEEDS + 1)]
     row["seeds"], row["warned"] = SEEDS, sum(map(bool, found))
     row |= {name: " ".join(each[0][k] for each in found if each) for k, name in enumerate(("at", "error"))}
     yield row
