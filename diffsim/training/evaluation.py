@@ -233,13 +233,13 @@ def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **foun
     """Print the gait, and leave gait.csv, evaluation.json and, if asked for, the video in the run's directory."""
     assert args.run_dir
     settings = {name: value for name, value in vars(args).items() if name in SETTINGS}
-    if numbers := evaluation.gait():
-        say(gait_lines(numbers))
     settings |= dict(script=args.script(), iteration=iteration)
     evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
-    rows = [(part, name, value) for part, values in numbers.items() for name, value in values.items()]
-    with (args.run_dir / "gait.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([("part", "number", "value"), *rows])
+    if numbers := evaluation.gait():
+        say(gait_lines(numbers))
+        rows = [(part, name, value) for part, values in numbers.items() for name, value in values.items()]
+        with (args.run_dir / "gait.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([("part", "number", "value"), *rows])
     if args.capture_video:
         try:
             say(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
