@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -75,10 +74,6 @@ class CommonFlags:
     def picture(self, name: str) -> Path:
         default = DOCS / "figures" / self.directory.name.replace("cpu", "")
         return (self.figures or (default if self.update_results else self.directory)) / f"{name}.png"
-
-    def link(self, name: str) -> str:
-        """A picture's address in a page."""
-        return os.path.relpath(self.picture(name), DOCS)
 
     def publish(self, name: str, text: str, page: str, everywhere: bool = False) -> None:
         """Print a table; with --update-results fill the part of a page that has its name.

@@ -129,12 +129,6 @@ def grouped(rows: Iterable[Cells], *columns: str) -> dict[tuple[str, ...], list[
     return groups
 
 
-def pivot(rows: Iterable[Cells], columns: Sequence[str], name: str, value: str) -> list[Mapping[str, object]]:
-    """A line for each group; its columns have the names in the column `name`, and the values beside them."""
-    groups = grouped(rows, *columns).items()
-    return [dict(zip(columns, key, strict=True)) | {row[name]: row[value] for row in own} for key, own in groups]
-
-
 def numbers(rows: Iterable[Cells], column: str) -> list[float]:
     """Those that a column has."""
     return [float(row[column]) for row in rows if row.get(column)]

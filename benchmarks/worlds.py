@@ -186,9 +186,9 @@ class Step(NamedTuple):
     fallen: Tensor  # (n,) who has fallen by then, or is lost
 
 
-def starts(env: DiffEnv, dtype: torch.dtype | None = None, seed: int = SEED) -> State:
+def starts(env: DiffEnv, dtype: torch.dtype | None = None) -> State:
     """The start states that all worlds share, those of an evaluation."""
-    env.reset(seed=seed)
+    env.reset(seed=SEED)
     nothing = torch.zeros(env.num_envs, env.scene.nu, device=env.device)
     parts = env.qpos, env.qvel, nothing, env.memory
     return State(*(part.to(dtype or env.dtype, copy=True) if part.is_floating_point() else part for part in parts))

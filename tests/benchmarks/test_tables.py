@@ -56,8 +56,9 @@ def test_results_of_a_gpu_have_places_of_their_own(monkeypatch: pytest.MonkeyPat
         common.CommonFlags(update_results=True),
         common.CommonFlags(output=Path("/elsewhere")),
     )
-    assert gpu.csv("speed") == common.RESULTS / "h100" / "speed.csv" and gpu.link("speed") == "figures/h100/speed.png"
-    assert cpu.csv("speed") == common.RESULTS / "cpu" / "speed.csv" and cpu.link("speed") == "figures/speed.png"
+    figures = common.DOCS / "figures"
+    assert gpu.csv("speed") == common.RESULTS / "h100" / "speed.csv" and gpu.picture("speed").parent == figures / "h100"
+    assert cpu.csv("speed") == common.RESULTS / "cpu" / "speed.csv" and cpu.picture("speed").parent == figures
     assert elsewhere.picture("speed") == Path("/elsewhere/speed.png")
 
 
