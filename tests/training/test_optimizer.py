@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Any
 
-import pytest
 import torch
 from learners import assert_same
 from torch import nn
@@ -61,51 +59,3 @@ def test_with_an_infinite_bound_large_gradients_are_followed_and_infinite_ones_s
             adam.step()
         torch.testing.assert_close(optimizer.vector, reference.detach())
     assert optimizer.skipped == 2
-
-
-def test_what_requires_no_gradient_stays() -> None:
-    module = network()
-    module[0].bias.requires_grad_(False)
-    bias = module[0].bias.detach().clone()
-    optimizer = ClippedAdam(module, 1.0, lr=0.1)
-    before = optimizer.vector.clone()
-    optimizer.step(module(torch.randn(4, 3)).square().sum())
-    assert torch.equal(module[0].bias, bias) and (optimizer.vector != before).all()
-    assert optimizer.vector.numel() == sum(p.numel() for p in module.parameters()) - bias.numel()
-
-
-def test_it_goes_on_from_its_state() -> None:
-    """With the norm and the decay rates that it was built with, and a learning rate that can still be filled."""
-    torch.manual_seed(0)
-    module = network()
-    optimizer = ClippedAdam(module, 1.0, (0.7, 0.95), lr=1e-2)
-    inputs = torch.randn(3, 20, 3)
-    optimizer.step(module(inputs[0]).square().mean())
-    optimizer.step(math.nan * module(inputs[0]).square().mean())
-    weights, state = copy.deepcopy(module.state_dict()), copy.deepcopy(optimizer.state_dict())
-
-    def go_on(betas: tuple[float, float], lr: float | None = None) -> torch.Tensor:
-        module = network()
-        module.load_state_dict(weights)
-        optimizer = ClippedAdam(module, 1.0, betas)
-        optimizer.load_state_dict(state)
-        assert_same(optimizer.state_dict(), state)
-        assert optimizer.skipped == 1 and optimizer.lr == 1e-2
-        if lr is not None:
-            optimizer.lr.fill_(lr)
-        for batch in inputs[1:]:
-            optimizer.step(module(batch).square().mean())
-        return optimizer.vector
-
-    for batch in inputs[1:]:
-        optimizer.step(module(batch).square().mean())
-    assert torch.equal(go_on((0.7, 0.95)), optimizer.vector)
-    assert not torch.equal(go_on((0.9, 0.999)), optimizer.vector)
-    assert torch.equal(go_on((0.7, 0.95), 0.0), torch.cat([weight.flatten() for weight in weights.values()]))
-
-
-def test_moments_of_another_shape_are_refused() -> None:
-    optimizer = ClippedAdam(network(), 1.0)
-    state = optimizer.state_dict()
-    with pytest.raises(ValueError, match="the state of an optimizer"):
-        optimizer.load_state_dict(state | {"adam": {0: state["adam"][0] | {"exp_avg": torch.zeros(3)}}})
