@@ -59,12 +59,15 @@ def test_gradient_is_the_finite_difference() -> None:
 
 
 def test_large_gradients_are_followed() -> None:
-    """An exploding gradient is what this baseline is about; test_optimizer.py has the rest."""
+    """An exploding gradient is what this baseline is about. An infinite one is skipped."""
     optimizer = build("cartpole").optimizer
     before, weights = optimizer.vector.clone(), optimizer.parameters
     optimizer.lr.fill_(1e-2)
     assert optimizer.step(1e15 * sum(weight.square().sum() for weight in weights)) > 1e15
     assert optimizer.skipped == 0 and not torch.equal(optimizer.vector, before)
+    before.copy_(optimizer.vector)
+    optimizer.step(torch.inf * sum(weight.square().sum() for weight in weights))
+    assert optimizer.skipped == 1 and torch.equal(optimizer.vector, before)
     assert optimizer.max_norm == 1.0 and optimizer.betas == (0.7, 0.95)
 
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import reference
 import torch
-from scenes import acceleration, free_states, parse, run, without
+from scenes import acceleration, free_states, parse, run
 from test_gradient import check_gradients
 
 from diffsim.sim.integration import Integration
@@ -79,8 +79,3 @@ def test_gradient_at_rest_is_the_viscous_one(rng):
     torch.testing.assert_close(slopes[300.0, 2.0], slopes[0.0, 2.0], rtol=1e-12, atol=0)
     torch.testing.assert_close(slopes[300.0, 0.0], slopes[1e-300, 0.0], rtol=1e-12, atol=0)
     assert not torch.allclose(slopes[0.0, 2.0], slopes[300.0, 0.0], rtol=0.1)
-
-
-def test_no_fluid_no_kernel_code():
-    scene = parse(FISH)
-    assert "drag" in scene.features and "drag" not in without(scene, "drag").features

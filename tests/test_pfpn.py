@@ -450,8 +450,6 @@ def test_settings_are_those_of_the_baselines(script: Any, baseline: Any, env: st
     ("script", "arguments", "message"),
     [
         (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
-        (pfpn, f"--hidden {2**62}", f"--hidden must be from 1 to 16,384, not {2**62}"),
-        (pfpn, "--dead 1", "--dead must be in [0, 1), not 1"),
         (pfpn, "--lr-bounds 1e-2 1e-3", "the lowest exceeds the highest"),
         (pfpn, "--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),
         (pfpn_sac, "--buffer-size 10", "--buffer-size 10 holds no window of 4096 steps"),

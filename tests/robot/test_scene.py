@@ -35,13 +35,6 @@ def test_carrier_is_no_slide_that_a_muscle_of_the_world_could_notice():
     assert parse(CRANE).carrier == 0 and without(parse(CRANE), "muscle").carrier == 2
 
 
-def test_features_are_those_of_the_arrays():
-    scene = task_scene("humanoid")
-    bare = without(scene, "contact", "limit", "stiffness", "damping")
-    assert bare.features == {"floating", "hinge", "motor"} < scene.features and bare.ncontact == 0
-    assert without(scene, "contact").features == scene.features - {"contact"}
-
-
 def test_only_the_links_before_the_first_load_are_inert():
     assert {name: task_scene(name).inert for name in ("hopper", "half_cheetah", "cartpole", "ant")} == {
         "hopper": 2,

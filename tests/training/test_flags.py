@@ -14,6 +14,10 @@ from learners import SCRIPTS, assert_refuses, refusal
 
 import bptt
 import diffsim
+import gps
+import mbpo
+import pfpn_sac
+import pods
 import ppo_baseline
 import sac_baseline
 import sapo
@@ -122,13 +126,13 @@ def test_ends_of_ranges_are_within(arguments: str) -> None:
     parse(shac.Args, ["--env", "cartpole", *arguments.split()])
 
 
-@pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
+@pytest.mark.parametrize("script", [*SCRIPTS.values(), gps, mbpo, pfpn_sac, pods, sac_baseline])
 def test_every_number_has_a_range(script: ModuleType) -> None:
-    """But the seed."""
+    """But the seed, and pods.py's order, of which there are two."""
     for name, hint in get_type_hints(script.Args, include_extras=True).items():
         value = getattr(script.Args, name)
         numbers = value if isinstance(value, tuple) else [value]
-        if name not in ("seed", "MAY_CHANGE") and type(numbers[0] if numbers else None) in (int, float):
+        if name not in ("seed", "order", "MAY_CHANGE") and type(numbers[0] if numbers else None) in (int, float):
             assert len(
                 [number for number, _ in ranges._ranges(hint, value) if number is not value or numbers == [value]]
             ) == len(numbers), name
