@@ -7,10 +7,7 @@ import pytest
 import torch
 
 import diffsim
-import sapo
-import shac
 from diffsim.sim.adjoint import ClipAdjoint, row_scales
-from diffsim.training import parse
 
 
 def twin(adjoint: np.ndarray, factor: float) -> np.ndarray:
@@ -84,11 +81,3 @@ def test_steps_without_gradients_and_what_is_no_factor() -> None:
     for factor in (-1.0, torch.nan, torch.inf, True, "5"):
         with pytest.raises(ValueError, match="adjoint_clip is .*, must be a factor of at least 0"):
             diffsim.make("cartpole", num_envs=2, adjoint_clip=factor)
-
-
-@pytest.mark.parametrize("kind", [shac.Args, sapo.Args])
-def test_the_default_depends_on_the_contact(kind: type[shac.Args | sapo.Args]) -> None:
-    ant = ["--env", "ant", "--device", "cpu"]
-    assert parse(kind, ant).adjoint_clip == 0.0
-    assert parse(kind, [*ant, "--contact", "mujoco"]).adjoint_clip > 0.0
-    assert parse(kind, [*ant, "--contact", "mujoco", "--adjoint-clip", "0"]).adjoint_clip == 0.0

@@ -1,8 +1,9 @@
-"""Gradients of single environments on MuJoCo's contact are heavy-tailed: one bad step outweighs a whole batch.
+"""Where gradients of single environments are heavy-tailed, one bad step outweighs a whole batch.
 
-So the adjoint, the loss's gradient with respect to a state, is clipped in each environment on its way back in time, as
-recurrent networks clip it at each step (Graves 2013, https://arxiv.org/abs/1308.0850, section 2.1; Pascanu et al. 2013,
-https://arxiv.org/abs/1211.5063, has the reasons), but to what is usual in the batch. docs/transfer.md has what it does.
+Then the adjoint, the loss's gradient with respect to a state, is clipped in each environment on its way back in time,
+as recurrent networks clip it at each step (Graves 2013, https://arxiv.org/abs/1308.0850, section 2.1; Pascanu et al.
+2013, https://arxiv.org/abs/1211.5063, has the reasons), but to what is usual in the batch. By default it is not;
+docs/transfer.md has what it does.
 """
 
 from __future__ import annotations

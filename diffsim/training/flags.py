@@ -29,7 +29,6 @@ ClipFile = Annotated[
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
-ADJOINT_CLIP = 5.0  # on MuJoCo's contact, whose gradients are heavy-tailed: docs/transfer.md
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -170,11 +169,7 @@ class WindowFlags(SymmetricFlags):
     MAY_CHANGE: ClassVar[tuple[str, ...]] = (*SymmetricFlags.MAY_CHANGE, "adjoint_clip")
 
     adjoint_clip: NonNegative = 0.0
-    """gradients with respect to a state of an environment are at most this many times the median (0: not clipped; per
-    --contact; docs/transfer.md)"""
-
-    def task_defaults(self) -> dict[str, Any]:
-        return super().task_defaults() | {"adjoint_clip": ADJOINT_CLIP if self.contact == "mujoco" else 0.0}
+    """gradients with respect to a state of an environment are at most this many times the median (0: not clipped)"""
 
 
 Args = TypeVar("Args", bound=Flags)
