@@ -42,7 +42,8 @@ PER_TASK = {
     "humanoid_imitation": ((256, 128), (128, 128), 2e-3, 5e-4, 0.995, 64, 2000),
 }
 # fmt: on
-STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01}  # near the pose from which a robot learns to walk
+# Near the pose from which a robot learns to walk
+STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01, "adjoint_clip": 5.0}
 BEGINNING = {"go1": STANDING, "go2": STANDING, "g1": STANDING | {"horizon": 16}}
 
 

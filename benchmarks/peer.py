@@ -119,7 +119,9 @@ def measure_speed(args: Args, name: Name) -> Iterator[Row]:
 
 def train(args: Args, name: Name) -> Iterator[Row]:
     """ppo_baseline.py's training, for some seconds. Its rollout is no CUDA graph: each control step in it is one."""
-    flags = f"--env {name} --seed {args.seed} --device {args.device} --contact mujoco {PPO} --run-dir".split()
+    flags = (
+        f"--env {name} --seed {args.seed} --device {args.device} --contact mujoco {PPO} --randomise --run-dir".split()
+    )
     settings = parse(ppo_baseline.Args, [*flags, f"{args.runs}/ppo_mujoco_warp/{name}__{args.seed}", *args.arguments])
     if settings.contact != "mujoco" or settings.randomise:
         fail("mujoco_warp has its own contact, which does not vary: leave out --contact and --randomise")

@@ -56,6 +56,7 @@ class Task:
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
+    randomise: ClassVar[tuple[str, ...]] = ()  # ranges that learners draw unless told otherwise, as in --randomise
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
     # Ranges of what `disturb` does, by names that --randomise may give: "latency" [control steps], "push" [m/s]

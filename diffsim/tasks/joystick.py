@@ -58,14 +58,14 @@ def quadruped(order: Sequence[str]) -> Robot:
     legs = tuple(
         Leg(
             (f"{name}_thigh", f"{name}_hip"),
-            {f"{name}_thigh": 0.22, f"{name}_calf": -0.44},
+            {f"{name}_thigh": 0.2, f"{name}_calf": -0.4},
             (0.19 if name[0] == "F" else -0.19, 0.14 if name[1] == "L" else -0.14),
             0.0 if name in ("FL", "RR") else 0.5,
         )
         for name in order
     )
     joints = tuple(f"{name}_{part}" for name in order for part in ("hip", "thigh", "calf"))
-    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.075, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
+    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.068, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
 
 
 def humanoid() -> Robot:
@@ -103,6 +103,13 @@ class Joystick(Task):
     robot: ClassVar[Robot]
     contact: ClassVar[Contact] = "mujoco"
     symmetric = True
+    randomise: ClassVar[tuple[str, ...]] = (
+        "friction=0.7:1.3",
+        "mass=0.85:1.15",
+        "motor=0.8:1.2",
+        "latency=0:1",
+        "push=0:0.5",
+    )
     substeps = 4
     control_dt = 0.02
     episode_length = 1000
@@ -110,6 +117,7 @@ class Joystick(Task):
     forward_column = None  # what counts is the command
     touchdown: ClassVar[bool] = True
     alive: ClassVar[float] = 4.0  # reward of a perfect step
+    smooth: ClassVar[float] = 2.0  # weight of changes of the action
     # By how much the actions of an episode come late; how large the pushes are that come at random
     disturbances = MappingProxyType({"latency": (0.0, 0.0), "push": (0.0, 0.0)})
 
@@ -273,7 +281,7 @@ class Joystick(Task):
         calm = 0.5 * score(velocity[..., 2].square(), 0.5) + 0.2 * score(angular[..., :2].square().sum(-1), 4.0)
         level = 0.4 * score(gravity[..., :2].square().sum(-1), 0.1)
         level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
-        gait = 1.2 * score(error.square(), 0.05).mean(-1) + score(change.square().mean(-1), 0.2)
+        gait = 1.2 * score(error.square(), 0.05).mean(-1) + self.smooth * score(change.square().mean(-1), 0.2)
         feet = 0.4 * score(lift.square(), 0.0004).mean(-1) + 0.15 * slip.mean(-1)
         return self.alive - 0.5 * speed - 0.25 * yaw - calm - level - gait - feet
 
@@ -299,5 +307,5 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
-    alive = 2.5
+    alive, smooth, randomise = 2.5, 1.0, ()
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise

@@ -130,11 +130,14 @@ class ParallelFlags(Flags):
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
     randomise: tuple[str, ...] = ()
-    """ranges drawn for each environment: friction=0.7:1.3 stiffness mass motor, and of a joystick latency push"""
+    """ranges drawn for each environment: friction=0.7:1.3 stiffness mass motor, of joysticks latency push (per task)"""
     redraw: Count = 10
     """iterations between drawings of the factors"""
     monitor: Natural = 50
     """iterations between replays of a window with 4 times the substeps (sim/state_error, sim/return_lost); 0: none"""
+
+    def task_defaults(self) -> dict[str, Any]:
+        return {"randomise": find_task(self.env).randomise}
 
     def check(self) -> None:
         super().check()
@@ -154,7 +157,7 @@ class SymmetricFlags(ParallelFlags):
     """in a state's mirror image the policy does the mirror image of what it does there (per task; docs/sapo.md)"""
 
     def task_defaults(self) -> dict[str, Any]:
-        return {"symmetric": find_task(self.env).symmetric}
+        return super().task_defaults() | {"symmetric": find_task(self.env).symmetric}
 
     def check(self) -> None:
         super().check()
