@@ -19,7 +19,7 @@ SETTINGS = read_csv(RESULTS / "cpu" / "numerics_presets.csv")
 
 def test_the_page_has_the_tables_of_the_csv_files(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     page, cpu = (DOCS / "numerics.md").read_text(), RESULTS / "cpu"
-    for part in ("presets", "promise", "extremes"):
+    for part in numerics.PARTS:
         numerics.main(numerics.Args(parts=(part,), draw_only=True, output=cpu, figures=tmp_path))
         printed = capsys.readouterr().out.partition("\n\n")[0]
         assert f"<!-- {part} -->\n{printed}\n<!-- /{part} -->" in page and "(none yet)" not in printed
@@ -87,6 +87,12 @@ def test_the_promise_is_kept() -> None:
     rows = read_csv(RESULTS / "cpu" / "numerics_promise.csv")
     assert {row["robot"] for row in rows} == {"go2", "g1", "hopper", "own_robot", "walker", "humanoid_CMU"}
     assert all(float(row["times 0.01"]) <= 1.5 for row in rows)
+
+
+def test_the_monitor_is_cheap_and_warns_of_a_policy_that_cheats() -> None:
+    for row in read_csv(RESULTS / "cpu" / "numerics_monitor.csv"):
+        assert float(row["share"].strip("%")) < 2 and int(row["warned"]) >= 2  # the third one barely moves
+        assert all(int(iteration) < 100 for iteration in row["at"].split())
 
 
 def test_a_robot_that_there_is_not_ends_the_benchmark_with_one_line(tmp_path: Path) -> None:
