@@ -2,7 +2,6 @@
 
     python benchmarks/transfer.py runs/learning/shac/ant__1            a run, or a checkpoint of any learner's script
     python benchmarks/transfer.py runs/learning/*/* --friction 0.5 0.7 1 1.3 1.5
-    python benchmarks/transfer.py runs/learning/shac/ant__1 --episodes 8 --video both.mp4
 
 A policy acts from the same start states in several worlds, of which each step changes one thing:
 
@@ -14,8 +13,7 @@ A policy acts from the same start states in several worlds, of which each step c
 
 A policy that peer.py trained in mujoco_warp was trained in "MuJoCo same", and what it keeps is its share of that speed.
 
-Writes transfer.csv, a row for each policy and world, and with --update-results the table of docs/transfer.md. The video
-shows the episode of median return here (left), and its start in MuJoCo (right).
+Writes transfer.csv, a row for each policy and world, and with --update-results the table of docs/transfer.md.
 """
 
 from __future__ import annotations
@@ -36,8 +34,7 @@ import diffsim
 from diffsim import DiffEnv, Integration, Scene, Simulator
 from diffsim.training import Count, Positive, fail, gait
 from diffsim.training.checkpoint import HOME
-from diffsim.training.evaluation import FINER, VIDEO_SECONDS
-from diffsim.view import render
+from diffsim.training.evaluation import FINER
 
 SAME = "MuJoCo same"  # with the law and the substeps of contact mujoco
 
@@ -48,7 +45,6 @@ class Args(common.CheckpointFlags):
     steps: Count = 1000  # control steps at most
     friction: tuple[Positive, ...] = (0.5, 1.0, 1.5)  # friction in MuJoCo, in multiples of the file's mu
     finer: Count = FINER  # steps of "finer" in multiples of the task's substeps
-    video: Path | None = None  # write the episode of median return, here and in MuJoCo side by side: .mp4 or .gif
 
 
 def speed(motion: Motion, control_dt: float, forward: int) -> float:
@@ -109,7 +105,7 @@ def conditions(case: Case, args: Args) -> dict[str, World]:
 def measure(args: Args, path: Path) -> Iterator[Row]:
     """A row for each world. What cannot be compared ends the benchmark with one line."""
     case = load_case(path, args.episodes, args.device)
-    env, how, motions, own = case.env, case.env.sim.integration, dict[str, Motion](), math.nan
+    env, how, own = case.env, case.env.sim.integration, math.nan
     trained_on = f"{case.path} was trained on {env.task.name}, whose"
     if "muscle" in env.scene.features:
         fail(f"{trained_on} muscles are not simulated in MuJoCo here")
@@ -117,15 +113,13 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         fail(f"{trained_on} policy depends on the past: choose one of another task")
     flags = {"episodes": args.episodes, "steps": args.steps, "finer": args.finer}
     for name, world in conditions(case, args).items():
-        motion = motions[name] = travel(case, world, args.steps)
+        motion = travel(case, world, args.steps)
         row = case.about | {"trained in": case.saved.simulator, "condition": name}
         row |= {"integrator": how.integrator, "substeps": how.substeps} | summary(motion, env)
         if isinstance(value := row["speed"], float):
-            own = value if len(motions) == 1 else own
+            own = value if math.isnan(own) else own
             row["kept"] = value / own
         yield row | flags
-    if args.video:
-        film(args.video, env, motions["here"], motions["MuJoCo x1"])
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
@@ -160,30 +154,7 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
-def film(path: Path, env: DiffEnv, here: Motion, there: Motion) -> None:
-    """The episode of median return here (left), and its start there (right), small as a gif; the fallen lie there."""
-    episode = int(here.returns.argsort()[(len(here.returns) - 1) // 2])
-    stride = max(1, math.ceil(1 / (render.VIDEO_FPS * env.control_dt) - 1e-6))
-    size, seconds = ((288, 208), 4.0) if path.suffix == ".gif" else (render.VIDEO_SIZE, VIDEO_SECONDS)
-    count = min(max(here.lengths[episode], there.lengths[episode]), round(seconds / env.control_dt))
-    with render.Renderer(env.scene, *size) as left, render.Renderer(env.scene, *size) as right:
-        sides = (left, here), (right, there)
-        frames = (
-            np.concatenate([side.draw(m.qpos[min(k, m.lengths[episode]), episode]) for side, m in sides], 1)
-            for k in range(0, count, stride)
-        )
-        print(render.save_video(path, frames, 1 / (stride * env.control_dt)))
-
-
 def main(args: Args) -> None:
-    if args.video:
-        if len(args.measured) != 1 or 1.0 not in args.friction:
-            fail("--video shows one checkpoint, and MuJoCo at the file's friction (--friction 1)")
-        try:
-            render.check_video(args.video, (2 * render.VIDEO_SIZE[0], render.VIDEO_SIZE[1]))
-            render.check_opengl()
-        except (ValueError, RuntimeError) as error:
-            fail(f"--video: {error}")
     measured(args, Part("transfer", measure, (*ABOUT[:-1], "condition"), "transfer", "transfer.md", table))
 
 

@@ -1,26 +1,41 @@
-"""Pictures of policies at work, written to docs/figures: a gif of each task, a strip of frames.
+"""Pictures of policies at work, written to docs/figures: a film of each task, a strip of frames.
 
-    python tools/draw.py loops
+    python tools/draw.py films                                # of all policies in diffsim/policies
+    python tools/draw.py films diffsim/policies/go2.pt
     python tools/draw.py gait runs/<run>/checkpoint.pt --start 2 --every 0.1 --frames 8
 
-Muscles are coloured by activation, as in the SHAC paper's Figure 5. A gif shows the median one of several episodes of
-the policy in diffsim/policies; that of a runner ends where it resembles its first frame most, so that it plays in a
-loop. The gait is that of the first of a few random episodes that lasts long enough.
+A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own contact on the file of the robot, from
+the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
+that it plays in a loop; a robot that falls or does not travel is shown from its start. Robots that follow commands go
+forward, above a diagram of the time in which each foot is on the ground (Hildebrand 1965). Muscles, which are not
+simulated in MuJoCo, are coloured by activation, as in the SHAC paper's Figure 5. The gait is that of the first of a few
+random episodes that lasts long enough.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import tyro
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 from tyro.conf import Positional
 
+from diffsim import Scene
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
-from diffsim.training import Evaluation, command, evaluate, fail, load_policy, make_policy_env
-from diffsim.view.render import Frame, Renderer, save_video
+from diffsim.tasks.joystick import Joystick
+from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.training.gait import TOUCHING, contact_bodies, trace
+from diffsim.view.render import Frame, Renderer, whole_file
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from common import Case, load_case  # noqa: E402
+from worlds import Here, MuJoCo, World, in_double, rollout, starts  # noqa: E402
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 # How many times closer than the robot's camera, and at which share of that one's height the picture's middle is.
@@ -34,47 +49,152 @@ CLOSER = {
     "go2": (1.3, 0.55),
     "g1": (1.4, 0.51),
 }
+FLOOR, AROUND = 2.0, 2.8  # m after which the floor repeats; s that a robot with a clock takes for it, in whole cycles
+LEAST_FPS, QUALITY = 30.0, 45  # of a film; WebP's, of 100
+ROW, LABELS = 16, 56  # pixels of a foot's line in the diagram, and of its name
+INK, PAPER, PALE = (40, 46, 58), (255, 255, 255), (226, 230, 236)
 
 
-def loops(
-    tasks: tuple[str, ...] = tuple(CLOSER),
-    size: tuple[int, int] = (320, 240),
-    every: int = 3,
+class Motion(NamedTuple):
+    """What a robot does in one world, as frames."""
+
+    qpos: NDArray[np.float64]  # (F, nq)
+    action: NDArray[np.float64]  # (F, nu)
+    fallen: bool  # by the end
+
+    def part(self, begin: int, length: int | None = None) -> Motion:
+        return self._replace(qpos=self.qpos[begin:][:length], action=self.action[begin:][:length])
+
+
+def films(
+    checkpoints: Positional[tuple[Path, ...]] = (),
+    size: tuple[int, int] = (480, 320),
     start: float = 2.0,
-    seconds: tuple[float, float] = (2.0, 3.0),
+    seconds: tuple[float, float] = (1.4, 2.4),
+    beside: bool = True,
 ) -> None:
-    """A gif of each trained policy that comes with the package.
+    """A film of each policy, called as its task.
 
     Args:
-        tasks: which ones.
-        size: width and height in pixels.
-        every: control steps between frames.
-        start: seconds into the episode before which no loop begins; a cart-pole is shown from its start.
-        seconds: least and most of a loop; a cart-pole, which does not travel, is shown for 3.5 s.
+        checkpoints: of any script; else those that come with the package.
+        size: width and height of a world's picture in pixels.
+        start: seconds into the episode before which no loop begins.
+        seconds: least and most of a loop, unless the robot has a clock; what is shown from its start takes 3.5 s.
+        beside: MuJoCo, too; else the file is called <task>_here.webp.
     """
-    for task in tasks:
-        episodes = episodes_of(Path(str(POLICIES / f"{task}.pt")), DEMO_EPISODES)
-        qpos, action = (rows[::every] for rows in episodes.median_episode())
-        (zoom, middle), (width, height) = CLOSER[task], size
-        wide, high = round(2 * zoom * width), round(2 * zoom * height)
-        left, top = wide // 2 - width, round(middle * high) - height
-        with Renderer(episodes.scene, wide, high) as renderer:
-            drawn = map(renderer.draw, qpos, action)
-            frames = [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in drawn]
-        fps = 1 / (every * episodes.control_dt)
-        first, last = 0, round(3.5 * fps)
-        if episodes.speed is not None:
-            first, last = find_loop(frames, round(start * fps), *(round(length * fps) for length in seconds))
-        path = save_video(FIGURES / f"{task}.gif", frames[first:last], fps)
-        print(f"{path}, {(last - first) / fps:.2f} s, {path.stat().st_size / 1000:.0f} kB")
+    for checkpoint in checkpoints or [POLICIES / f"{task}.pt" for task in CLOSER]:
+        case = load_case(checkpoint, DEMO_EPISODES, "cpu")
+        task, dt = case.env.task, case.env.control_dt
+        every = max(1, int(1 / (LEAST_FPS * dt) + 1e-6))
+        fps, clock = 1 / (every * dt), isinstance(task, Joystick)
+        shortest, longest = (stride(task), stride(task)) if isinstance(task, Joystick) else seconds
+        sides = motions(case, round((start + longest + 2.0) / dt), every, beside)
+        if any(motion.fallen for motion in sides.values()) or not (clock or task.forward_column is not None):
+            sides = {name: motion.part(0, round(3.5 * fps)) for name, motion in sides.items()}
+            pictures = {name: drawn(case, motion, size) for name, motion in sides.items()}
+        else:
+            sides = {name: motion.part(round(start * fps)) for name, motion in sides.items()}
+            pictures = {name: drawn(case, motion, size) for name, motion in sides.items()}
+            lengths = round(shortest * fps), round(longest * fps)  # a clock keeps both worlds in step
+            begins, length = find_loop([*pictures.values()], *lengths, together=clock)
+            for name, begin in zip(sides, begins, strict=True):
+                sides[name] = sides[name].part(begin, length)
+                pictures[name] = pictures[name][begin:][:length]
+        shown = {name: [titled(frame, name) for frame in frames] for name, frames in pictures.items()}
+        if clock:
+            for name, frames in shown.items():
+                below = diagrams(case.env.scene, sides[name].qpos, size[0])
+                shown[name] = [np.concatenate(both) for both in zip(frames, below, strict=True)]
+        frames = [np.concatenate(row, axis=1) for row in zip(*shown.values(), strict=True)]
+        path = save_webp(FIGURES / f"{task.name}{'' if beside else '_here'}.webp", frames, fps)
+        print(f"{path}, {len(frames) / fps:.2f} s, {fps:.0f} frames/s, {path.stat().st_size / 1000:.0f} kB")
 
 
-def find_loop(frames: Sequence[Frame], start: int, shortest: int, longest: int) -> tuple[int, int]:
-    """The range of frames whose end resembles its begin most: gait and floor, of which 8 x 8 pixels are compared."""
-    small = np.array([frame[::8, ::8] for frame in frames], dtype=np.float32)
-    lengths = range(shortest, longest + 1)
-    ranges = [(first, first + length) for length in lengths for first in range(start, len(frames) - length)]
-    return min(ranges, key=lambda ends: np.abs(small[ends[1]] - small[ends[0]]).mean())
+def drawn(case: Case, motion: Motion, size: tuple[int, int]) -> list[Frame]:
+    """Pictures as near as CLOSER says, drawn with twice as many pixels a side: smooth edges."""
+    zoom, middle = CLOSER.get(case.env.task.name, (1.0, 0.5))
+    width, height, wide, high = *size, *(round(2 * zoom * side) for side in size)
+    left, top = wide // 2 - width, round(middle * high) - height
+    with Renderer(case.env.scene, wide, high) as renderer:
+        whole = map(renderer.draw, motion.qpos, motion.action)
+        return [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in whole]
+
+
+def stride(task: Joystick) -> float:
+    """Seconds of the cycles in which a commanded robot crosses what of the floor repeats."""
+    return round(AROUND * task.robot.cycle) / task.robot.cycle
+
+
+def motions(case: Case, steps: int, every: int, beside: bool) -> dict[str, Motion]:
+    """A frame for `every` of so many control steps, of the episode of median return here, by the name of the world."""
+    env, task, start, found, episode = case.env, in_double(case.env), starts(case.env, torch.float64), {}, -1
+    worlds: dict[str, World] = {"diffsim": Here(env.sim)}
+    if beside and "muscle" not in env.scene.features:
+        exact = env.sim.integration.constrained
+        worlds["MuJoCo"] = MuJoCo(env.scene, env.num_envs, env.control_dt, own_friction=exact)
+    if isinstance(task, Joystick):
+        start.memory[:, :3] = torch.tensor((FLOOR / stride(task), 0.0, 0.0))
+    for name, world in worlds.items():
+        taken = [*rollout(world, task, case.saved.network, start, steps)]
+        states = [step.state for step in taken[::every]]
+        fallen = torch.stack([step.fallen for step in taken])
+        if episode < 0:
+            returns = torch.stack([step.reward for step in taken]).masked_fill(fallen, 0.0).sum(0)
+            episode = int(returns.median(0).indices)
+        qpos, action = (torch.stack([getattr(x, part)[episode] for x in states]).numpy() for part in ("qpos", "action"))
+        found[name] = Motion(qpos, action, bool(fallen[-1, episode]))
+    return found
+
+
+def find_loop(sides: Sequence[Sequence[Frame]], shortest: int, longest: int, together: bool) -> tuple[list[int], int]:
+    """First frames, and the length after which these are resembled most: gait and floor, compared by 8 x 8 pixels.
+
+    Args:
+        together: all sides begin at the same time.
+    """
+    best, begins, taken = float(np.inf), [0], shortest
+    small = [np.array([frame[::8, ::8] for frame in frames], dtype=np.float32) for frames in sides]
+    for length in range(shortest, longest + 1):
+        gaps = [np.abs(side[length:] - side[:-length]).mean((1, 2, 3)) for side in small]
+        gaps = [sum(gaps, np.zeros(len(gaps[0])))] * len(gaps) if together else gaps
+        if (gap := sum(float(each.min()) for each in gaps)) < best:
+            best, begins, taken = gap, [int(each.argmin()) for each in gaps], length
+    return begins, taken
+
+
+def titled(frame: Frame, text: str) -> Frame:
+    picture = Image.fromarray(frame)
+    ImageDraw.Draw(picture).text((10, 6), text, INK, ImageFont.load_default(18))
+    return np.asarray(picture)
+
+
+def diagrams(scene: Scene, qpos: NDArray[np.float64], width: int) -> list[Frame]:
+    """Of each row qpos (T, nq) one: bars for the time in which a foot is on the ground, and a line at the row's."""
+    (depth, _), bodies, right = trace(scene, qpos), contact_bodies(scene), width - 8
+    touching = {scene.mj_model.body(b).name: (depth[:, bodies == b] > 0).any(1) for b in np.unique(bodies)}
+    feet = {name: down for name, down in touching.items() if down.mean() >= TOUCHING}
+    sheet = Image.new("RGB", (width, ROW * len(feet) + 12), PAPER)
+    draw, at = ImageDraw.Draw(sheet), np.linspace(LABELS, right, len(qpos) + 1)
+    for line, (name, down) in enumerate(feet.items()):
+        top = 6 + ROW * line
+        draw.text((10, top), name.split("_")[0], INK, ImageFont.load_default(12))
+        draw.rectangle((LABELS, top + 3, right, top + ROW - 3), PALE)
+        for k in np.flatnonzero(down).tolist():
+            draw.rectangle((at[k], top + 3, at[k + 1], top + ROW - 3), INK)
+    pictures = [sheet.copy() for _ in qpos]
+    for k, picture in enumerate(pictures):
+        ImageDraw.Draw(picture).line((at[k], 2, at[k], sheet.height - 3), (214, 60, 40), 2)
+    return [np.asarray(picture) for picture in pictures]
+
+
+def save_webp(path: Path, frames: Sequence[Frame], fps: float) -> Path:
+    """Written as an animation that repeats for ever; its delays are milliseconds."""
+    first, *others = map(Image.fromarray, frames)
+    delays = np.diff(np.round(np.arange(len(frames) + 1) * 1000 / fps)).astype(int).tolist()
+    with whole_file(path) as part:
+        how = dict(format="WEBP", duration=delays, loop=0, quality=QUALITY, method=4)
+        first.save(part, save_all=True, append_images=others, **how)
+    return path
 
 
 def gait(
@@ -89,23 +209,17 @@ def gait(
         frames: how many.
         size: width and height of a frame in pixels.
     """
-    from PIL import Image
-
-    episodes = episodes_of(checkpoint, 16)
+    saved = load_policy(checkpoint)
+    episodes = evaluate(make_policy_env(saved, 16), saved.network)
     wanted = [round((start + k * every) / episodes.control_dt) for k in range(frames)]
     lasting = episodes.lengths > wanted[-1]
     if not lasting.any():
         fail(f"none of {len(lasting)} episodes lasts {start + (frames - 1) * every:.2f} s")
     qpos, action = (rows[wanted] for rows in episodes.episode(int(lasting.int().argmax())))
-    path = FIGURES / f"{load_policy(checkpoint).args['env']}_gait.png"
+    path = FIGURES / f"{saved.args['env']}_gait.png"
     with Renderer(episodes.scene, 2 * size, 2 * size) as renderer:
         Image.fromarray(halve(np.concatenate([*map(renderer.draw, qpos, action)], axis=1))).save(path)
     print(path)
-
-
-def episodes_of(checkpoint: Path, count: int) -> Evaluation:
-    saved = load_policy(checkpoint)
-    return evaluate(make_policy_env(saved, count), saved.network)
 
 
 def halve(frame: Frame) -> Frame:
@@ -117,7 +231,7 @@ def halve(frame: Frame) -> Frame:
 @command
 def main() -> None:
     torch.set_num_threads(1)
-    tyro.extras.subcommand_cli_from_dict({"loops": loops, "gait": gait}, description=__doc__)
+    tyro.extras.subcommand_cli_from_dict({"films": films, "gait": gait}, description=__doc__)
 
 
 if __name__ == "__main__":

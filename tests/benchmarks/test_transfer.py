@@ -93,11 +93,3 @@ def test_what_cannot_be_compared(name: str, message: str, tmp_path: Path, capsys
         torch.save(state | {"args": state["args"] | {"env": "juggler"}}, path)
     args = parse(transfer.Args, None, [str(path)] if name else [])
     assert message in refusal(lambda: transfer.main(args), capsys)
-
-
-def test_a_video_shows_both_worlds(opengl: None, tmp_path: Path) -> None:
-    env = diffsim.make("hopper", 1)
-    qpos = env.qpos.double().numpy()
-    motion = transfer.Motion(np.stack([qpos] * 9), np.zeros((9, 1, 6)), np.zeros(1), np.array([8]), np.array([False]))
-    transfer.film(tmp_path / "both.gif", env, motion, motion)
-    assert (tmp_path / "both.gif").stat().st_size > 1_000

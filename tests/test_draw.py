@@ -1,0 +1,70 @@
+"""tools/draw.py: films that play in a loop, and the diagram of feet."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+import diffsim
+from diffsim.tasks.joystick import Go2
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+import draw  # noqa: E402
+
+
+def test_a_loop_ends_where_it_begins() -> None:
+    """Periods of 20 frames; the first side is disturbed before frame 10, the second from frame 50 on."""
+    drawn, turn = np.random.default_rng(1), 2 * np.pi * np.arange(70) / 20
+    shade = 100 + 50 * np.sin(turn[:, None, None, None] + drawn.uniform(0, 6, (16, 24, 3)))
+    left, right = shade.copy(), shade.copy()
+    left[:10], right[50:] = drawn.uniform(0, 255, (10, 16, 24, 3)), drawn.uniform(0, 255, (20, 16, 24, 3))
+    sides = [[*left.astype(np.uint8)], [*right.astype(np.uint8)]]
+    (one, other), length = draw.find_loop(sides, 15, 25, together=False)
+    assert length == 20 and one >= 10 and other + 20 < 50
+    begins, length = draw.find_loop(sides, 15, 25, together=True)
+    assert length == 20 and begins[0] == begins[1] and 10 <= begins[0] < 30
+
+
+def test_bars_show_which_feet_are_on_the_ground() -> None:
+    """Of a Go2 that stands, then hangs in the air, then stands again; the line moves from left to right."""
+    scene, task = Go2.load_robot(), Go2()
+    qpos = np.tile(np.array(task.start[: scene.nq]), (9, 1))
+    qpos[:, 2] -= 0.02  # its feet are in the ground
+    qpos[3:6, 2] += 0.2
+    pictures = draw.diagrams(scene, qpos, 236)
+    assert [picture.shape for picture in pictures] == [(12 + 4 * draw.ROW, 236, 3)] * 9
+    width = (236 - 8 - draw.LABELS) / 9
+    for row in range(4):
+        line = pictures[0][6 + draw.ROW * row + draw.ROW // 2]
+        for k in range(1, 9):
+            wanted = draw.PALE if 3 <= k < 6 else draw.INK
+            assert tuple(line[round(draw.LABELS + width * (k + 0.5))]) == wanted
+    assert all(tuple(picture[4, round(draw.LABELS + width * k)]) == (214, 60, 40) for k, picture in enumerate(pictures))
+
+
+def test_webp_plays_at_true_speed_for_ever(tmp_path: Path) -> None:
+    frames = [np.full((16, 32, 3), shade, np.uint8) for shade in np.linspace(0, 250, 30)]
+    path = draw.save_webp(tmp_path / "film.webp", frames, 30.0)
+    with Image.open(path) as film:
+        shown = [(frame.load(), frame.info["duration"])[1] for frame in ImageSequence.Iterator(film)]
+        assert film.info["loop"] == 0 and film.size == (32, 16)
+    assert len(shown) == 30 and sum(shown) == 1000
+
+
+@pytest.mark.slow
+def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one with a clock, both worlds above diagrams, and of one without, alone."""
+    monkeypatch.setattr(draw, "FIGURES", tmp_path)
+    policies = Path(diffsim.__file__).parent / "policies"
+    draw.films((policies / "go2.pt",), size=(96, 64))
+    draw.films((policies / "ant.pt",), size=(96, 64), beside=False)
+    with Image.open(tmp_path / "go2.webp") as both, Image.open(tmp_path / "ant_here.webp") as one:
+        assert both.size == (2 * 96, 64 + 12 + 4 * draw.ROW) and one.size == (96, 64)
+        cycles = both.n_frames * Go2.control_dt * Go2.robot.cycle  # type: ignore[attr-defined]
+        assert cycles == pytest.approx(round(cycles), abs=Go2.robot.cycle * Go2.control_dt)
+        assert 1.4 * 30 <= one.n_frames <= 2.4 * 30  # type: ignore[attr-defined]
