@@ -1,0 +1,75 @@
+"""benchmarks/gps_examples.py and gps_stability.py: what is recorded and shipped, and how fast a policy leaves it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import gps_examples
+import gps_stability
+import numpy as np
+import pytest
+import torch
+from learners import SMALL, refusal, run
+
+import diffsim
+import gps
+import shac
+from diffsim.planning import System, load_demonstration
+from diffsim.training import parse
+from diffsim.training.evaluation import make_env
+
+
+@pytest.mark.parametrize("env", gps.PER_TASK)
+def test_each_shipped_example_is_a_motion_of_its_robot(env: str) -> None:
+    """The simulator follows it to its end."""
+    args = parse(gps.Args, ["--env", env, "--device", "cpu"])
+    search = gps.Search(args, make_env(args, 1))
+    ((system, x, u),) = search.examples()
+    plan = search.plan(system, x, u)
+    torch.testing.assert_close(plan.x[0, :, : system.nq], x[:, : system.nq], rtol=0.0, atol=0.05)
+
+
+@pytest.mark.parametrize("task", [gps_examples.HopperExample, gps_examples.WalkerExample])
+def test_tasks_of_examples_have_the_reward_of_gps(task: type[gps_examples.Hopper]) -> None:
+    """But for what a step without error earns, and actions after tanh."""
+    name = task.name.removesuffix("_example")
+    args = parse(gps.Args, ["--env", name, "--device", "cpu"])
+    search = gps.Search(args, make_env(args, 1))
+    assert (task.control_dt, task.substeps) == (args.control_dt, args.substeps)
+    own = System(diffsim.make(task, 1, control_dt=args.control_dt, substeps=args.substeps))
+    x = search.system.start() + 0.05 * torch.randn(6, search.system.nx, generator=torch.Generator().manual_seed(1))
+    still = torch.zeros(6, search.system.nu, dtype=torch.float64)
+    torch.testing.assert_close(own.reward(x, still), gps_examples.ALIVE + search.reward(x, still))
+
+
+def test_a_recorded_policy(tmp_path: Path) -> None:
+    """Its states follow from its actions; in the second half it may see another speed, and acts otherwise."""
+    run(shac, tmp_path / "run", *SMALL["shac"])
+    found = []
+    for name, switch in (("one", 0.0), ("other", 5.0)):
+        words = dict(to=tmp_path / f"{name}.npz", env="cartpole", run=tmp_path / "run", steps=12)
+        gps_examples.main(gps_examples.Args(**words, switch=switch))  # type: ignore[arg-type]
+        system = System(diffsim.make("cartpole", 1))
+        ((x, u),) = load_demonstration(system, tmp_path / f"{name}.npz", 12)
+        played, _, _ = system.rollout(x[:1], 12, lambda t, _, u=u: u[t : t + 1])
+        torch.testing.assert_close(played[0], x, rtol=0.0, atol=1e-5)
+        found.append(u)
+    one, other = found
+    assert torch.equal(one[:6], other[:6]) and (one[6:] != other[6:]).any()
+
+
+def test_a_swimmer_swims_forward(tmp_path: Path) -> None:
+    gps_examples.main(gps_examples.Args(to=tmp_path / "swim.npz", env="swimmer", steps=60))
+    x = np.load(tmp_path / "swim.npz")["qpos"][:, 0]
+    assert x[0] == 0.0 and x[-1] > 0.6 * 60 * 0.05
+
+
+def test_without_a_run_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = gps_examples.Args(to=tmp_path / "a.npz", env="hopper")
+    assert "--run must be the directory of a run" in refusal(lambda: gps_examples.main(args), capsys)
+
+
+def test_growth_is_the_largest_exponent() -> None:
+    loop = torch.tensor([[1.1, 0.3], [0.0, 0.5]]).double().expand(4000, 2, 2)
+    assert gps_stability.growth(loop, 0.02) == pytest.approx(math.log(1.1) / 0.02, rel=1e-2)
