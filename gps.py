@@ -464,8 +464,8 @@ class SampleSet:
         return score.argsort(descending=True, stable=True)[:active].sort().values
 
     def prune(self, stored: int) -> None:
-        """Keeps so many: theta*'s, the initial guides', the best-scored others; drops generators without any."""
-        kept = self.samples.pick(self.choose(stored, stored))
+        """Keeps so many: theta*'s newest, the initial guides', those of most weight; drops generators without any."""
+        kept = self.samples.pick(self.choose(stored, stored // 2))
         used = torch.tensor(sorted({*kept.source.tolist(), self.best}), device=kept.u.device)
         index = torch.full((len(self.generators),), -1, device=used.device)
         index[used] = torch.arange(len(used), device=used.device)
