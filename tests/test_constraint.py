@@ -353,6 +353,29 @@ def test_slips_and_impacts_converge_to_mujocos(friction, speed, rng):
     check_gradients(scene, [x[:8] for x in states], rng, enough=0.9)
 
 
+def test_violent_states_on_stiff_ground_converge_to_mujocos(rng):
+    """A quadruped deep in a ground of impedance 0.9999 and impratio 100, with dry friction and limits."""
+    scene, n = diffsim.make("go2", 1).scene, 1024
+    qpos, turn = np.tile(scene.qpos0, (n, 1)), 0.3 * rng.normal(size=(n, 4))
+    qpos[:, :3] += 0.03 * rng.normal(size=(n, 3))
+    qpos[:, 3:7] = (qpos[:, 3:7] + turn) / np.linalg.norm(qpos[:, 3:7] + turn, axis=1, keepdims=True)
+    qpos[:, 7:] += 0.1 * rng.normal(size=(n, scene.nq - 7))
+    states = qpos, 2 * rng.normal(size=(n, scene.nv)), rng.uniform(-1, 1, (n, scene.nu))
+    states = [x.astype(np.float32).astype(float) for x in states]
+    _, solved, residual = step(scene, states, 200)
+    assert residual.max() < 1e-10
+    change = abs(solved - states[1]).max(1)
+    _, expected, kinds = in_mujoco(scene, *(x[:64] for x in states))
+    assert {STATES["cone"], STATES["linear_neg"]} <= kinds
+    assert (abs(solved[:64] - expected).max(1) / change[:64]).max() < 1e-7
+    how = Integration()
+    for dtype, enough in ((torch.float64, 0.999), (torch.float32, 0.97)):
+        _, qvel, residual = step(scene, states, how.passes, tolerance=how.tolerance, dtype=dtype)
+        error, converged = abs(qvel - solved).max(1) / change, residual <= how.tolerance
+        assert converged.mean() >= enough
+        assert np.quantile(error[converged], 0.99) < 5e-3 and error[converged].max() < 0.1
+
+
 def test_gradient_at_the_tolerance_is_near_that_of_the_solution(rng):
     scene, states = sliding_ant(0.3, 2.0, rng)
     w, parts = weights(scene, rng), []

@@ -150,76 +150,105 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return p, jar, vec4(D, state[1], state[2], state[3]), of
 
     @wp.func
-    def touch(m: Model, law: Law, here: Lane, links: t.Links, height: T, touches: t.Touches):
-        """The contacts of a lane at the start of a substep."""
-        first = m.contact_begin[here.at]
-        for i in range(here.n):
-            for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
-                centre, distance, on = place(m, c, links[i], height)
-                touches[c - first].known = on * touches[c - first].on
-                touches[c - first].on = on
-                if block.any_of(on):
-                    p, jar, state, of = contact_state(m, law, c, centre, distance, on, links[i].V, vec6())
-                    touches[c - first].p = p
-                    touches[c - first].bias = jar
-                    touches[c - first].D = state[0]
-
-    @wp.func
     def friction(m: Model, law: Law, c: int):
         if wp.static(VARIED):
             return law.mu * T(m.contact_numbers[c][2])
         return T(m.contact_numbers[c][2])
 
     @wp.func
-    def add_contacts(
-        m: Model,
-        law: Law,
-        here: Lane,
-        k: int,
-        A: vec6,
-        B: vec6,
-        step: vec6,  # of the link's twist, that led here
-        passes: int,  # so far
-        touches: t.Touches,
-        load: Load,
-    ):
-        """The load of link k with its contacts, linear about A, and their part of what newton.constrain returns.
+    def touch(m: Model, law: Law, here: Lane, links: t.Links, height: T, touches: t.Touches):
+        """The contacts of a lane at the start of a substep, without acceleration.
 
-        The first pass has the forces of the last substep, and takes what did not touch there for sticking.
+        They are linear about where they were in the last substep, and stick if they did not touch there.
         """
-        found = vec3()
+        first = m.contact_begin[here.at]
+        for i in range(here.n):
+            for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
+                s = c - first
+                centre, distance, on = place(m, c, links[i], height)
+                stuck = T(1.0) - on * touches[s].on
+                touches[s].on = on
+                if block.any_of(on):
+                    p, jar, state, of = contact_state(m, law, c, centre, distance, on, links[i].V, vec6())
+                    was = vec3()
+                    for r in range(3):
+                        was[r] = pick(T(0.0), stuck, jar[r], touches[s].jar[r])
+                    f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), was, stuck)
+                    touches[s].p = p
+                    touches[s].jar = jar
+                    touches[s].D = state[0]
+                    touches[s].f = f + H * (was - jar)
+                    touches[s].H = H
+
+    @wp.func
+    def add_contacts(m: Model, here: Lane, k: int, touches: t.Touches, load: Load):
+        """The load of link k with its contacts, linear about the iterate."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             s = c - m.contact_begin[here.at]
             if block.any_of(touches[s].on):
                 p = touches[s].p
-                D = touches[s].D
-                jar = point_velocity(B, p) + touches[s].bias
-                mu = friction(m, law, c)
-                squash = T(m.contact_numbers[c][3])
-                by = point_velocity(step, p)
-                was_at = jar - by  # where the last pass is linear about
-                stuck = T(0.0)
-                if passes < 2:
-                    stuck = T(1.0) - touches[s].known
-                    for r in range(3):
-                        was_at[r] = pick(T(0.0), stuck, was_at[r], touches[s].jar[r])
-                f, H = cone(D, mu, squash, was_at, stuck)
-                if passes == 0:
-                    f = f + H * (was_at - jar)
-                else:
-                    Hs = H * by
-                    less = f + H * (was_at - jar)
-                    f, H = cone(D, mu, squash, jar, T(0.0))
-                    less = less - f
-                    away = T(m.contact_numbers[c][4]) * less
-                    found = found + vec3(wp.dot(by, less), wp.dot(by, Hs), wp.dot(away, away))
-                    touches[s].jar = jar
+                H = touches[s].H
                 PH = wp.skew(p) * H
                 load.a = load.a - PH * wp.skew(p)
                 load.b = load.b + PH
                 load.d = load.d + H
-                load.f = load.f - force_at(p, f + H * point_velocity(A, p))
-        return load, found
+                load.f = load.f - force_at(p, touches[s].f)
+        return load
+
+    @wp.func
+    def makes_good(less: vec3, w: T, H: mat3):
+        """(1 / w + H)^-1 less, the acceleration that makes good what a force lacks; I + w H has pivots of 1 or more."""
+        G = w * H
+        x = w * less
+        d = T(1.0) / (T(1.0) + G[0, 0])
+        y = d * G[1, 0]
+        z = d * G[2, 0]
+        e = G[2, 1] - z * G[1, 0]
+        x[1] = x[1] - y * x[0]
+        x[2] = x[2] - z * x[0]
+        c = T(1.0) / wp.max(T(1.0) + G[1, 1] - y * G[1, 0], T(1.0))
+        v = c * e
+        x[2] = (x[2] - v * x[1]) / wp.max(T(1.0) + G[2, 2] - z * G[2, 0] - v * e, T(1.0))
+        x[1] = c * x[1] - v * x[2]
+        x[0] = d * x[0] - y * x[1] - z * x[2]
+        return x
+
+    @wp.func
+    def try_contacts(m: Model, law: Law, here: Lane, k: int, step: vec6, part: T, tries: int, touches: t.Touches):
+        """Forces and slopes after a part of a step of link k's twist; their part of what newton.measure returns."""
+        found = vec6()
+        for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
+            s = c - m.contact_begin[here.at]
+            if block.any_of(touches[s].on):
+                by = point_velocity(step, touches[s].p)
+                if tries == 0:
+                    touches[s].Hs = touches[s].H * by
+                jar = touches[s].jar + part * by
+                f, H = cone(touches[s].D, friction(m, law, c), T(m.contact_numbers[c][3]), jar, T(0.0))
+                less = touches[s].f - part * touches[s].Hs - f
+                w = T(m.contact_numbers[c][4])
+                away = makes_good(less, w, H)
+                found = found + vec6(
+                    wp.dot(by, less),
+                    wp.dot(by, touches[s].Hs),
+                    wp.dot(by, H * by),
+                    wp.dot(away, away),
+                    w * wp.trace(H),
+                    T(0.0),
+                )
+                touches[s].tried = jar
+                touches[s].pushes = f
+                touches[s].H = H
+        return found
+
+    @wp.func
+    def keep_contacts(m: Model, here: Lane, touches: t.Touches):
+        """The contacts of a lane are where they were tried last."""
+        first = m.contact_begin[here.at]
+        for c in range(first, m.contact_begin[here.at + here.n]):
+            if block.any_of(touches[c - first].on):
+                touches[c - first].jar = touches[c - first].tried
+                touches[c - first].f = touches[c - first].pushes
 
     @wp.func
     def record_contacts(m: Model, here: Lane, ck: t.Checkpoint, touches: t.Touches):
@@ -306,17 +335,20 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return b
 
     @wp.func
-    def joint_constraint(m: Model, law: Law, i: int, q: T, qd: T, qdd: T, stuck: T):
+    def stop(m: Model, law: Law, i: int, q: T, qd: T):
+        """Of a joint's limit (D or 0, jar without acceleration, the direction in which the joint returns)."""
+        state, way = limit_row(m, law, i, q)
+        return vec3(state[0], way * limit_damping(m, law, i) * qd + state[2], way)
+
+    @wp.func
+    def joint_constraint(m: Model, i: int, stop: vec3, qd: T, qdd: T, stuck: T):
         """(force of the limit and of dry friction on the joint, minus its derivative in qdd); stuck as of cone."""
         force = T(0.0)
         slope = T(0.0)
         if wp.static(LIMIT):
-            state, way = limit_row(m, law, i, q)
-            if block.any_of(state[0]):
-                jar = way * (qdd + limit_damping(m, law, i) * qd) + state[2]
-                D = pick(jar, T(0.0), state[0], stuck * state[0])
-                force = force - way * D * jar
-                slope = slope + D
+            jar = stop[2] * qdd + stop[1]
+            slope = pick(jar, T(0.0), stop[0], stuck * stop[0])
+            force = -stop[2] * slope * jar
         if wp.static(LOSS):
             loss = m.joint_loss[i]
             f = -T(loss[1]) * (qdd + T(loss[2]) * qd)
@@ -343,4 +375,14 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
         return gain
 
-    return by_name(touch, add_contacts, record_contacts, add_contacts_adjoint, joint_constraint, joint_gain)
+    return by_name(
+        touch,
+        add_contacts,
+        try_contacts,
+        keep_contacts,
+        record_contacts,
+        add_contacts_adjoint,
+        stop,
+        joint_constraint,
+        joint_gain,
+    )

@@ -133,7 +133,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 f = -damper * motion.rate
             else:
                 d = d + motion.firm
-                f = motion.force + motion.held + motion.firm * motion.rate
+                f = motion.force + motion.held - T(m.armature[k]) * motion.rate
         else:
             f = joint.actuation(m, k, motion.motor, q, link.qd)
             f = f + joint.passive_force(m, law, k, q, link.qd)
@@ -176,13 +176,16 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 ui = f - wp.dot(S, own.f)
                 di = T(1.0) / d
                 if wp.static(FLOATING) or p > 0:
-                    C = motions[i].C
                     va = Ua * di
                     vl = Ul * di
-                    ca = wp.spatial_top(C)
-                    cl = wp.spatial_bottom(C)
-                    bias = join(own.a * ca + own.b * cl, ca * own.b + own.d * cl)
-                    loads[p].f = loads[p].f + own.f + bias + join(va, vl) * (ui - wp.dot(Ui, C))
+                    if wp.static(CONSTRAINED):
+                        loads[p].f = loads[p].f + own.f + join(va, vl) * ui
+                    else:
+                        C = motions[i].C
+                        ca = wp.spatial_top(C)
+                        cl = wp.spatial_bottom(C)
+                        bias = join(own.a * ca + own.b * cl, ca * own.b + own.d * cl)
+                        loads[p].f = loads[p].f + own.f + bias + join(va, vl) * (ui - wp.dot(Ui, C))
                     loads[p].a = loads[p].a + own.a - wp.outer(Ua, va)
                     loads[p].b = loads[p].b + own.b - wp.outer(Ua, vl)
                     loads[p].d = loads[p].d + own.d - wp.outer(Ul, vl)
@@ -200,8 +203,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         m: Model,
         law: Law,
         here: Lane,
-        phase: int,
-        factor_row: int,
         record: int,
         ck: Ck,
         links: Links,
@@ -211,21 +212,15 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     ):
         """Accelerations (minus gravity, which acts as an acceleration of the base), those of joints into u."""
         motions[0].A = join(vec3(), -vec3(m.gravity))
-        if wp.static(DAMPED):
-            if phase == SOLVE:
-                motions[0].A = vec6()
         if wp.static(FLOATING):
             if wp.static(BASE_DAMPED):
-                load = base.damp_base(m, law, phase == SOLVE, links[0], load, root)
+                load = base.damp_base(m, law, True, links[0], load, root)
             L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
             motions[0].A = a0
             root.turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
             root.speeding_up = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(links[0].V), root.v) + vec3(m.gravity)
-            if wp.static(DAMPED):
-                if phase == SOLVE:
-                    root.speeding_up = wp.spatial_bottom(a0)
             if record == 1:
-                base.store_base(ck.f, factor_row, here.e, L)
+                base.store_base(ck.f, here.row, here.e, L)
         for i in range(1, here.n):
             ai = motions[m.parent[here.at + i]].A + motions[i].C
             qdd = (motions[i].u - wp.dot(motions[i].U, ai)) * motions[i].dinv
@@ -412,34 +407,33 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 root.speeding_up = vec3()
                 if wp.static(CONTACT):
                     constraint.touch(m, law, here, links, place, touches)
-                newton.begin(m, law, here, links, motions, loads, free_loads)
+                newton.begin(m, law, here, links, motions, loads, free_loads, root)
                 phase = int(NEWTON)
                 while phase < DONE:
-                    if phase == NEWTON:
-                        root, by = newton.linearize(m, law, here, links, motions, touches, free_loads, loads, root, by)
-                        if by.passes == passes or not block.any_of(by.going):
-                            residual = wp.max(residual, by.off)
-                            phase = DONE - int(DAMPED)
-                            if record == 1:
-                                phase = FACTOR
-                        else:
-                            count = count + by.going
-                            by.passes = by.passes + 1
+                    if phase == NEWTON and (by.passes == passes or not block.any_of(by.going)):
+                        residual = wp.max(residual, by.off)
+                        phase = DONE - int(DAMPED)
+                        if record == 1:
+                            phase = FACTOR
                     if phase < DONE:
                         factor_row = SOLVES * here.row
                         if wp.static(DAMPED):
                             if phase == FACTOR:
                                 factor_row = factor_row + 1
-                            if phase == SOLVE:
-                                for i in range(here.n):
-                                    loads[i] = free_loads[i]
-                                    loads[i].f = vec6()
-                                    motions[i].C = vec6()
+                        if phase == SOLVE:
+                            for i in range(here.n):
+                                loads[i] = free_loads[i]
+                                loads[i].f = vec6()
+                        else:
+                            newton.linearize(m, here, motions, touches, free_loads, loads)
                         keeps = record * wp.where(phase > NEWTON, 1, 0)
                         inward(m, law, here, phase, factor_row, keeps, ck, links, motions, loads)
-                        root = accelerate(m, law, here, phase, factor_row, keeps, ck, links, motions, loads[0], root)
+                        root = newton.respond(
+                            m, law, here, phase == SOLVE, factor_row, keeps, ck, links, motions, loads[0], root
+                        )
                         if phase == NEWTON:
-                            root, by = newton.step_on(m, here, links, motions, root, by)
+                            count = count + by.going
+                            root, by = newton.step_on(m, law, here, links, motions, touches, free_loads, root, by)
                         else:
                             phase = phase + 1
                             if wp.static(not DAMPED):
@@ -462,7 +456,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 root.turning_up = root.wdot + root.turning_up
             else:
                 inward(m, law, here, SOLVE, here.row, record, ck, links, motions, loads)
-                root = accelerate(m, law, here, SOLVE, here.row, record, ck, links, motions, loads[0], root)
+                root = accelerate(m, law, here, record, ck, links, motions, loads[0], root)
             # 3. the new state
             if record == 1:
                 record_rates(m, here, ck, 0, root.speeding_up, root.turning_up, motions)

@@ -239,10 +239,10 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     Node, Adjoint = struct("Node", Node), struct("Adjoint", Adjoint)
     Motion = dict.fromkeys("CAU", vec6) | dict.fromkeys(("dinv", "u", "motor", "rest"), T)
     if spec.constrained:
-        Motion |= {"B": vec6, "twist": vec6} | dict.fromkeys(("rate", "step", "force", "held", "firm"), T)
+        Motion |= {"twist": vec6, "stop": vec3} | dict.fromkeys("rate force held firm holds given".split(), T)
     Motion = struct("Motion", Motion)
     root = {"pos": vec3, "rot": quat} | dict.fromkeys("v w rest speeding_up turning_up vdot wdot".split(), vec3)
-    Touch = struct("Touch", {"p": vec3, "bias": vec3, "D": T, "on": T, "known": T, "jar": vec3})
+    Touch = struct("Touch", dict.fromkeys("p jar f tried pushes Hs".split(), vec3) | {"H": mat3, "D": T, "on": T})
     constants = dict.fromkeys("h theta k_n k_d k_t mu k_limit d_limit mass motor".split(), T)
     return SimpleNamespace(
         T=T,
@@ -298,7 +298,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         Root=struct("Root", root),
         # where Newton's method is: 1 for environments that have not converged, else 0; squares of the residual, of the
         # acceleration (plus 1) and of the step; passes so far
-        Newton=struct("Newton", dict.fromkeys("tolerance going off size moved".split(), T) | {"passes": int}),
+        Newton=struct("Newton", dict.fromkeys("tolerance going off size".split(), T) | {"passes": int}),
         # where a contact is, jar without acceleration, D, whether it touches, did so in the last substep, and jar there
         Touch=Touch,
         Touches=wp.array(dtype=Touch),

@@ -32,6 +32,7 @@ def constrained(scene: Scene, seconds: float) -> Scene:
     limit, loss = np.tile(_numbers((1.0, 1.0), (0.9, 0.9, 1.0, 0.5, 2.0), 1.0, 0.0), (scene.nlink, 1)), []
     for link, dof in enumerate(range(first, m.nv), start=1):
         joint, weight = m.dof_jntid[dof], m.dof_invweight0[dof]
+        limit[link, 4] = weight
         if np.isfinite(scene.lower[link]):
             limit[link] = _numbers(m.jnt_solref[joint], m.jnt_solimp[joint], weight, m.jnt_margin[joint], fastest)
         k, b, _, _, _, d, *_ = _numbers(m.dof_solref[dof], m.dof_solimp[dof], weight, 0.0, fastest)

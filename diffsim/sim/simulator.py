@@ -57,8 +57,9 @@ class Simulator:
             started from a quaternion shorter than 1e-15 or longer than 1e15. Their state is returned as it was before
             that step, its gradient is zero; other environments are not touched.
         residual: (N,) with the integrator mujoco, by how much the constraints' forces differ after the last pass of
-            Newton's method from those that it counted on, as accelerations relative to sqrt(1 + |qacc|^2), in that
-            substep of the last step where it is largest; 1 where that pass went a part of its way; else zeros.
+            Newton's method from those that it counted on, as the accelerations that the next pass would add, and what
+            rounding and a line search leave of the pass, relative to sqrt(1 + |qacc|^2), in that substep of the last
+            step where it is largest; else zeros.
         passes: (N,) how many Newton's method took in the last step, mean over its substeps.
         unconverged: (N,) int32, how many control steps ended with a residual above the tolerance.
         nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
