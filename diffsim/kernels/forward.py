@@ -394,7 +394,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(MUSCLE):
                 muscle.add_muscles(m, here, pull, links, loads)
             # 2. inward and outward: articulated inertias, then accelerations. With constraints each pass is a step of
-            # Newton's method, the first as if all of them stuck; the adjoint has the factor where it ends. MuJoCo's
+            # Newton's method (newton.py); the adjoint has the factor where it ends. MuJoCo's
             # implicit damping is one solve more: (M + h b) change = -h b a.
             if wp.static(CONSTRAINED):
                 by = Newton()

@@ -146,7 +146,8 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                 if i >= FIRST:
                     found = found + constraint.try_contacts(m, law, here, k, motions[i].twist, part, tries, touches)
         if wp.static(SHARED):
-            found = sums.add_vec6(found)
+            for r in range(5):
+                found[r] = sums.add(found[r])
         return found
 
     @wp.func
