@@ -14,9 +14,10 @@ from tables import markdown, read_csv
 
 import pfpn
 import pfpn_sac
+import shac
 from diffsim.training import parse
 
-SCRIPTS = {"benchmarks/gps_variants": VariantArgs, "pfpn": pfpn.Args, "pfpn_sac": pfpn_sac.Args}
+SCRIPTS = {"benchmarks/gps_variants": VariantArgs, "pfpn": pfpn.Args, "pfpn_sac": pfpn_sac.Args, "shac": shac.Args}
 
 
 @pytest.mark.parametrize("group", suites.GROUPS)
