@@ -37,8 +37,10 @@ PER_TASK = {
     "humanoid":     ((256, 128, 64), 1024,  32,  8192, 5, 0.0,   5000),
     "humanoid_mtu": ((512, 512, 256), 1024, 32,  8192, 6, 0.0,  20000),
     "humanoid_imitation": ((256, 128, 64), 1024, 32, 8192, 5, 0.0, 5000),
+    "g1_track":     ((512, 256, 128), 4096, 24, 24576, 5, 0.0,   5000),
 }
 # fmt: on
+BALANCING = {"g1_track": {"initial_log_std": -1.0}}  # more noise throws it over
 CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost more, smaller steps learn more of each
 
 
@@ -93,7 +95,7 @@ class Args(SymmetricFlags):
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, ()), strict=False))
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
-        return super().task_defaults() | values
+        return super().task_defaults() | values | BALANCING.get(self.env, {})
 
     def check(self) -> None:
         super().check()

@@ -39,12 +39,13 @@ PER_TASK = {
     "go1":          ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9,    64,  600),
     "go2":          ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9,    64,  600),
     "g1":           ((256, 128),    (256, 128), 2e-3, 1e-3, 0.9,    64, 1500),
+    "g1_track":     ((512, 256),    (512, 256), 2e-3, 1e-3, 0.9,   256, 2400),
     "humanoid_imitation": ((256, 128), (128, 128), 2e-3, 5e-4, 0.995, 64, 2000),
 }
 # fmt: on
 # Near the pose from which a robot learns to walk
 STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01, "adjoint_clip": 5.0}
-BEGINNING = {"go1": STANDING, "go2": STANDING, "g1": STANDING | {"horizon": 16}}
+BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"), STANDING | {"horizon": 16})
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -127,7 +128,7 @@ class OtherFile(MuJoCo):
         self, env: DiffEnv, num_envs: int, file: Path | None, friction: float, mass: float = 1.0, gains: float = 1.0
     ) -> None:
         own = env.scene.mj_model
-        model = mujoco.MjModel.from_xml_path(str(file or env.scene.path))
+        model = copy.copy(own) if file is None else mujoco.MjModel.from_xml_path(str(file))
         model.geom_friction[:, 0] *= friction
         model.pair_friction[:, :2] *= friction
         model.body_mass *= mass

@@ -19,7 +19,7 @@ from diffsim.sim.integration import Integration
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options, check_device, check_dtype
 from diffsim.sim.simulator import Simulator
-from diffsim.tasks import TASKS, Accuracy, Contact, HumanoidImitation, Task, find_task
+from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, find_task, tracking
 from diffsim.tasks.imitation.clip import Clip, read_clip
 
 __all__ = [
@@ -82,7 +82,8 @@ def make(
             of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
             observes, rewards and ends by are then those over the ground below the root.
         control_dt: seconds of a control step in place of the task's; the substeps divide it.
-        clip: the motion that humanoid_imitation tracks, or its .npz file, see read_clip; default the shipped run.
+        clip: the motions that g1_track tracks, or the one of humanoid_imitation; or their file or folder, see
+            read_clip. Default a shipped one.
         **others: stochastic_init, early_termination, max_episode_steps, adjoint_clip, render_mode: see DiffEnv;
             threads, factors, forces: see sim.Options.
 
@@ -97,15 +98,15 @@ def make(
     startup.check_kernel_cache()
     if clip is None:
         task = kind(device, dtype)
-    elif issubclass(kind, HumanoidImitation):
+    elif issubclass(kind, Imitation):
         task = kind(device, dtype, clip if isinstance(clip, Clip) else read_clip(clip))
     else:
-        raise ValueError(f"task {kind.name!r} tracks no clip; {HumanoidImitation.name} does")
+        raise ValueError(f"task {kind.name!r} tracks no clip; {', '.join(tracking())} do")
     if control_dt is not None and control_dt != task.control_dt:
         if task.num_memory:  # its times count in control steps
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
-    scene = task.load_robot()
+    scene = task.scene()
     asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance, touchdown=touchdown)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
     if penalty and integration.constrained:

@@ -9,7 +9,8 @@ from diffsim.tasks.half_cheetah import HalfCheetah
 from diffsim.tasks.hopper import Hopper
 from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.humanoid_mtu import HumanoidMTU
-from diffsim.tasks.imitation.task import HumanoidImitation
+from diffsim.tasks.imitation.task import HumanoidImitation, Imitation
+from diffsim.tasks.imitation.tracking import G1Track
 from diffsim.tasks.joystick import G1, Go1, Go2
 from diffsim.tasks.own import FILE, task_of_file
 from diffsim.tasks.swimmer import Swimmer
@@ -19,7 +20,7 @@ TASKS: dict[str, type[Task]] = {
     task.name: task
     for task in (
         *(CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU, Swimmer, Walker, HumanoidImitation),
-        *(Go1, Go2, G1),
+        *(Go1, Go2, G1, G1Track),
     )
 }
 
@@ -33,4 +34,20 @@ def find_task(name: str | type[Task]) -> type[Task]:
     return TASKS.get(name) or task_of_file(name)
 
 
-__all__ = ["FILE", "TASKS", "Accuracy", "Contact", "HumanoidImitation", "Task", "TaskError", "find_task"]
+def tracking() -> list[str]:
+    """The names of those in TASKS that track clips."""
+    return [name for name, task in TASKS.items() if issubclass(task, Imitation)]
+
+
+__all__ = [
+    "FILE",
+    "TASKS",
+    "Accuracy",
+    "Contact",
+    "HumanoidImitation",
+    "Imitation",
+    "Task",
+    "TaskError",
+    "find_task",
+    "tracking",
+]

@@ -89,6 +89,10 @@ class Task:
                 return load_scene(folder / asset)
         raise TaskError(f"task {cls.name!r}: no robot file {str(asset)!r} in {' or '.join(map(str, folders))}")
 
+    def scene(self) -> Scene:
+        """The robot as this task drives it; by default that of `load_robot`."""
+        return self.load_robot()
+
     @torch.no_grad()
     def bind(self, scene: Scene) -> Task:
         """Itself, fitted to its robot: start, num_random, obs_dim and forward_column are found where they are missing.

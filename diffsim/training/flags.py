@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 
 from diffsim.sim.integration import PASSES, TOLERANCE
-from diffsim.tasks import FILE, Contact, HumanoidImitation, Task, find_task
+from diffsim.tasks import FILE, Contact, Imitation, Task, find_task, tracking
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail
@@ -100,7 +100,7 @@ class Flags(RunFlags):
     early_termination: bool = True
     """end episodes where the robot falls, as the task says; otherwise only their time ends them"""
     clip: ClipFile = None
-    """motion that humanoid_imitation tracks (docs/imitation.md): an .npz file, or the name of a shipped one"""
+    """motions that g1_track or humanoid_imitation tracks: a file, a folder, or a shipped one (docs/tracking.md)"""
     threads: Natural = 0
     """CPU threads of the simulator, which change no result (0: as many as have work)"""
 
@@ -110,8 +110,8 @@ class Flags(RunFlags):
 
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
-        if self.clip and not issubclass(find_task(self.env), HumanoidImitation):
-            fail(f"--clip is of {HumanoidImitation.name}: {self.env} tracks no motion")
+        if self.clip and not issubclass(find_task(self.env), Imitation):
+            fail(f"--clip is of {', '.join(tracking())}: {self.env} tracks no motion")
 
     @classmethod
     def script(cls) -> str:
@@ -204,7 +204,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
             args.contact = task.contact
         defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
-        if issubclass(task, HumanoidImitation):
+        if issubclass(task, Imitation):
             defaults.clip = read_clip(task.default_clip)
         args = _cli(kind, argv, defaults)
         args.device = distributed.choose_device(args.device)

@@ -24,6 +24,7 @@ Frame = NDArray[np.uint8]  # (height, width, 3)
 
 AT_REST, FULL_FORCE = np.array([0.25, 0.4, 0.85, 1.0]), np.array([0.95, 0.15, 0.1, 1.0])  # colours of a muscle
 GROUND = np.array([0.75, 0.77, 0.81, 1.0], dtype=np.float32)
+GHOST = np.array([0.2, 0.6, 0.3, 0.35], dtype=np.float32)
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
@@ -62,12 +63,15 @@ class Renderer(AbstractContextManager["Renderer"]):
             follow(model, camera := mujoco.MjvCamera())
             self._camera = camera
 
-    def draw(self, qpos: ArrayLike, ctrl: ArrayLike | None = None, profile: int = 0) -> Frame:
+    def draw(
+        self, qpos: ArrayLike, ctrl: ArrayLike | None = None, profile: int = 0, ghost: ArrayLike | None = None
+    ) -> Frame:
         """The frame (height, width, 3) of one configuration qpos (nq,).
 
         Args:
             ctrl: (nu,) in [-1, 1]; colours muscles by their activation, blue at rest, red at full force.
             profile: of which environment's terrain, if each has its own.
+            ghost: another configuration (nq,) of the robot, which is drawn transparent.
         """
         self._data.qpos[:] = qpos
         if ctrl is not None:
@@ -79,6 +83,14 @@ class Renderer(AbstractContextManager["Renderer"]):
         self._renderer.update_scene(self._data, self._camera)
         if self._terrain is not None:
             add_terrain(self._renderer.scene, self._terrain[profile % len(self._terrain)], self._material)
+        if ghost is not None:
+            self._data.qpos[:] = ghost
+            mujoco.mj_kinematics(self.model, self._data)
+            scene, kind = self._renderer.scene, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+            first = scene.ngeom
+            mujoco.mjv_addGeoms(self.model, self._data, mujoco.MjvOption(), mujoco.MjvPerturb(), kind, scene)
+            for geom in scene.geoms[first : scene.ngeom]:
+                geom.rgba = GHOST
         return self._renderer.render()
 
     def close(self) -> None:
@@ -176,16 +188,20 @@ def film(
     control_dt: float,
     ctrl: ArrayLike | None = None,
     size: tuple[int, int] = VIDEO_SIZE,
+    ghost: ArrayLike | None = None,
 ) -> Path:
-    """Film qpos (T, nq) and ctrl (T, nu), a row per control step [s], at true speed with at most 30 frames/s.
+    """Film qpos (T, nq), ctrl (T, nu) and ghost (T, nq), a row per control step [s], at true speed with at most 30
+    frames/s.
 
     See save_video; size is width and height in pixels.
     """
     check_video(path, size)
     stride = max(1, math.ceil(1 / (VIDEO_FPS * control_dt) - 1e-6))
-    commands = itertools.repeat(None) if ctrl is None else np.asarray(ctrl)[::stride]
+    others = (itertools.repeat(None) if each is None else np.asarray(each)[::stride] for each in (ctrl, ghost))
     with Renderer(scene, *size) as renderer:
-        return save_video(path, map(renderer.draw, np.asarray(qpos)[::stride], commands), 1 / (stride * control_dt))
+        rows = zip(np.asarray(qpos)[::stride], *others, strict=False)
+        frames = (renderer.draw(q, c, ghost=g) for q, c, g in rows)
+        return save_video(path, frames, 1 / (stride * control_dt))
 
 
 def save_video(path: str | os.PathLike[str], frames: Iterable[Frame], fps: float) -> Path:

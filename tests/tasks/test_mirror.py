@@ -12,7 +12,7 @@ from diffsim.tasks import TASKS
 from diffsim.tasks.mirror import reflections
 from diffsim.training.gait import trace
 
-MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1")
+MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1", "g1_track")
 
 
 @pytest.mark.parametrize("name, dtype, tolerance", [("ant", torch.float32, 3e-5), ("humanoid", torch.float64, 1e-12)])

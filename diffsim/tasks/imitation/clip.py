@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import warnings
 from importlib.resources import files
 from pathlib import Path
 from zipfile import BadZipFile
@@ -10,14 +12,18 @@ from zipfile import BadZipFile
 import mujoco
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from diffsim.tasks.imitation.kinematics import difference
 
 CONTROL_DT = 1 / 60  # s
 SHORTEST, LONGEST = 6, 216_000  # frames: 0.1 s and an hour
-LAYOUT = "finite qpos (frames, nq), in columns 3 to 6 the root's quaternion, and fps [1/s] or dt [s]; of 0.1 s to 1 h"
+LAYOUT = "an .npz file with finite qpos (frames, nq), in columns 3 to 6 the root's quaternion, and fps [1/s] or dt [s]"
+ROWS = "a .csv file with finite rows of root position, quaternion xyzw and joints, without a header"
+RATE = 30.0  # 1/s of a .csv file that does not say: those of Unitree's LAFAN1
 BEYOND = math.radians(30)  # joint limits are springs, so that recorded motions pass them a little
+FASTEST = 40.0  # rad/s: Unitree's motors reach 20 to 37
 SEAM = 3.0  # the ends of a loop may be this many times as far apart as any two successive frames
 
 
@@ -27,24 +33,29 @@ def tangent(a: Tensor, b: Tensor) -> Tensor:
 
 
 class Clip:
-    """A motion at the rate of control.
+    """A motion at the rate of control, or several.
 
     The last frame of a loop is the first one of the next round: equal but for x and y.
 
     Attributes:
-        name: of the file, without .npz.
+        name: of the file, without its suffix, or of the folder.
         qpos: (T, nq) float64 in MuJoCo's convention, the world's frame, m and rad; quaternions wxyz of unit length.
         loop: whether it goes on from the beginning.
+        lengths: the frames of each motion, of several that stand in qpos one after the other; empty of one.
     """
 
-    def __init__(self, name: str, qpos: Tensor, loop: bool) -> None:
-        self.name, self.qpos, self.loop = name, qpos, loop
+    lengths: tuple[int, ...] = ()
+
+    def __init__(self, name: str, qpos: Tensor, loop: bool, lengths: tuple[int, ...] = ()) -> None:
+        self.name, self.qpos, self.loop, self.lengths = name, qpos, loop, lengths
 
     def __str__(self) -> str:
         return self.name
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Clip) and self.loop == other.loop and torch.equal(self.qpos, other.qpos)
+        if not isinstance(other, Clip) or (self.loop, self.lengths) != (other.loop, other.lengths):
+            return False
+        return torch.equal(self.qpos, other.qpos)
 
     def __len__(self) -> int:
         """Frames of a round, which are numbered from 0."""
@@ -60,6 +71,16 @@ class Clip:
         frames = round((len(self.qpos) - 1) * CONTROL_DT / control_dt) + 1
         return self if frames == len(self.qpos) else Clip(self.name, _resample(self.qpos, frames), self.loop)
 
+    def motions(self) -> list[Clip]:
+        """Each motion, of which none is a loop."""
+        return [Clip(self.name, part, loop=False) for part in self.qpos.split(self.lengths or (len(self.qpos),))]
+
+    def smoothed(self, frames: int) -> Clip:
+        """The mean over so many frames around each, so that single bad ones do no harm; at the ends over fewer."""
+        near = F.avg_pool1d(self.qpos.mT, frames, stride=1, padding=frames // 2, count_include_pad=False).mT
+        near[:, 3:7] /= near[:, 3:7].norm(dim=1, keepdim=True)
+        return Clip(self.name, near, self.loop)
+
     def velocity(self, control_dt: float = CONTROL_DT) -> Tensor:
         """qvel (T, nv) of each frame, the mean of the differences to the frames before and after it."""
         step = tangent(self.qpos[:-1], self.qpos[1:])
@@ -67,7 +88,8 @@ class Clip:
         return 0.5 * (torch.cat((before, step)) + torch.cat((step, after))) / control_dt
 
     def check(self, model: mujoco.MjModel) -> None:
-        """That a robot can follow it; raises ValueError for another width or joints far beyond their limits."""
+        """That a robot can follow it; raises ValueError for another width, joints far beyond their limits, or a loop
+        that does not end as it begins."""
         if self.qpos.shape[1] != model.nq:
             raise ValueError(f"clip {self}: qpos has {self.qpos.shape[1]} columns, the robot has {model.nq}")
         angles, limited, (low, high) = self.qpos.numpy()[:, 7:], model.jnt_limited[1:] != 0, model.jnt_range[1:].T
@@ -77,6 +99,13 @@ class Clip:
             raise ValueError(
                 f"clip {self}: joint {model.joint(k + 1).name!r} is up to {most[k]:.3g} rad beyond its limits "
                 f"{low[k]:.3g} to {high[k]:.3g}; are the angles in radians?"
+            )
+        ends, pairs = self.qpos[[0, -1]], (self.qpos[:-1], self.qpos[1:])
+        gap, step = (tangent(a, b)[..., 2:].abs().max() for a, b in (ends, pairs))
+        if self.loop and gap > SEAM * step:
+            raise ValueError(
+                f"clip {self} is a loop, but its last frame differs from its first by up to {gap:.2g} (m, rad); "
+                "end it where the next round begins, or add loop=False"
             )
 
 
@@ -93,35 +122,56 @@ def read_clip(source: str | Path) -> Clip:
     becomes a whole number of control steps.
 
     Args:
-        source: an .npz file with qpos (T, nq), either fps [1/s] or dt [s], and loop (optional, true if not there); or
-            the name of a shipped clip.
+        source: an .npz file with qpos (T, nq), either fps [1/s] or dt [s], and loop (optional, true if not there); a
+            .csv file with the rows of Unitree's LAFAN1, 30 in a second, or with another number as in "walk.csv:60"; a
+            folder of such files; or the name of a shipped clip.
 
     Raises:
-        ValueError: no such file, one of another LAYOUT, or a loop that does not end as it begins.
+        ValueError: no such file, or one of another LAYOUT.
     """
-    path = Path(source)
+    name, _, rate = str(source).rpartition(":")
+    path, fps = (Path(name), float(rate)) if name and re.fullmatch(r"\d+(\.\d+)?", rate) else (Path(source), RATE)
+    path = path if path.exists() else shipped().get(str(source), path)
+    if path.is_dir() and (found := sorted(each for each in path.iterdir() if each.suffix in READERS)):
+        motions = [_read_file(each, fps).qpos for each in found]
+        if len(widths := {motion.shape[1] for motion in motions}) > 1:
+            raise ValueError(f"the clips of {path} are of several robots: their qpos have {widths} columns")
+        return Clip(path.name, torch.cat(motions), loop=False, lengths=tuple(map(len, motions)))
     if not path.is_file():
-        if str(source) not in shipped():
-            raise ValueError(f"no such clip: {source}; give an .npz file or one of {', '.join(shipped())}")
-        path = shipped()[str(source)]
+        raise ValueError(
+            f"no such clip: {source}; give an .npz or .csv file, a folder of them, or one of {', '.join(shipped())}"
+        )
+    return _read_file(path, fps)
+
+
+def _read_npz(path: Path, _: float) -> tuple[Tensor, float, bool]:
+    with np.load(path, allow_pickle=False) as arrays:
+        qpos, loop = torch.from_numpy(arrays["qpos"].astype(np.float64)), bool(arrays.get("loop", True))
+        return qpos, float(arrays["dt"]) if "dt" in arrays else 1.0 / float(arrays["fps"]), loop
+
+
+def _read_csv(path: Path, fps: float) -> tuple[Tensor, float, bool]:
+    rows = torch.from_numpy(np.loadtxt(path, delimiter=",", ndmin=2))
+    return torch.cat((rows[:, :3], rows[:, 6:7], rows[:, 3:6], rows[:, 7:]), 1), 1.0 / fps, False
+
+
+READERS = {".npz": (_read_npz, LAYOUT), ".csv": (_read_csv, ROWS)}
+
+
+def _read_file(path: Path, fps: float) -> Clip:
+    """The clip of one file, with fps rows in a second if it does not say."""
+    reader, layout = READERS.get(path.suffix, READERS[".npz"])
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            qpos, loop = torch.from_numpy(arrays["qpos"].astype(np.float64)), bool(arrays.get("loop", True))
-            dt = float(arrays["dt"]) if "dt" in arrays else 1.0 / float(arrays["fps"])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy's, that a file is empty
+            qpos, dt, loop = reader(path, fps)
         frames, norm = (len(qpos) - 1) * dt / CONTROL_DT, qpos[:, 3:7].norm(dim=1, keepdim=True)
         if not (qpos.isfinite().all() and norm.min() >= 0.5 and SHORTEST - 1.5 <= frames <= LONGEST):
             raise ValueError("numbers that are no motion")
     except (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, ArithmeticError, BadZipFile) as error:
-        raise ValueError(f"clip {path} must be an .npz file with {LAYOUT}") from error
+        raise ValueError(f"clip {path} must be {layout}; of 0.1 s to 1 h") from error
     qpos[:, 3:7] /= norm
-    clip = Clip(path.stem, _resample(qpos, round(frames) + 1), loop)
-    gap, step = (tangent(a, b)[..., 2:].abs().max() for a, b in (clip.qpos[[0, -1]], (clip.qpos[:-1], clip.qpos[1:])))
-    if loop and gap > SEAM * step:
-        raise ValueError(
-            f"clip {path} is a loop, but its last frame differs from its first by up to {gap:.2g} (m, rad); "
-            "end it where the next round begins, or add loop=False"
-        )
-    return clip
+    return Clip(path.stem, _resample(qpos, round(frames) + 1), loop)
 
 
 def _resample(qpos: Tensor, frames: int) -> Tensor:

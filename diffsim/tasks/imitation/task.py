@@ -16,16 +16,47 @@ from diffsim.tasks.imitation.kinematics import Kinematics, difference, matrix
 STRAY = 0.5  # m; the episode ends when the root is further from the reference's
 
 
-class HumanoidImitation(Task):
+def draw(rand: Tensor, count: int) -> Tensor:
+    """An int64 (...) below count from rand (..., 1): any alike, the first one if rand is 0.5."""
+    return ((rand[..., 0] + 0.5).remainder(1.0) * count).long().clamp(max=count - 1)
+
+
+class Imitation(Task):
+    """A robot with a free root and hinges tracks a clip. Memory: the time in the clip, first of all.
+
+    Args:
+        clip: what to track; default the shipped one. One of another robot raises ValueError.
+    """
+
+    default_clip: ClassVar[str]
+    num_random = 1
+    start, spread = (), ()
+    _qpos: Tensor  # (T, nq) and (T, nv) of the reference
+    _qvel: Tensor
+
+    def __init__(
+        self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
+    ) -> None:
+        super().__init__(device, dtype)
+        self.clip = read_clip(self.default_clip) if clip is None else clip
+
+    def first_step(self, rand: Tensor) -> Tensor:
+        """The frame (...) int64 where an episode from rand (..., 1) starts (DeepMimic, 6.1: reference state init.)."""
+        raise NotImplementedError
+
+    def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
+        """The reference's state at the first step."""
+        step = self.first_step(rand)
+        return self._qpos[step], self._qvel[step]
+
+    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
+        raise ValueError(f"an observation of task {self.name!r} depends on the time: use observe_with")
+
+
+class HumanoidImitation(Imitation):
     """The robot of the humanoid task. The reference is at frame `step` of the clip, which goes round if it is a loop.
 
     Memory: the control step of the clip's time.
-
-    Args:
-        clip: what to track; default the shipped one.
-
-    Raises:
-        ValueError: the clip is of another robot.
     """
 
     name = "humanoid_imitation"
@@ -33,19 +64,19 @@ class HumanoidImitation(Task):
     contact: ClassVar[Contact] = Humanoid.contact
     substeps, fast, accurate = Humanoid.substeps, Humanoid.fast, Humanoid.accurate
     obs_dim = 57
-    num_random = num_memory = 1
-    default_clip: ClassVar[str] = "humanoid_run"
+    num_memory = 1
+    default_clip = "humanoid_run"
     # The middles of these geoms
     ends: ClassVar[tuple[str, ...]] = ("right_hand", "left_hand", "right_foot_inner", "left_foot_inner")
-    start, spread = (), ()
 
     def __init__(
         self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
     ) -> None:
-        super().__init__(device, dtype)
+        super().__init__(device, dtype, clip)
+        if self.clip.lengths:
+            raise ValueError(f"task {self.name!r} tracks one motion, not the {len(self.clip.lengths)} of {self.clip}")
         scene = self.load_robot()
         model, trunk = scene.mj_model, scene.contact_link == 0
-        self.clip = read_clip(self.default_clip) if clip is None else clip
         self._kinematics = Kinematics(model, device, dtype)
         self.clip.check(model)
         geoms = [model.geom(name).id for name in self.ends]
@@ -64,18 +95,8 @@ class HumanoidImitation(Task):
         self._sizes = (4, self._qpos.shape[1] - 7, self._qvel.shape[1] - 3, 3 * len(geoms), 3)
 
     def first_step(self, rand: Tensor) -> Tensor:
-        """The frame (...) int64 at which an episode from rand (..., 1) starts: any alike, the first one if rand is 0.5
-        (DeepMimic, 6.1: reference state initialisation)."""
         count = self.period if self.clip.loop else self.period - 1
-        return ((rand[..., 0] + 0.5).remainder(1.0) * count).long().clamp(max=count - 1)
-
-    def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
-        """The reference's state at the first step."""
-        step = self.first_step(rand)
-        return self._qpos[step], self._qvel[step]
-
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        raise ValueError(f"an observation of task {self.name!r} depends on the time: use observe_with")
+        return draw(rand, count)
 
     def begin(self, rand: Tensor) -> Tensor:
         return self.first_step(rand).to(rand.dtype).unsqueeze(-1)

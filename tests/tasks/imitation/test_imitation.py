@@ -137,9 +137,11 @@ def test_bad_clips_are_refused_in_one_line(tmp_path: Path) -> None:
     for complaint, qpos in WRONG_CLIPS.items():
         with pytest.raises(ValueError, match=complaint):
             diffsim.make("humanoid_imitation", 1, clip=write(file, qpos=qpos, fps=30))
-    with pytest.raises(ValueError, match="no such clip: nowhere; give an .npz file or one of humanoid_run"):
+    with pytest.raises(
+        ValueError, match="no such clip: nowhere; give an .npz or .csv file, a folder of them, or one of .*humanoid_run"
+    ):
         read_clip("nowhere")
-    with pytest.raises(ValueError, match="task 'ant' tracks no clip; humanoid_imitation does"):
+    with pytest.raises(ValueError, match="task 'ant' tracks no clip; humanoid_imitation, g1_track do"):
         diffsim.make("ant", 1, clip="humanoid_run")
 
 
@@ -343,7 +345,7 @@ def test_flags(capsys: pytest.CaptureFixture[str]) -> None:
     assert parse(shac.Args, ["--env", "humanoid_imitation"]).clip == read_clip("humanoid_run")
     assert parse(shac.Args, ["--env", "humanoid"]).clip is None
     line = refusal(lambda: parse(shac.Args, ["--env", "ant", "--clip", "humanoid_run"]), capsys)
-    assert line.endswith("--clip is of humanoid_imitation: ant tracks no motion")
+    assert line.endswith("--clip is of humanoid_imitation, g1_track: ant tracks no motion")
     with pytest.raises(SystemExit):
         parse(shac.Args, ["--env", "humanoid_imitation", "--clip", "nowhere"])
     assert "no such clip: nowhere" in capsys.readouterr().err

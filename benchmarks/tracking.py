@@ -1,0 +1,122 @@
+"""How well policies track their clips in MuJoCo, on any file of their robot.
+
+    python benchmarks/tracking.py runs/g1_track__sapo__1 --file path/to/unitree_g1/scene.xml
+    python benchmarks/tracking.py runs/h100/* --push 0.5
+    python benchmarks/tracking.py runs/h100/many --clip folder/of/unseen/clips
+
+Each motion is tracked several times from its first frame to its end, from joints that are up to 0.05 rad off. An
+episode succeeds if the root is never 0.5 m or 1 rad away from the clip's: mjlab's and BeyondMimic's criterion, of which
+a fall is one case. Errors are means over the time until then. Servos get the policy's targets within the range of its
+training, and a motor the torque that the task's servo would have. Nothing else of the file is changed.
+
+Writes tracking.csv, a row for each policy and world, and with --update-results the table of docs/tracking.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import common
+import numpy as np
+import torch
+from common import ABOUT, Part, load_case, measured, run
+from joystick import PUSHED_EVERY, training
+from tables import Row, grouped, middle, numbers
+from worlds import Array, OtherFile, State, rollout
+
+from diffsim import read_clip
+from diffsim.tasks.imitation.tracking import Tracking
+from diffsim.training import Count, NonNegative, Positive, SavedPolicy, fail
+
+OFF = 0.05  # rad, of the joints at the start
+
+
+@dataclass
+class Args(common.CheckpointFlags):
+    file: Path | None = None  # MJCF of the robot with a ground, in place of the task's
+    clip: Path | None = None  # motions in place of those of the training: a file or a folder
+    episodes: Count = 16  # of each motion
+    friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
+    push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
+
+
+def track(saved: SavedPolicy, task: Tracking, world: OtherFile, args: Args) -> tuple[Array, Array]:
+    """Success (n,) of each motion's episodes, and (3, n) mean errors of root [m], rotation and joints [rad]."""
+    first, length = (each.repeat_interleave(args.episodes) for each in task.motions)
+    n, drawn = len(first), np.random.default_rng(1)
+    memory = torch.zeros(n, task.num_memory).double()
+    memory[:, 0] = first
+    qpos, qvel = task.reference(memory)
+    qpos[:, 7:] += torch.from_numpy(drawn.uniform(-OFF, OFF, (n, task.joints)))
+
+    def push(step: int, state: State) -> State:
+        if not args.push or not step or step % round(PUSHED_EVERY / task.control_dt):
+            return state
+        angles, kicks = drawn.uniform(0, 2 * np.pi, n), np.zeros(state.qvel.shape)
+        kicks[:, :2] = args.push * np.stack((np.cos(angles), np.sin(angles)), 1)
+        return state._replace(qvel=state.qvel + torch.from_numpy(kicks))
+
+    start = State(qpos, qvel, torch.zeros(n, task.joints).double(), memory)
+    names, sizes = zip(*task.obs_parts, strict=True)
+    sums, counted, alive = torch.zeros(3, n).double(), torch.zeros(n), torch.ones(n, dtype=torch.bool)
+    for step, seen in enumerate(rollout(world, task, saved.network, start, int(length.max()), push)):
+        playing = step < length
+        alive &= ~seen.fallen | ~playing
+        if not (alive & playing).any():
+            break
+        obs = dict(zip(names, seen.obs.split(sizes, -1), strict=True))
+        off = *(obs[name].norm(dim=-1) for name in ("root_off", "root_turned")), obs["joints_off"].abs().mean(-1)
+        sums += torch.where(alive & playing, torch.stack(off), 0.0)
+        counted += alive & playing
+    return alive.numpy(), (sums / counted.clamp(min=1)).numpy()
+
+
+def measure(args: Args, path: Path) -> Iterator[Row]:
+    """A row for each friction."""
+    case = load_case(path, 1, "cpu")
+    if not isinstance(own := case.env.task, Tracking):
+        fail(f"{path} was trained on {own.name}, which is not judged by its clip's root")
+    clip = own.clip if args.clip is None else read_clip(args.clip)
+    task = type(own)(dtype=torch.float64, clip=clip)
+    task.bind(case.env.scene)
+    count = len(task.motions[0])
+    for friction in args.friction:
+        world = OtherFile(case.env, count * args.episodes, args.file, friction)
+        success, (root, turn, joints) = track(case.saved, task, world, args)
+        if count > 1:
+            print("  " + " ".join(f"{share:.0%}" for share in success.reshape(count, -1).mean(1)))
+        row = {"clip": str(clip), "motions": count, "clip s": float(task.motions[1].sum()) * task.control_dt}
+        row |= {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
+        row |= {"success": success.mean(), "joint error": joints.mean(), "root error": root.mean()}
+        yield case.about | training(case) | row | {"root turn": turn.mean(), "episodes": args.episodes}
+
+
+def table(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each clip, learner and machine, over seeds: medians. `success` is on the file's friction, the others
+    are least shares over seeds and frictions, without and with pushes; errors are those on the file's friction."""
+    rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
+    lines = list[Row]()
+    for (clip, learner, machine, file), group in grouped(rows, "clip", "learner", "machine", "file").items():
+        calm = [row for row in group if float(row["push"]) == 0]
+        plain = [row for row in calm if float(row["friction"]) == 1]
+        pushed = numbers([row for row in group if float(row["push"]) > 0], "success")
+        least = numbers(calm, "success")
+        lines.append(
+            {"clip": clip, "learner": learner, "machine": machine, "seeds": len({row["checkpoint"] for row in group})}
+            | {"training (s)": middle(plain, "training s", ".0f"), "judged on": file}
+            | {"success": middle(plain, "success", ".0%"), "least": f"{min(least):.0%}" if least else ""}
+            | {"least, pushed": f"{min(pushed):.0%}" if pushed else ""}
+            | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
+        )
+    return lines
+
+
+def main(args: Args) -> None:
+    key = (*ABOUT[:-1], "clip", "file", "friction", "push")
+    measured(args, Part("tracking", measure, key, "tracking", "tracking.md", table))
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)

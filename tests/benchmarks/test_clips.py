@@ -1,0 +1,64 @@
+"""How benchmarks/tracking.py judges policies that track clips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import tracking
+from learners import refusal
+from torch import Tensor, nn
+from worlds import OtherFile
+
+import diffsim
+from diffsim import Clip
+from diffsim.tasks.imitation.tracking import G1Track
+from diffsim.training import SavedPolicy
+
+POLICIES = Path(diffsim.__file__).parent / "policies"
+
+
+class Servo(nn.Module):
+    """Tells the servos the reference's joints."""
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self.low, self.high = low, high
+
+    def forward(self, obs: Tensor) -> Tensor:
+        off, _, joints = obs[:, 21 : 21 + 3 * 29].split(29, dim=1)
+        return (2 * (joints - off) - self.low - self.high) / (self.high - self.low)
+
+
+def test_who_stands_succeeds_and_who_is_to_fly_fails() -> None:
+    home = torch.from_numpy(diffsim.load_scene(Path(diffsim.__path__[0]) / "assets/g1.xml").mj_model.key_qpos[0])
+    still = home.expand(31, -1).clone()
+    flight = still.clone()
+    flight[:, 2] += torch.linspace(0, 2, 31, dtype=flight.dtype)
+    clip = Clip("two", torch.cat((still, flight)), False, (31, 31))
+    env = diffsim.make("g1_track", 1, clip=clip)
+    policy = Servo(*torch.from_numpy(env.scene.mj_model.actuator_ctrlrange).float().T)
+    task = G1Track(dtype=torch.float64, clip=clip)
+    task.bind(env.scene)
+    args, saved = tracking.Args(episodes=3, push=0.1), SavedPolicy(nn.Sequential(policy), "servo", {}, 1)
+    success, (root, turn, joints) = tracking.track(saved, task, OtherFile(env, 6, None, 1.0), args)
+    assert success.tolist() == [True] * 3 + [False] * 3
+    assert (root[:3] < 0.05).all() and (root[3:] > 0.1).all() and (turn[:3] < 0.1).all() and (joints < 0.1).all()
+
+
+def test_a_row_for_each_friction_and_a_line_for_each_clip() -> None:
+    row = dict(task="g1_track", clip="walk", learner="sapo", file="g1", push="0", success="1")
+    row |= {"training s": "100", "joint error": "0.06", "root error": "0.04"}
+    rows = [row | dict(checkpoint=f"h100/{k}", friction=str(f)) for k in (1, 2) for f in (0.7, 1, 1.3)]
+    rows[0]["success"], rows[-2]["success"] = "0.5", "0.8"
+    (line,) = tracking.table([*rows, row | dict(checkpoint="h100/1", friction="1", push="0.5", success="0.25")])
+    assert line["seeds"] == 2 and line["machine"] == "h100" and line["training (s)"] == "100"
+    assert (line["success"], line["least"], line["least, pushed"]) == ("90%", "50%", "25%")
+    assert (line["joints (rad)"], line["root (m)"]) == ("0.060", "0.040")
+
+
+def test_what_cannot_be_judged(capsys: pytest.CaptureFixture[str]) -> None:
+    args = tracking.Args(checkpoints=(POLICIES / "hopper.pt",))
+    error = refusal(lambda: tracking.main(args), capsys)
+    assert "was trained on hopper, which is not judged by its clip's root" in error

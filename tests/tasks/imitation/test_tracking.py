@@ -1,0 +1,268 @@
+"""Tracking: clips of other projects' files, what is refused, the reference, the reward, the mirror, and the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scenes import task_scene
+from torch import Tensor
+
+import diffsim
+from diffsim import Clip, read_clip
+from diffsim.tasks.imitation.task import STRAY
+from diffsim.tasks.imitation.tracking import AHEAD, BEFORE_END, REACH, STANDING, TURNED, G1Track
+
+REAL = torch.float64
+N = 29
+
+
+@pytest.fixture(scope="module")
+def task() -> G1Track:
+    return G1Track(dtype=REAL)
+
+
+def sway(seconds: float, fps: float) -> np.ndarray:
+    """qpos (T, 36) of a slow motion that turns about all axes and goes forward."""
+    t = np.arange(round(seconds * fps) + 1)[:, None] / fps
+    angle, axis = 0.4 * np.sin(2 * t), np.array([[1.0, 2.0, -2.0]]) / 3
+    place = np.concatenate((0.3 * t + 1, 0.1 * np.sin(t), 0.76 + 0.01 * np.cos(3 * t)), 1)
+    joints = 0.2 + 0.1 * np.sin(2 * t + np.arange(N))
+    joints[:, [1, 5, 7, 11, 13]] -= 0.2  # of small ranges
+    return np.concatenate((place, np.cos(angle / 2), np.sin(angle / 2) * axis, joints), 1)
+
+
+def write_csv(path: Path, qpos: np.ndarray) -> Path:
+    """As Unitree's LAFAN1 and G1 Moves: no header, quaternion xyzw."""
+    np.savetxt(path, qpos[:, [0, 1, 2, 4, 5, 6, 3, *range(7, qpos.shape[1])]], delimiter=",")
+    return path
+
+
+def some(task: G1Track, count: int, off: float = 0.1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """qpos, qvel, action and memory of robots that are beside the reference."""
+    generator = torch.Generator().manual_seed(0)
+    memory = task.begin(torch.rand(count, 1, dtype=REAL, generator=generator))
+    memory[:, 1:] = torch.rand(count, 2 * N, dtype=REAL, generator=generator) - 0.5
+    qpos, qvel = task.reference(memory)
+    qpos = qpos + off * torch.randn(qpos.shape, dtype=REAL, generator=generator)
+    qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
+    return qpos, qvel + off * torch.randn(qvel.shape, dtype=REAL, generator=generator), memory[:, 1 : 1 + N], memory
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def test_both_csv_forms_and_a_folder_are_the_motion_that_they_hold(tmp_path: Path) -> None:
+    expected = torch.from_numpy(sway(2, 60))
+    lafan = write_csv(tmp_path / "lafan.csv", sway(2, 30))
+    moves = write_csv(tmp_path / "moves.csv", sway(2, 60))
+    np.savez(tmp_path / "own.npz", qpos=sway(2, 60), fps=60, loop=False)
+    torch.testing.assert_close(read_clip(lafan).qpos, expected, atol=2e-3, rtol=0)
+    for source in (f"{moves}:60", tmp_path / "own.npz"):
+        clip = read_clip(source)
+        torch.testing.assert_close(clip.qpos, expected, atol=1e-12, rtol=0)
+        assert clip.name == Path(str(source).partition(":")[0]).stem and not clip.loop
+    assert len(read_clip(moves).qpos) == 241  # of 30 rows in a second
+    both = read_clip(f"{tmp_path}:60")
+    assert both.lengths == (61, 121, 121) and both.name == tmp_path.name and len(both.motions()) == 3
+    assert torch.equal(both.motions()[1].qpos, read_clip(f"{moves}:60").qpos)
+    task = G1Track(dtype=REAL, clip=both)
+    assert task.motions[1].tolist() == [50, 100, 100] and task.motions[0].tolist() == [0, 51, 152]
+    torch.save(both, file := tmp_path / "clip.pt")
+    with torch.serialization.safe_globals([Clip]):
+        assert torch.load(file, weights_only=True) == both != read_clip(moves)
+
+
+def test_bad_clips_are_refused_in_one_line(tmp_path: Path) -> None:
+    good, fast, wide = sway(2, 60), sway(2, 60), sway(2, 60) * np.where(np.arange(36) < 7, 1, 10)
+    fast[:, 22] = 2.6 * np.sin(10 * np.arange(len(fast)) / 60)  # of a shoulder; at twice the speed it is too fast
+    wrong = {
+        "qpos has 28 columns, the robot has 36": good[:, :28],
+        "is up to .* rad beyond its limits .*; are the angles in radians?": wide,
+        "turns by up to .* rad/s, more than a motor's 40; is it played too fast?": fast,
+        "must be a .csv file with finite rows .* of 0.1 s to 1 h": good * np.nan,
+        "must be a .csv file with finite rows": good[:3],
+    }
+    for complaint, qpos in wrong.items():
+        file = write_csv(tmp_path / "bad.csv", qpos)
+        with pytest.raises(ValueError, match=f"^clip .*{complaint}$" if "joint" in complaint else complaint) as found:
+            diffsim.make("g1_track", 1, clip=f"{file}:120" if "fast" in complaint else f"{file}:60")
+        assert "\n" not in str(found.value)
+    for content in ("", "x,y,z\n", "1,2,3\n1,2\n"):
+        file.write_text(content)
+        with pytest.raises(ValueError, match="must be a .csv file with finite rows of root position"):
+            read_clip(file)
+    (empty := tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="no such clip: .*empty; give an .npz or .csv file, a folder of them, or one"):
+        read_clip(empty)
+    write_csv(empty / "a.csv", good), write_csv(empty / "b.csv", good[:, :30])
+    with pytest.raises(
+        ValueError, match=r"clips of .*empty are of several robots: their qpos have \{36, 30\}|\{30, 36"
+    ):
+        read_clip(empty)
+    with pytest.raises(ValueError, match="task 'humanoid_imitation' tracks one motion, not the 2 of two"):
+        motion = read_clip("humanoid_run").qpos
+        diffsim.make("humanoid_imitation", 1, clip=Clip("two", torch.cat((motion, motion)), False, (24, 24)))
+
+
+# The reference --------------------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_clips_stand_on_the_ground() -> None:
+    model = task_scene("g1_track").mj_model
+    data = mujoco.MjData(model)
+    feet = [g for g in range(1, model.ngeom) if model.geom_contype[g]]
+    folder, size = Path(diffsim.__path__[0]) / "assets/clips", 0
+    for name, seconds in (("g1_karate", 25.7), ("g1_jazz_walk", 10.6)):
+        task, heights, found = G1Track(dtype=REAL, clip=read_clip(name)), [], np.zeros(model.nv)
+        for qpos in task._qpos.numpy():
+            data.qpos[:] = qpos
+            mujoco.mj_kinematics(model, data)
+            heights.append((data.geom_xpos[feet, 2] - model.geom_size[feet, 0]).min())
+        assert abs(np.quantile(heights, STANDING)) < 1e-6 and min(heights) > -0.02
+        assert task._qpos[0, :2].tolist() == [0, 0]
+        assert int(task.motions[1]) * 0.02 == pytest.approx(seconds, abs=0.1)
+        for t in (50, 200, 400):  # half the difference between the frames before and after
+            mujoco.mj_differentiatePos(model, found, 0.04, task._qpos[t - 1].numpy(), task._qpos[t + 1].numpy())
+            np.testing.assert_allclose(task._qvel[t].numpy(), found, atol=0.02)
+        assert not task._qvel[-1].any()
+        size += (folder / f"{name}.npz").stat().st_size
+    assert size < 150_000
+
+
+def test_a_single_bad_frame_does_little_harm() -> None:
+    qpos = torch.from_numpy(sway(4, 60))
+    bad = qpos.clone()
+    bad[100, 20] += 1.0
+    good, mended = (G1Track(dtype=REAL, clip=Clip("sway", each, False)) for each in (qpos, bad))
+    assert (good._qpos - mended._qpos).abs().max() < 0.21 and (good._qvel - mended._qvel).abs().max() < 12
+
+
+def test_servos_reach_the_clip_and_a_little_more_on_both_sides(task: G1Track) -> None:
+    model = diffsim.make("g1_track", 1).scene.mj_model
+    low, high = torch.from_numpy(model.actuator_ctrlrange).T
+    joints = task._qpos[:, 7:].quantile(torch.tensor([0.002, 0.998], dtype=REAL), dim=0)
+    assert (low <= joints[0] - REACH + 1e-6).all() and (high >= joints[1] + REACH - 1e-6).all()
+    assert (high - low < 5).all()
+    image = task.mirror.action(torch.stack((low, high)))
+    torch.testing.assert_close(torch.stack((image.amin(0), image.amax(0))), torch.stack((low, high)))
+
+
+# What is observed and rewarded ----------------------------------------------------------------------------------------
+
+
+def test_parts_of_the_observation_are_what_they_are_called(task: G1Track) -> None:
+    """Of a robot whose x is the world's y."""
+    qpos, qvel, action, memory = some(task, 3)
+    qpos[:, 3:7] = np.sqrt(0.5) * torch.tensor([1.0, 0, 0, 1])
+    names, sizes = zip(*task.obs_parts, strict=True)
+    obs = dict(zip(names, task.observe_with(qpos, qvel, action, memory).split(sizes, dim=-1), strict=True))
+    (target, speed), (later, _) = task.reference(memory), task.reference(memory, AHEAD)
+
+    def here(vector: Tensor) -> Tensor:
+        return torch.stack((vector[:, 1], -vector[:, 0], vector[:, 2]), 1)
+
+    expected = dict(velocity=here(qvel), root_off=here(target[:, :3] - qpos[:, :3]), reference_velocity=here(speed))
+    expected |= dict(reference_ahead=here(later[:, :3] - target[:, :3]), angular_velocity=qvel[:, 3:6])
+    expected |= {"joints_off": qpos[:, 7:] - target[:, 7:], "rates_off_x0.1": 0.1 * (qvel - speed)[:, 6:]}
+    expected |= {"joints": qpos[:, 7:], "joint_rates_x0.1": 0.1 * qvel[:, 6:], "last_action": action}
+    expected |= {"action_change": action - memory[:, 1 + N :], "joints_ahead": (later - target)[:, 7:]}
+    expected["gravity"] = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3)
+    turn = np.zeros((3, 3))
+    for k in range(3):
+        mujoco.mju_subQuat(turn[k], target[k, 3:7].numpy(), qpos[k, 3:7].numpy())
+    expected["root_turned"] = torch.from_numpy(turn)
+    assert obs.keys() == expected.keys() and sum(sizes) == task.obs_dim
+    for name, value in expected.items():
+        torch.testing.assert_close(obs[name], value)
+
+
+def test_the_reward_is_largest_on_the_reference_and_its_gradient_exact(task: G1Track) -> None:
+    qpos, qvel, action, memory = some(task, 4, off=0.0)
+    memory[:, 1 + N :] = action
+    best = task.reward(task.observe_with(qpos, qvel, action, memory), action)
+    torch.testing.assert_close(best, torch.full((4,), 3.0, dtype=REAL))
+    for k in (0, 2, 3, 5, 8, 20, 35):
+        other = qpos.clone()
+        other[:, k] += 0.1
+        other[:, 3:7] /= other[:, 3:7].norm(dim=1, keepdim=True)
+        assert (task.reward(task.observe_with(other, qvel, action, memory), action) < best - 1e-3).all()
+    for k in (0, 2, 8, 34):
+        other = qvel.clone()
+        other[:, k] += 1.0
+        assert (task.reward(task.observe_with(qpos, other, action, memory), action) < best - 1e-3).all()
+    qpos, qvel, action, memory = some(task, 2)
+
+    def reward(qpos: Tensor, qvel: Tensor, last: Tensor, before: Tensor) -> Tensor:
+        memory_ = torch.cat((memory[:, :1], last, before), 1)
+        return task.reward(task.observe_with(qpos, qvel, last, memory_), last)
+
+    parts = qpos, qvel, action, memory[:, 1 + N :]
+    assert torch.autograd.gradcheck(reward, [part.clone().requires_grad_() for part in parts])
+
+
+def test_the_image_tracks_the_mirrored_clip(task: G1Track) -> None:
+    """It sees the image, gains the same, ends alike; the clip's mirror image has the same ranges and heights."""
+    mirror = task.mirror
+    image = G1Track(dtype=REAL, clip=Clip("image", mirror.qpos(task.clip.qpos), False))
+    torch.testing.assert_close(image._qpos, mirror.qpos(task._qpos), rtol=0, atol=1e-9)
+    qpos, qvel, action, memory = some(task, 50)
+    mirrored = torch.cat((memory[:, :1], *map(mirror.action, memory[:, 1:].split(N, 1))), 1)
+    seen = image.observe_with(mirror.qpos(qpos), mirror.qvel(qvel), mirror.action(action), mirrored)
+    obs = task.observe_with(qpos, qvel, action, memory)
+    torch.testing.assert_close(seen, mirror.obs(obs), rtol=0, atol=1e-9)
+    torch.testing.assert_close(image.reward(seen, action), task.reward(obs, action))
+    np.testing.assert_allclose(
+        image.scene().mj_model.actuator_ctrlrange, task.scene().mj_model.actuator_ctrlrange, atol=1e-6
+    )
+
+
+# Start, clock and end -------------------------------------------------------------------------------------------------
+
+
+def test_episodes_start_anywhere_but_near_an_end(tmp_path: Path) -> None:
+    motions = [torch.from_numpy(sway(seconds, 60)) for seconds in (4, 0.5)]
+    clip = Clip("two", torch.cat(motions), False, tuple(map(len, motions)))
+    task = G1Track(dtype=REAL, clip=clip)
+    rand = torch.arange(2000, dtype=REAL).unsqueeze(1) / 2000
+    step = task.first_step(rand)
+    assert step.unique().tolist() == [*range(200 - BEFORE_END), 201] and step[1000] == 0
+    qpos, qvel = task.reset(rand)
+    assert torch.equal(qpos, task._qpos[step]) and torch.equal(qvel, task._qvel[step])
+    memory = torch.zeros(2, task.num_memory, dtype=REAL)
+    memory[:, 0] = torch.tensor([198.0, 201.0])
+    frames = []
+    for k in range(30):
+        action = torch.full((2, N), float(k), dtype=REAL)
+        memory = task.remember(memory, action, action[:, :0])
+        frames.append(memory[:, 0].tolist())
+    assert frames[:3] == [[199, 202], [200, 203], [200, 204]] and frames[-1] == [200, 226]  # held at the ends
+    assert torch.equal(memory[:, 1 : 1 + N], action) and torch.equal(memory[:, 1 + N :], action - 1)
+
+
+def test_the_end(task: G1Track) -> None:
+    qpos, qvel, action, memory = some(task, 1, off=0.0)
+
+    def ends(place: float = 0.0, turn: float = 0.0) -> bool:
+        off = qpos.clone()
+        off[:, 1] += place
+        spin = torch.tensor([np.cos(turn / 2), 0, 0, np.sin(turn / 2)], dtype=REAL)
+        mujoco.mju_mulQuat(found := np.zeros(4), qpos[0, 3:7].numpy(), spin.numpy())
+        off[0, 3:7] = torch.from_numpy(found)
+        return bool(task.terminated(task.observe_with(off, qvel, action, memory)))
+
+    assert not ends() and not ends(STRAY - 1e-3) and ends(STRAY + 1e-3)
+    assert not ends(turn=TURNED - 1e-3) and ends(turn=TURNED + 1e-3) and ends(turn=-TURNED - 1e-3)
+
+
+def test_a_robot_follows_for_a_while_when_its_servos_are_told_the_reference() -> None:
+    env = diffsim.make("g1_track", 4, seed=0, clip="g1_jazz_walk", stochastic_init=False)
+    low, high = torch.from_numpy(env.scene.mj_model.actuator_ctrlrange).float().T
+    for step in range(20):
+        target = env.task.reference(env.memory, 1)[0][:, 7:]  # type: ignore[attr-defined]
+        with torch.no_grad():
+            _, reward, terminated, _, _ = env.step((2 * target - low - high) / (high - low))
+        assert reward.min() > 2.0 and not terminated.any() and (env.memory[:, 0] == step + 1).all()
