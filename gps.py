@@ -78,7 +78,7 @@ class Args(Flags):
     demonstration: Path | None = None
     """the example, or several: .npz of qpos (T+1, nq), qvel (T+1, nv), action (T, nu), a row a step (per task)"""
     ilqr_iterations: Natural = 0
-    """iterations of trajectory optimisation that improve the example, and can make it unlearnable (docs/gps.md)"""
+    """iterations of trajectory optimisation, which improve the example and make it harder to learn (docs/gps.md)"""
     guiding_samples: Repeats = 40
     """trajectories drawn from the guiding distributions"""
     adaptive: Natural = 0
