@@ -29,7 +29,8 @@ SEARCHES = 12  # evaluations of a line search, at most
 EDGE = 0.1  # least distance of its secants from the ends of its bracket, in multiples of its width
 ENOUGH = 0.1  # it ends this close to the least cost, in multiples of what the part of the step would gain at first
 NEAR = 0.05  # the slope after a whole step that is good enough, in multiples of the first one
-ROUND_OFF = 1.0  # of a step, in multiples of the float's epsilon and of the contacts' stiffness beside inertia
+ROUND_OFF = 20.0  # of a step, in multiples of the float's epsilon and of the contacts' stiffness beside inertia
+ROWS = 10.0  # by how much more an acceleration can be off than each row alone says, which other rows hold: measured
 PATIENCE = 6, 2  # passes, and with dry friction, for which a whole step may end in a slope as large as the first one
 
 
@@ -219,7 +220,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             found = measure(m, law, here, links, motions, touches, part, tries)
             rounding = T(ROUNDING) * found[4]
             away = (T(1.0) - part) * (T(1.0) - part) + rounding * rounding
-            off = (found[3] + away * moved) / by.size
+            off = (T(ROWS * ROWS) * found[3] + away * moved) / by.size
             by.off = pick(T(0.0), by.going, off, by.off)
             if tries == 0 and by.passes > 0:
                 rises = pick(square, off, by.going * (found[0] - patience * found[1]), T(0.0))
