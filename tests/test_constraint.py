@@ -477,7 +477,8 @@ def test_float32_keeps_the_zone_of_a_deep_contact() -> None:
     """Feet deep in the ground are so stiff that rounding moves a contact over the edge of its cone. The gradient takes
     the zone in which the step was solved: with another one it was up to 1e5 times too large."""
     task = diffsim.TASKS["go2"]
-    scene, how, n = task.load_robot(), task.integration("default"), 512
+    scene, n = task.load_robot(), 512
+    how = task.integration("default")._replace(tolerance=1e-6)  # so that rounding is what differs
     rng = torch.Generator().manual_seed(0)
     noise = lambda *size: torch.rand(*size, generator=rng, dtype=torch.float64) * 2 - 1  # noqa: E731
     qpos = torch.tensor(scene.mj_model.key_qpos[0]).repeat(n, 1)
@@ -490,6 +491,6 @@ def test_float32_keeps_the_zone_of_a_deep_contact() -> None:
         leaf = qvel.to(dtype).requires_grad_()
         end = sim.step(qpos.to(dtype), leaf, ctrl.to(dtype))[1]
         found.append(torch.autograd.grad((end * weights.to(dtype)).sum(), leaf)[0].double())
-    converged = sim.residual < 1e-3
-    error = ((found[1] - found[0]).norm(dim=1) / found[0].norm(dim=1))[converged]
-    assert converged.double().mean() > 0.9 and error.median() < 2e-3 and error.max() < 3
+    assert (sim.residual < how.tolerance).double().mean() > 0.98
+    error = (found[1] - found[0]).norm(dim=1) / found[0].norm(dim=1)
+    assert error.median() < 2e-3 and error.max() < 1
