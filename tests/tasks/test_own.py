@@ -94,7 +94,7 @@ def test_a_file_that_changes_is_read_again(tmp_path: Path) -> None:
         ("import sys\nsys.exit(3)\n", "task.py", "task.py, line 2: SystemExit: 3"),
         ("import nowhere\n", "task.py:Any", "task.py, line 1: ModuleNotFoundError: No module named 'nowhere'"),
         (None, "anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant"),
-        (None, "anty", "g1, or give a file such as my_task.py"),
+        (None, "anty", "g1, g1_track, or give a file such as my_task.py"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_file(
@@ -311,7 +311,7 @@ def test_own_tasks_have_mujocos_contact_and_the_shipped_ones_the_papers() -> Non
         contact = "soft"
 
     hard, soft = (lambda n, kind=kind: diffsim.Integration(kind, n) for kind in ("mujoco", "semi_implicit"))
-    assert {name for name, task in TASKS.items() if task.contact == "mujoco"} == {"go1", "go2", "g1"}
+    assert {name for name, task in TASKS.items() if task.contact == "mujoco"} == {"go1", "go2", "g1", "g1_track"}
     for kind, words, expected in (
         (Bare, ["default"], hard(4)),
         (Bare, ["accurate"], hard(16)._replace(tolerance=1e-5)),

@@ -152,7 +152,7 @@ def test_defaults_are_the_tables(script: ModuleType) -> None:
         preset = getattr(script, "INTEGRATION", {}).get(env) or diffsim.TASKS[env].integration("default")
         if preset.integrator == "mujoco" and script.__name__ in ("shac", "sapo"):  # shorter windows of more
             expected |= {"num_envs": 4 * expected.get("num_envs", script.Args().num_envs)}
-            assert args.horizon == (16 if env == "g1" and script.__name__ in ("shac", "sapo") else 8)
+            assert args.horizon == (16 if env in ("g1", "g1_track") and script.__name__ in ("shac", "sapo") else 8)
         expected |= dict(integrator=preset.integrator, substeps=preset.substeps, theta=preset.theta)
         assert {name: getattr(args, name) for name in expected} == expected
 
