@@ -127,7 +127,7 @@ class Case(NamedTuple):
         """The cells of ABOUT."""
         args = self.saved.args
         learner = " ".join((self.saved.script, *(args[name] for name in ("policy",) if name in args)))
-        learner += " --symmetric" if args.get("symmetric") else ""
+        learner += "".join(f" --{name}" for name in ("symmetric", "randomise") if args.get(name))
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
         values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
         return dict(zip(ABOUT, values, strict=True))

@@ -158,6 +158,10 @@ class OtherFile(MuJoCo):
 
     def _advance(self, data: mujoco.MjData, action: Array) -> None:
         target = self._middle + self._reach * action[self._order]
+        if self._servo.all():
+            data.ctrl[self._ctrl] = np.where(self._limited, target.clip(self._least, self._most), target)
+            mujoco.mj_step(self.model, data, self.substeps)
+            return
         for _ in range(self.substeps):
             torque = self._stiffness * (target - data.qpos[self._joint_qpos])
             torque -= self._damping * data.qvel[self._joint_qvel]
