@@ -141,7 +141,7 @@ def test_training_keeps_it_and_resumes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("script", LEARNERS)
 def test_a_gpu_trains_and_keeps_it(script: str, task: str, tmp_path: Path) -> None:
     """In CUDA graphs; networks are made on the CPU, and the task's mirror on the GPU."""
-    flags = f"--env {task} --symmetric --num-envs 8 --horizon 4 --iterations 6 --device cuda --quiet --eval-episodes 2"
+    flags = f"--env {task} --symmetric --num-envs 16 --horizon 4 --iterations 6 --device cuda --quiet --eval-episodes 2"
     run(importlib.import_module(script), tmp_path, *flags.split())
     mirror = TASKS[task]().mirror
     obs = torch.randn(20, len(mirror.obs.index))
