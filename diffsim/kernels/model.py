@@ -290,16 +290,18 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         Base=struct("Base", dict.fromkeys("gp gr gv gw v vdot".split(), vec3)),
         # what the forward kernel keeps of a link and its joint: the link's velocity product C and acceleration A; the
         # factor U and 1/d, the right-hand side u and then the acceleration, the motors' force, what rounding the
-        # position lost. In Newton's method the joint's acceleration, the last step of that, the force on it without
-        # constraints, theirs and minus its slope; the link's twist if rates were accelerations, and the last step of it
+        # position lost. In Newton's method the joint's acceleration, the force on it without constraints, theirs (held;
+        # firm: minus its slope), theirs where a part of the step is tried (holds; given: the slope's share), the
+        # limit's stop, and the twist that the step gives the link
         Motion=Motion,
         Motions=wp.array(dtype=Motion),
         # a floating base's state, accelerations or steps of a solve, and the iterate
         Root=struct("Root", root),
-        # where Newton's method is: 1 for environments that have not converged, else 0; squares of the residual, of the
-        # acceleration (plus 1) and of the step; passes so far
+        # where Newton's method is: 1 for environments that have not converged, else 0; squares of the residual and of
+        # the acceleration (plus 1); passes so far
         Newton=struct("Newton", dict.fromkeys("tolerance going off size".split(), T) | {"passes": int}),
-        # where a contact is, jar without acceleration, D, whether it touches, did so in the last substep, and jar there
+        # where a contact is, jar and force of the iterate and where a part of the step is tried, H step, the cone's H
+        # there, D, and whether it touches
         Touch=Touch,
         Touches=wp.array(dtype=Touch),
         vec6s=wp.array(dtype=vec6),

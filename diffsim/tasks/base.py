@@ -55,6 +55,7 @@ class Task:
     forward_column: int | None  # of qpos [m], grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
+    touchdown: ClassVar[bool] = True  # of the presets on MuJoCo's contact, see Integration
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
     randomise: ClassVar[tuple[str, ...]] = ()  # ranges that learners draw unless told otherwise, as in --randomise
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
@@ -170,6 +171,7 @@ class Task:
         own = hasattr(cls, "substeps") and contact == cls.contact
         explicit = Integration.explicit(contact, cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt)))
         if explicit.constrained:
+            explicit = explicit._replace(touchdown=cls.touchdown)
             fast = explicit.replaced(tolerance=10 * TOLERANCE)
             accurate = explicit.replaced(substeps=4 * explicit.substeps, tolerance=TOLERANCE / 10)
             return {"fast": fast, "default": explicit, "accurate": accurate}
@@ -228,6 +230,10 @@ class Task:
             noise: (..., num_noise) uniform in [0, 1).
         """
         return memory
+
+    def metadata(self) -> dict[str, str]:
+        """What a program needs to know of the task that runs its policy, for `export`."""
+        return {}
 
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """What a control step starts with in place of qvel (..., nv) and action (..., nu): pushes, delays.

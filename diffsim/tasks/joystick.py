@@ -16,10 +16,9 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from diffsim.sim.integration import Integration
 from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.feet import Feet
-from diffsim.tasks.locomotion import rotate
+from diffsim.tasks.locomotion import rotate, score
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, partners, reflections
 
 FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
@@ -88,11 +87,6 @@ def humanoid() -> Robot:
     return Robot(joints, home, 0.755, legs, 0.65, 0.08, 1.4, (("right_", "left_"),))
 
 
-def score(square: Tensor, scale: float) -> Tensor:
-    """log(1 + square / scale): a parabola near 0; far away it does not drown the other terms, and has a slope."""
-    return torch.log1p(square / scale)
-
-
 class Joystick(Task):
     """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates).
 
@@ -115,7 +109,6 @@ class Joystick(Task):
     episode_length = 1000
 
     forward_column = None  # what counts is the command
-    touchdown: ClassVar[bool] = True
     alive: ClassVar[float] = 4.0  # reward of a perfect step
     smooth: ClassVar[float] = 2.0  # weight of changes of the action
     # By how much the actions of an episode come late; how large the pushes are that come at random
@@ -135,12 +128,6 @@ class Joystick(Task):
         cls.obs_parts = *seen, *private, ("feet_from_reference", legs), ("feet_slip", legs)
         cls.actor_dim, cls.obs_dim = (sum(size for _, size in parts) for parts in (seen, cls.obs_parts))
         cls.num_memory, cls.num_noise, cls.num_random = 16 + 4 * n, 20 + 2 * n, 22 + 2 * n
-
-    @classmethod
-    def presets(cls, contact: str | None = None) -> dict[str, Integration]:
-        """See Task."""
-        found = super().presets(contact)
-        return {k: how._replace(touchdown=cls.touchdown) if how.constrained else how for k, how in found.items()}
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)
@@ -284,6 +271,17 @@ class Joystick(Task):
         gait = 1.2 * score(error.square(), 0.05).mean(-1) + self.smooth * score(change.square().mean(-1), 0.2)
         feet = 0.4 * score(lift.square(), 0.0004).mean(-1) + 0.15 * slip.mean(-1)
         return self.alive - 0.5 * speed - 0.25 * yaw - calm - level - gait - feet
+
+    def metadata(self) -> dict[str, str]:
+        """See Task; the command's name is mjlab's."""
+        robot = self.robot
+        most = ",".join(f"{size:g}" for size in robot.command)
+        return dict(
+            command_names="twist",
+            command_range=most,
+            gait_frequency=f"{robot.cycle:g}",
+            root_height=f"{robot.height:g}",
+        )
 
     def terminated(self, obs: Tensor) -> Tensor:
         """Tilted by more than 60 degrees, or the root below 60 % of its height."""

@@ -21,7 +21,6 @@ from diffsim.env import DiffEnv
 from diffsim.robot.elements import control_range, servos
 from diffsim.tasks import FILE, TASKS
 from diffsim.tasks.imitation.clip import Clip
-from diffsim.tasks.joystick import Joystick
 from diffsim.training.errors import fail
 from diffsim.training.layers import Both, First, Fold, Likeliest, ObsNormalizer
 
@@ -212,10 +211,7 @@ def describe(saved: SavedPolicy, env: DiffEnv, columns: int) -> dict[str, str]:
             told |= dict(joint_stiffness=joined(m.actuator_gainprm[:, 0]))
             told |= dict(joint_damping=joined(0.0 - m.actuator_biasprm[:, 2]))
             told |= dict(default_joint_pos=joined((low + high) / 2), action_scale=joined((high - low) / 2))
-    if isinstance(task, Joystick):
-        told |= dict(command_names="twist", command_range=joined(task.robot.command))
-        told |= dict(gait_frequency=f"{task.robot.cycle:g}", root_height=f"{task.robot.height:g}")
-    return told
+    return told | task.metadata()
 
 
 def joined(values: Iterable[object]) -> str:

@@ -87,9 +87,8 @@ def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> li
     all simulators, in windows of 8 steps from the start states."""
     best = np.full((len(sims), 2), np.inf)
     for turn in range(rounds + 1):  # the first one compiles and warms up
-        for row, sim in list(zip(best, sims, strict=True))[
-            :: (-1) ** turn
-        ]:  # so that no one always follows the slowest
+        order = [*zip(best, sims, strict=True)]
+        for row, sim in order if turn % 2 else reversed(order):  # so that no one always follows the slowest
             copies = torch.arange(sim.num_envs) % len(motion.qpos)
             q0, v0, actions = (
                 x.to(sim.device, sim.dtype)

@@ -14,13 +14,11 @@ from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
-from diffsim.sim.integration import Integration
 from diffsim.tasks.base import Contact
 from diffsim.tasks.imitation.clip import FASTEST, Clip
 from diffsim.tasks.imitation.kinematics import Kinematics, difference
 from diffsim.tasks.imitation.task import STRAY, Imitation, draw
-from diffsim.tasks.joystick import score
-from diffsim.tasks.locomotion import rotate
+from diffsim.tasks.locomotion import rotate, score
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
 
 SMOOTH = 5  # frames of 1/60 s whose mean a frame of the reference is
@@ -43,6 +41,7 @@ class Tracking(Imitation):
     joints: ClassVar[int]
     sides: ClassVar[Sides]  # (right, left) beginnings of the names of joints and actuators
     contact: ClassVar[Contact] = "mujoco"
+    touchdown = False  # hard soles chatter, and then the slopes of their touching down are noise
     substeps = 4
     control_dt = 0.02
     episode_length = 500  # 10 s
@@ -57,12 +56,6 @@ class Tracking(Imitation):
         cls.obs_parts = *((name, 3) for name in root), *((name, cls.joints) for name in each)
         cls.obs_dim = sum(size for _, size in cls.obs_parts)
         cls.num_memory = 1 + 2 * cls.joints
-
-    @classmethod
-    def integration(cls, accuracy: str, contact: str | None = None) -> Integration:
-        """See Task; hard soles chatter, and then the slopes of their touching down are noise."""
-        found = super().integration(accuracy, contact)
-        return found._replace(touchdown=False) if found.constrained else found
 
     def __init__(
         self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
