@@ -43,7 +43,7 @@ def test_presets_of_every_task():
             each.substeps * (1.5 if each.integrator == "extrapolated" else 1) for each in (fast, default, accurate)
         ]
         assert works[0] <= works[1] / 2 and works[1] < works[2]
-        for accuracy, substeps, tolerance in (("fast", 4, 1e-3), ("default", 4, 1e-4), ("accurate", 16, 1e-5)):
+        for accuracy, substeps, tolerance in (("default", 4, 1e-4), ("accurate", 16, 1e-5)):
             preset = Integration("mujoco", substeps, tolerance=tolerance)
             assert task.integration(accuracy, "mujoco") == preset, name
 
@@ -80,12 +80,13 @@ def test_arguments_override_the_preset():
     assert (soft.k_n, soft.k_d, soft.k_t, soft.mu) == (1e5, 1e4, file.k_t, file.mu)
     wrong = {"'kn'.*k_n, k_d, k_t, mu, k_limit, d_limit": dict(penalty={"kn": 1e5})}
     wrong |= {f"k_n is {bad}, must be": dict(penalty={"k_n": bad}) for bad in (-1.0, float("nan"), float("inf"))}
-    wrong |= {"'faster'.*fast, accurate, default": dict(accuracy="faster")}
+    wrong |= {"'faster' on soft contact; .*fast, accurate, default": dict(accuracy="faster")}
+    wrong |= {"'fast' on mujoco contact; .*default, accurate": dict(accuracy="fast", contact="mujoco")}
     wrong |= {"unknown contact 'hard'; choose from soft, mujoco": dict(contact="hard")}
     for message, arguments in wrong.items():
         with pytest.raises(ValueError, match=message):
             diffsim.make("hopper", 1, **arguments)
-    with pytest.raises(ValueError, match="task 'walker' has no preset 'fast'; choose from default"):
+    with pytest.raises(ValueError, match="task 'walker' has no preset 'fast' on soft contact; choose from default"):
         TASKS["walker"].integration("fast")
 
 

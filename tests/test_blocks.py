@@ -176,6 +176,13 @@ def test_a_hinge_far_off_moves_on_or_is_contained(count):
         np.testing.assert_allclose(
             end.double() - angle, 3.0 * CONTROL_DT, atol=0.51 * np.spacing(np.float32(abs(angle)))
         )
+    for angle, slowest in ((1e4, 0.03), (9e4, 0.24)):  # rad/s, as docs/numerics.md has it: a slower one stands still
+        for rate in (10 * slowest, 3 * slowest, 0.9 * slowest, 0.3 * slowest):
+            end = zeros + angle
+            for _ in range(60):
+                end, _ = sim.step(end, zeros + rate, zeros)
+            moved = (end.double() - angle) / (60 * CONTROL_DT)
+            assert (abs(moved - rate) < slowest).all() and (rate > slowest / 2 or (moved == 0).all())
     for angle in (1.1e5, 3e7, -2e9):  # sines of blocks are wrong from 3e7 on
         end, _ = sim.step(zeros + angle, zeros + 3.0, zeros)
         assert sim.nonfinite.all() and (end == zeros + angle).all()

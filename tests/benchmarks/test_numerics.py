@@ -59,7 +59,7 @@ def test_accurate_is_more_accurate_and_fast_is_faster() -> None:
         by = {row["preset"]: row for row in own}
         for name in ERRORS if "accurate" in by else ():
             assert float(by["accurate"][name]) < float(by["default"][name]), by
-        assert "fast" not in by or float(by["fast"]["speed"]) >= 1, by
+        assert "fast" not in by or float(by["fast"]["speed"]) >= 1.1, by
 
 
 def test_more_substeps_never_cost_less() -> None:

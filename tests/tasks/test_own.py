@@ -318,7 +318,6 @@ def test_own_tasks_have_mujocos_contact_and_the_shipped_ones_the_papers() -> Non
         (Bare, ["default", "soft"], soft(16)),
         (Slow, ["default"], hard(12)),
         (Own, ["default"], hard(7)),
-        (Own, ["fast"], hard(7)._replace(tolerance=1e-3)),
         (Own, ["default", "soft"], soft(16)),
         (Soft, ["default"], soft(7)),
         (Soft, ["default", "mujoco"], hard(4)),
