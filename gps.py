@@ -38,16 +38,15 @@ from diffsim.training.layers import ObsNormalizer
 from diffsim.training.ranges import Count, Natural, NonNegative, Positive, Repeats
 from diffsim.training.run import Run
 
-TRACKING = 0.05  # weight of the squared deviation from the example's states, in the guides alone (Section 6)
 STORED = 3  # times --active, the samples of S that are kept to choose from
 # fmt: off
-COLUMNS = ("horizon", "control_dt", "action_cost", "hidden", "noise", "pretraining")
+COLUMNS = ("horizon", "control_dt", "action_cost", "hidden", "noise", "tracking", "pretraining")
 PER_TASK: dict[str, tuple[float, ...]] = {
-    "cartpole": (240, 1 / 60, 1e-3,  50, 0.10, 1500),
-    "hopper":   (500, 0.02,   1e-1,  50, 0.10,  200),
-    "humanoid": (500, 1 / 60, 1e-1, 200, 0.01,  200),
-    "swimmer":  (500, 0.05,   1e-2,  50, 0.10,  200),
-    "walker":   (500, 0.01,   1e-1,  50, 0.10,  200),
+    "cartpole": (240, 1 / 60, 1e-3,  50, 0.10, 0.05, 1500),
+    "hopper":   (500, 0.02,   1e-1,  50, 0.10, 0.05,  200),
+    "humanoid": (500, 1 / 60, 1e-1, 200, 0.01, 0.05,  200),
+    "swimmer":  (500, 0.05,   1e-2,  50, 0.10, 0.05,  200),
+    "walker":   (500, 0.01,   1e-1,  50, 0.10, 0.50,   50),
 }
 # The paper's reward: v_x* [m/s], p_y* [m], its weight w_h, and that of the trunk's squared rotation, which is ours.
 # Other tasks have their own.
@@ -89,6 +88,8 @@ class Args(Flags):
     """units of the policy's hidden layer (per task)"""
     noise: Positive = 0.1
     """the policy's standard deviation, relative to that of the example's actions over time (per task)"""
+    tracking: NonNegative = 0.05
+    """weight of the squared deviation from the example's states, in the guides alone (Section 6; per task)"""
     pretraining: Repeats = 1500
     """L-BFGS iterations of the fit to the guiding samples (per task)"""
     samples: Repeats = 10
@@ -213,12 +214,13 @@ class Search:
 
     def plan(self, ground: System, x: Tensor, u: Tensor) -> Plan:
         """Line 1: an example as this simulator follows it, and as iLQR improves it."""
-        return ilqr(ground, self.cost, *follow_demonstration(ground, x, u, TRACKING), self.args.ilqr_iterations)
+        followed = follow_demonstration(ground, x, u, self.args.tracking)
+        return ilqr(ground, self.cost, *followed, self.args.ilqr_iterations)
 
     def guide(self, ground: System, plan: Plan) -> LinearGaussian:
         """Line 1: exp(reward) about a plan, times Section 6's tracking term and the policy's noise."""
         noise = 0.5 / self.network.sigma.square()
-        cost = Sum((self.cost, Tracking(ground, plan.x, plan.u, TRACKING, noise)))
+        cost = Sum((self.cost, Tracking(ground, plan.x, plan.u, self.args.tracking, noise)))
         return maximum_entropy_controllers(ground, cost, plan)[0]
 
     def sample_guides(self) -> Samples:
