@@ -56,6 +56,8 @@ class Args(ParallelFlags):
     """of the Gaussian: its standard deviation depends on the state, or is a parameter of each action"""
     particles: Several = 35
     """particles (components, bins) of each action"""
+    initial_log_std: float | None = None
+    """log standard deviation of the first actions (default: a Gaussian's is 0, components cover [-1, 1], about -0.5)"""
     resampling: Literal["weighted", "uniform", "none"] = "weighted"
     """where dead particles go: to living ones in proportion to their mean weight, to any of them, or nowhere"""
     resampling_interval: Count = 20
@@ -98,6 +100,8 @@ class Args(ParallelFlags):
         super().check()
         if self.lr_bounds[0] > self.lr_bounds[1]:
             fail(f"--lr-bounds {self.lr_bounds}: the lowest exceeds the highest")
+        if not LOG_STD[0] <= (self.initial_log_std or 0.0) <= LOG_STD[1]:
+            fail(f"--initial-log-std must be from {LOG_STD[0]:g} to {LOG_STD[1]:g}, not {self.initial_log_std}")
 
 
 # Policies -------------------------------------------------------------------------------------------------------------
@@ -168,9 +172,9 @@ class Head(nn.Module):
         super().__init__()
         self.policy, self.shape = args.policy, (actions, 1 if args.policy == "gaussian" else args.particles)
         self.scale: nn.Linear | None = None
-        loc, log_std = spread(*self.shape)
+        loc, log_std = spread(*self.shape, args.initial_log_std)
         if self.policy == "gaussian":
-            self.linear, first = nn.Linear(inputs, actions), torch.zeros(self.shape)
+            self.linear, first = nn.Linear(inputs, actions), torch.full(self.shape, args.initial_log_std or 0.0)
             if args.std == "own":
                 self.log_std = nn.Parameter(first)
             else:
@@ -202,11 +206,17 @@ class Head(nn.Module):
         return (Bins if self.policy == "discrete" else Mixture)(logits, loc, log_std)
 
 
-def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
-    """Locations that cover each action evenly, and log standard deviations that cover the gaps between them (m, n)."""
+def spread(actions: int, n: int, log_std: float | None = None) -> tuple[Tensor, Tensor]:
+    """Locations that cover each action evenly, and log standard deviations that cover the gaps between them (m, n).
+
+    They cover [-1, 1], or as much as gives their mixture with equal weights a log standard deviation.
+    """
     loc = torch.linspace(-1, 1, n, dtype=torch.float64)
     gap = loc.diff()
     widest = torch.maximum(F.pad(gap, (1, 0)), F.pad(gap, (0, 1)))
+    if log_std is not None:
+        scale = math.exp(log_std) / (loc.square() + widest.square()).mean().sqrt()
+        loc, widest = loc * scale, widest * scale
     return loc.float().repeat(actions, 1), widest.log().float().repeat(actions, 1)
 
 

@@ -99,6 +99,15 @@ def test_the_deviation_of_a_gaussian_depends_on_the_state_or_not(std: str) -> No
     assert change[0].min() > 0 and (change.std(0).max() < 1e-6) == (std == "own")
 
 
+@pytest.mark.parametrize("log_std", [-2.0, 0.0])
+@pytest.mark.parametrize("policy", ["pfpn", "gaussian", "gmm", "discrete"])
+def test_the_first_actions_have_the_deviation_that_is_asked_for(policy: str, log_std: float) -> None:
+    args = parse(pfpn.Args, f"--device cpu --policy {policy} --initial-log-std {log_std}".split())
+    torch.manual_seed(0)
+    draws = pfpn.Head(args, 4, M)(torch.zeros(20_000, 4)).sample()
+    torch.testing.assert_close(draws.std(0).log(), torch.full((M,), log_std), rtol=0, atol=0.15)
+
+
 def test_entropy_is_of_the_weights_or_of_the_gaussian() -> None:
     logits, loc, log_std = parameters(BATCH)
     entropy = pfpn.Mixture(logits, loc, log_std).entropy()
@@ -442,7 +451,7 @@ def test_settings_are_those_of_the_baselines(script: Any, baseline: Any, env: st
     own, theirs = (vars(parse(each.Args, flags)) for each in (script, baseline))
     other = {SAME.get(name, name): value for name, value in theirs.items()}
     own |= {name: vars(script).get(constant) for name, constant in CONSTANTS.items() if name in other}
-    shared = other.keys() & own.keys() - {"run_dir", "eval_every", "save_every"}
+    shared = other.keys() & own.keys() - {"run_dir", "eval_every", "save_every", "initial_log_std"}  # of another policy
     assert len(shared) > 20 and {name: own[name] for name in shared} == {name: other[name] for name in shared}
 
 
@@ -451,6 +460,8 @@ def test_settings_are_those_of_the_baselines(script: Any, baseline: Any, env: st
     [
         (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
         (pfpn, "--lr-bounds 1e-2 1e-3", "the lowest exceeds the highest"),
+        (pfpn, "--initial-log-std nan", "--initial-log-std must be from -5 to 2, not nan"),
+        (pfpn, "--initial-log-std 2.5", "--initial-log-std must be from -5 to 2, not 2.5"),
         (pfpn, "--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),
         (pfpn_sac, "--buffer-size 10", "--buffer-size 10 holds no window of 4096 steps"),
     ],
