@@ -22,7 +22,7 @@ import warp as wp
 
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.factors import D_LIMIT, K_LIMIT, MOTOR, environment_law
+from diffsim.kernels.factors import D_LIMIT, K_LIMIT, MOTOR, lane_of
 from diffsim.kernels.force import external_force
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
@@ -39,14 +39,14 @@ from diffsim.robot.scene import FACTORS
 @cache
 def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
-    T, vec2, vec3, vec6, quat, Model, Law, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Law, t.Lane
+    T, vec2, vec3, vec6, quat, Model, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Lane
     Link, Node, Adjoint, Base = t.Link, t.Node, t.Adjoint, t.Base
     Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.array
-    law_of, solve_with_factor = environment_law(spec), factor_solve(spec)
+    lane, solve = lane_of(spec), factor_solve(spec)
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint = muscle_law(spec), constraint_law(spec)
-    CONSTRAINED, SOLVES, DAMPED, NV = spec.constrained, spec.solves, spec.damped, spec.nv
+    CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
     CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT = (
         name in spec.features for name in ("contact", "motor", "clamp", "muscle", "limit")
     )
@@ -66,62 +66,62 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         return vec3(load(a, here.row, k, here.e), load(a, here.row, k + 1, here.e), load(a, here.row, k + 2, here.e))
 
     @wp.func
-    def next_rates(ck: Ck, here: Lane, k: int, h: T):
+    def next_rates(ck: Ck, here: Lane, k: int):
         """Three rates at the end of the substep."""
-        return rates(ck.v, here, k) + h * rates(ck.a, here, k)
+        return rates(ck.v, here, k) + here.h * rates(ck.a, here, k)
 
     @wp.func
-    def end_of(m: Model, here: Lane, ck: Ck, h: T, g_qpos: t.array2, g_qvel: t.array2, nodes: Nodes):
+    def end_of(m: Model, here: Lane, ck: Ck, g: t.Batch, nodes: Nodes):
         """Into nodes the gradient of the state after the substep here.row; returns the base's."""
         e = here.e
         for i in range(1, here.n):
-            nodes[i].gq = read(g_qpos, e, qpos_adr(m, here.at + i))
-            nodes[i].gqd = read(g_qvel, e, VADR + link_of(m, here.at + i))
+            nodes[i].gq = read(g.qpos_out, e, qpos_adr(m, here.at + i))
+            nodes[i].gqd = read(g.qvel_out, e, VADR + link_of(m, here.at + i))
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 i = m.ball_slot[here.lane * NBALL + b]
                 adr = qpos_adr(m, here.at + i)
-                wb = next_rates(ck, here, VADR + link_of(m, here.at + i), h)
-                rot_b = wp.normalize(kin.load_quat_row(ck.q, here.row, adr, e) * sp.exp_quat(h * wb))
-                gb = sp.to_tangent(rot_b, kin.load_quat(g_qpos, e, adr))
+                wb = next_rates(ck, here, VADR + link_of(m, here.at + i))
+                rot_b = wp.normalize(kin.load_quat_row(ck.q, here.row, adr, e) * sp.exp_quat(here.h * wb))
+                gb = sp.to_tangent(rot_b, kin.load_quat(g.qpos_out, e, adr))
                 for k in range(3):
                     nodes[i + k].gq = gb[k]
         base = Base()
         if wp.static(FLOATING):
-            w = next_rates(ck, here, 3, h)
-            rot = wp.normalize(kin.load_quat_row(ck.q, here.row, 3, e) * sp.exp_quat(h * w))
-            base.gp = vec3(read(g_qpos, e, 0), read(g_qpos, e, 1), read(g_qpos, e, 2))
-            base.gr = sp.to_tangent(rot, kin.load_quat(g_qpos, e, 3))
-            base.gv = vec3(read(g_qvel, e, 0), read(g_qvel, e, 1), read(g_qvel, e, 2))
-            base.gw = vec3(read(g_qvel, e, 3), read(g_qvel, e, 4), read(g_qvel, e, 5))
+            w = next_rates(ck, here, 3)
+            rot = wp.normalize(kin.load_quat_row(ck.q, here.row, 3, e) * sp.exp_quat(here.h * w))
+            base.gp = vec3(read(g.qpos_out, e, 0), read(g.qpos_out, e, 1), read(g.qpos_out, e, 2))
+            base.gr = sp.to_tangent(rot, kin.load_quat(g.qpos_out, e, 3))
+            base.gv = vec3(read(g.qvel_out, e, 0), read(g.qvel_out, e, 1), read(g.qvel_out, e, 2))
+            base.gw = vec3(read(g.qvel_out, e, 3), read(g.qvel_out, e, 4), read(g.qvel_out, e, 5))
         return base
 
     @wp.func
-    def balls_state(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes):
+    def balls_state(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes):
         """Into links the turns of the ball joints, into nodes the adjoint of their integrator."""
         turn = wp.zeros(shape=wp.static(max(NBALL, 1)), dtype=quat)
         for b in range(m.ball_count[here.lane]):
             i = m.ball_slot[here.lane * NBALL + b]
             turn[b] = kin.load_quat_row(ck.q, here.row, qpos_adr(m, here.at + i), here.e)
             gb = vec3(nodes[i].gq, nodes[i + 1].gq, nodes[i + 2].gq)
-            rate = next_rates(ck, here, VADR + link_of(m, here.at + i), law.h)
-            gb_turn, gb_start = sp.exp_adjoint(law.h * rate, gb)
+            rate = next_rates(ck, here, VADR + link_of(m, here.at + i))
+            gb_turn, gb_start = sp.exp_adjoint(here.h * rate, gb)
             for k in range(3):
-                nodes[i + k].gqd = nodes[i + k].gqd + law.h * (gb_turn[k] - gb[k])
+                nodes[i + k].gqd = nodes[i + k].gqd + here.h * (gb_turn[k] - gb[k])
                 nodes[i + k].gq = gb_start[k]
         kin.place_balls(m, here, turn, links)
 
     @wp.func
-    def base_state(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
+    def base_state(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
         """The floating base's motion into links[0] and nodes[0]; returns it with the adjoint of its integrator."""
         rot = kin.load_quat_row(ck.q, here.row, 3, here.e)
         v = rates(ck.v, here, 0)
         w = rates(ck.v, here, 3)
         vdot = rates(ck.a, here, 0) - vec3(m.gravity)
         wdot = rates(ck.a, here, 3)
-        g_turn, gr_start = sp.exp_adjoint(law.h * (w + law.h * wdot), base.gr)
-        base.gv = base.gv + law.h * base.gp
-        base.gw = base.gw + law.h * g_turn
+        g_turn, gr_start = sp.exp_adjoint(here.h * (w + here.h * wdot), base.gr)
+        base.gv = base.gv + here.h * base.gp
+        base.gw = base.gw + here.h * g_turn
         base.gr = gr_start
         R = wp.quat_to_matrix(rot)
         links[0].R = R
@@ -141,7 +141,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         return base
 
     @wp.func
-    def joints_state(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes):
+    def joints_state(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes):
         """How the links move, into nodes."""
         for i in range(1, here.n):
             k = here.at + i
@@ -161,84 +161,56 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(CLAMP):
                 ahead = own.q
                 if wp.static(IMPLICIT):
-                    ahead = ahead + law.theta * law.h * own.qd
+                    ahead = ahead + here.theta * here.h * own.qd
                 nodes[i].free = joint.actuation_free(m, k, nodes[i].driven, ahead, own.qd)
 
     @wp.func
-    def solve(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
-        """lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
-        first, and g + h b lambda1 reaches the acceleration before it."""
-        g_base = vec6()
-        if wp.static(FLOATING):
-            g_base = join(links[0].R * base.gw, base.gv)
-        for s in range(SOLVES):
-            if wp.static(DAMPED and BASE_DAMPED):
-                g_base = g_base + T(s) * T(m.base_damping) * nodes[0].W
-            for i in range(here.n):
-                nodes[i].g = nodes[i].gqd
-                if wp.static(DAMPED):
-                    nodes[i].W1 = nodes[i].W
-                    within = T(1.0)
-                    if wp.static(CLAMP):
-                        within = nodes[i].free
-                    nodes[i].g = nodes[i].gqd + T(s) * joint.damping(m, here.at + i, within) * nodes[i].lam
-            solve_with_factor(m, law, here, ck, SOLVES * here.row + s, links, nodes, g_base)
-
-    @wp.func
     def partials(
-        m: Model,
-        law: Law,
-        here: Lane,
-        links: Links,
-        nodes: Nodes,
-        place: t.Place,
-        ck: Ck,
-        adj: Adjoints,
-        adj_factors: Array,
+        m: Model, here: Lane, links: Links, nodes: Nodes, place: t.Place, ck: Ck, adj: Adjoints, adj_factors: Array
     ):
         """Into adj the partial derivatives of phi, link by link."""
         for i in range(1, INERT + 1):
             adj[i] = Adjoint()
         for i in range(FIRST, here.n):
             k = here.at + i
-            own = link.link_adjoint(m, law, k, links[i], nodes[i], place, adj_factors)
+            own = link.link_adjoint(m, here, k, links[i], nodes[i], place, adj_factors)
             if wp.static(CONSTRAINED and CONTACT):
-                own = constraint.add_contacts_adjoint(m, law, here, k, links[i], nodes[i], place, ck, own, adj_factors)
+                own = constraint.add_contacts_adjoint(m, here, k, links[i], nodes[i], place, ck, own, adj_factors)
             if wp.static(DAMPED):
-                own = link.add_damping_adjoint(m, law, k, links[i], nodes[i], own, adj_factors)
+                own = link.add_damping_adjoint(m, here, k, links[i], nodes[i], own, adj_factors)
             adj[i] = own
 
     @wp.func
-    def joint_gain(m: Model, law: Law, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
+    def joint_gain(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
         """Derivatives of the joint's force with respect to q and qd."""
         k = here.at + i
         qi = link.q
         end_rate = link.qd
         if wp.static(IMPLICIT):
-            qi = qi + law.theta * law.h * link.qd
+            qi = qi + here.theta * here.h * link.qd
             if wp.static(LIMIT):
-                end_rate = end_rate + law.h * load(ck.a, here.row, VADR + link_of(m, k), here.e)
+                end_rate = end_rate + here.h * load(ck.a, here.row, VADR + link_of(m, k), here.e)
         within = T(1.0)
         if wp.static(CLAMP):
             within = own.free
-        gain = joint.gain(m, law, k, qi, link.qd, end_rate, within)
+        gain = joint.gain(m, here, k, qi, link.qd, end_rate, within)
         if wp.static(VARIED and LIMIT):
             if m.carried[k] == 1:  # of the lanes that have the joint
-                by = joint.limit_constants_gain(m, law, k, qi, link.qd, end_rate, law.theta * law.h)
+                by = joint.limit_constants_gain(m, here, k, qi, link.qd, end_rate, here.theta * here.h)
                 adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * by[0]
                 adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - own.lam * by[1]
         if wp.static(CONSTRAINED):
-            of_held = constraint.joint_gain(m, law, k, link.q, link.qd, own.rate)
+            of_held = constraint.joint_gain(m, here, k, link.q, link.qd, own.rate)
             gain = gain + vec2(of_held[0], of_held[1])
             if wp.static(VARIED):
                 if m.carried[k] == 1:
                     adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * of_held[2]
         if wp.static(IMPLICIT):
-            gain[1] = gain[1] + law.theta * law.h * gain[0]
+            gain[1] = gain[1] + here.theta * here.h * gain[0]
         return gain
 
     @wp.func
-    def inward(m: Model, law: Law, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints, adj_factors: Array):
+    def inward(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, adj: Adjoints, adj_factors: Array):
         """Sums adj over subtrees and projects it on the joints."""
         slots = int(SLOTS)
         if wp.static(SHARERS > 1):
@@ -256,7 +228,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     p = m.inboard[k]
                     turned = m.outboard[k]
                 own = nodes[i]
-                gain = joint_gain(m, law, here, i, ck, links[i], own, adj_factors)
+                gain = joint_gain(m, here, i, ck, links[i], own, adj_factors)
                 S = links[i].S
                 by = adj[i]
                 xv = by.v - wp.spatial_cross_dual(links[p].V, by.a)
@@ -352,15 +324,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
 
     @wp.func
     def write_controls(
-        m: Model,
-        law: Law,
-        here: Lane,
-        drop: T,
-        ctrl: t.array2,
-        nodes: Nodes,
-        adj_pull: Array,
-        adj_factors: Array,
-        g: t.Start,
+        m: Model, here: Lane, drop: T, ctrl: t.array2, nodes: Nodes, adj_pull: Array, adj_factors: Array, g: t.Batch
     ):
         """Writes the gradients of actions and factors."""
         for k in range(NU):
@@ -373,7 +337,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 if wp.static(VARIED):
                     motor = T(m.gear[k]) * read(ctrl, here.e, k) + T(m.motor_bias[k])
                     adj_factors[MOTOR] = adj_factors[MOTOR] + by * motor
-                    by = law.motor * by
+                    by = here.motor * by
                 hand_out(g.ctrl, here.e, k, drop, by * T(m.gear[k]))
         if wp.static(VARIED):
             for k in range(NFACTORS):
@@ -384,7 +348,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                     hand_out(g.factors, here.e, k, drop, total)
 
     @wp.func
-    def write_state(m: Model, here: Lane, drop: T, qpos: t.array2, base: Base, nodes: Nodes, g: t.Start):
+    def write_state(m: Model, here: Lane, drop: T, qpos: t.array2, base: Base, nodes: Nodes, g: t.Batch):
         """Writes the gradients of qpos and qvel."""
         e = here.e
         for i in range(1, here.n):
@@ -421,18 +385,14 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         row0: int,
         ck: t.Checkpoint,
         # what came in (its quaternions may not be of unit length), and whether the step was contained
-        start: t.Start,
+        batch: t.Batch,
         nonfinite: wp.array(dtype=wp.bool),
-        # gradient in
-        g_qpos_out: t.array2,
-        g_qvel_out: t.array2,
-        # gradient out
-        g: t.Start,
+        # gradient, of what came out in, of what came in out
+        g: t.Batch,
         nonfinite_gradients: wp.array(dtype=int),
     ):
-        here = kin.lane_of(m, first, wp.tid())
-        law = law_of(m, T(seconds), T(implicitness), start.factors, here.e)
-        law.touchdown = touchdown
+        here = lane(m, first, wp.tid(), T(seconds), T(implicitness), batch.factors)
+        here.touchdown = touchdown
         links = wp.zeros(shape=SLOTS, dtype=Link)
         nodes = wp.zeros(shape=SLOTS, dtype=Node)
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)
@@ -442,14 +402,14 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         adj_pull = wp.zeros(shape=PULLS, dtype=T)
         if wp.static(CLAMP):
             driven = wp.zeros(shape=SLOTS, dtype=T)
-            joint.drive(m, law, here, start.ctrl, driven)
+            joint.drive(m, here, batch.ctrl, driven)
             for i in range(1, here.n):
                 nodes[i].driven = driven[i]
         if wp.static(MUSCLE):
-            muscle.activate(m, law, here, start.ctrl, pull)
+            muscle.activate(m, here, batch.ctrl, pull)
         links[0].R = wp.identity(3, dtype=T)
         here.row = row0 + substeps - 1
-        base = end_of(m, here, ck, law.h, g_qpos_out, g_qvel_out, nodes)
+        base = end_of(m, here, ck, g, nodes)
         for sub in range(substeps):
             here.row = row0 + substeps - 1 - sub
             # 1. the state of this substep, and the adjoint of the integrator
@@ -458,22 +418,22 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             for i in range(1, here.n):
                 links[i].q = load(ck.q, here.row, qpos_adr(m, here.at + i), here.e)
                 links[i].qd = load(ck.v, here.row, VADR + link_of(m, here.at + i), here.e)
-                nodes[i].gqd = nodes[i].gqd + law.h * nodes[i].gq
+                nodes[i].gqd = nodes[i].gqd + here.h * nodes[i].gq
             if wp.static(NBALL > 0):
-                balls_state(m, law, here, ck, links, nodes)
+                balls_state(m, here, ck, links, nodes)
             if wp.static(FLOATING):
-                base = base_state(m, law, here, ck, links, nodes, base)
+                base = base_state(m, here, ck, links, nodes, base)
                 place = kin.carrier_place(m, load(ck.q, here.row, 0, here.e), load(ck.q, here.row, 2, here.e))
             place = kin.place_links(m, here, links, place)
-            joints_state(m, law, here, ck, links, nodes)
+            joints_state(m, here, ck, links, nodes)
             # 2. to 4.
-            solve(m, law, here, ck, links, nodes, base)
-            partials(m, law, here, links, nodes, place, ck, adj, adj_factors)
+            solve(m, here, ck, links, nodes, base)
+            partials(m, here, links, nodes, place, ck, adj, adj_factors)
             if wp.static(FORCED):
-                force.add_forces_adjoint(m, here, start.forces, links, nodes, adj, adj_forces)
+                force.add_forces_adjoint(m, here, batch.forces, links, nodes, adj, adj_forces)
             if wp.static(MUSCLE):
                 muscle.add_muscles_adjoint(m, here, pull, links, nodes, adj, adj_pull)
-            inward(m, law, here, ck, links, nodes, adj, adj_factors)
+            inward(m, here, ck, links, nodes, adj, adj_factors)
             if wp.static(BALL_SPRING):
                 ball_springs(m, here, links, nodes)
             if wp.static(FLOATING):
@@ -485,9 +445,9 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         if here.lane == 0:
             block.count(nonfinite_gradients, here.e, pick(T(0.0), contained, T(0.0), broken))
         drop = broken + contained
-        write_controls(m, law, here, drop, start.ctrl, nodes, adj_pull, adj_factors, g)
+        write_controls(m, here, drop, batch.ctrl, nodes, adj_pull, adj_factors, g)
         if wp.static(FORCED):
             force.write_forces_adjoint(m, here, drop, adj_forces, g.forces)
-        write_state(m, here, drop, start.qpos, base, nodes, g)
+        write_state(m, here, drop, batch.qpos, base, nodes, g)
 
     return backward

@@ -42,7 +42,7 @@ LEAST_SINKING = 1e-3  # m in a substep: a sphere that grazes the ground has a ju
 @cache
 def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
-    T, U, vec2, vec3, vec4, vec6, mat3, Model, Law, Link = (
+    T, U, vec2, vec3, vec4, vec6, mat3, Model, Link = (
         t.T,
         t.U,
         t.vec2,
@@ -51,7 +51,6 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         t.vec6,
         t.mat3,
         t.Model,
-        t.Law,
         t.Link,
     )
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
@@ -128,35 +127,35 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return centre, distance, pick(distance, T(m.contact_numbers[c][10]), T(1.0), T(0.0))
 
     @wp.func
-    def constants(m: Model, law: Law, c: int):
+    def constants(m: Model, here: Lane, c: int):
         """(stiffness, damping, friction) of contact sphere c."""
         numbers = m.contact_numbers[c]
         if wp.static(VARIED):
-            return vec3(law.k_n, wp.sqrt(law.k_n) * T(numbers[1]), law.mu * T(numbers[2]))
+            return vec3(here.k_n, wp.sqrt(here.k_n) * T(numbers[1]), here.mu * T(numbers[2]))
         return vec3(T(1.0), T(numbers[1]), T(numbers[2]))
 
     @wp.func
-    def contact_state(m: Model, law: Law, c: int, centre: vec3, distance: T, on: T, V: vec6, B: vec6):
+    def contact_state(m: Model, here: Lane, c: int, centre: vec3, distance: T, on: T, V: vec6, B: vec6):
         """MuJoCo's contact point, jar, what row and what constants return; D is 0 where the sphere does not touch."""
         numbers = m.contact_numbers[c]
         # The point lies in the middle between the two surfaces.
         p = centre - vec3(T(0.0), T(0.0), T(m.contact_radius[c]) + T(0.5) * distance)
-        of = constants(m, law, c)
+        of = constants(m, here, c)
         state = row(numbers, of[0], wp.min(distance - T(numbers[10]), T(0.0)))
         jar = point_velocity(B, p) + of[1] * point_velocity(V, p) + vec3(T(0.0), T(0.0), state[2])
         D = on * state[0]
         if wp.static(VARIED):
-            D = law.k_d * D
+            D = here.k_d * D
         return p, jar, vec4(D, state[1], state[2], state[3]), of
 
     @wp.func
-    def friction(m: Model, law: Law, c: int):
+    def friction(m: Model, here: Lane, c: int):
         if wp.static(VARIED):
-            return law.mu * T(m.contact_numbers[c][2])
+            return here.mu * T(m.contact_numbers[c][2])
         return T(m.contact_numbers[c][2])
 
     @wp.func
-    def touch(m: Model, law: Law, here: Lane, links: t.Links, height: T, touches: t.Touches):
+    def touch(m: Model, here: Lane, links: t.Links, height: T, touches: t.Touches):
         """The contacts of a lane at the start of a substep, without acceleration.
 
         They are linear about where they were in the last substep, and stick if they did not touch there.
@@ -169,7 +168,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 stuck = T(1.0) - on * touches[s].on
                 touches[s].on = on
                 if block.any_of(on):
-                    p, jar, state, of = contact_state(m, law, c, centre, distance, on, links[i].V, vec6())
+                    p, jar, state, of = contact_state(m, here, c, centre, distance, on, links[i].V, vec6())
                     was = vec3()
                     for r in range(3):
                         was[r] = pick(T(0.0), stuck, jar[r], touches[s].jar[r])
@@ -214,7 +213,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return x
 
     @wp.func
-    def try_contacts(m: Model, law: Law, here: Lane, k: int, step: vec6, part: T, tries: int, touches: t.Touches):
+    def try_contacts(m: Model, here: Lane, k: int, step: vec6, part: T, tries: int, touches: t.Touches):
         """Forces and slopes after a part of a step of link k's twist; their part of what newton.measure returns."""
         found = vec6()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
@@ -224,7 +223,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 if tries == 0:
                     touches[s].Hs = touches[s].H * by
                 jar = touches[s].jar + part * by
-                f, H = cone(touches[s].D, friction(m, law, c), T(m.contact_numbers[c][3]), jar, T(0.0))
+                f, H = cone(touches[s].D, friction(m, here, c), T(m.contact_numbers[c][3]), jar, T(0.0))
                 less = touches[s].f - part * touches[s].Hs - f
                 w = T(m.contact_numbers[c][4])
                 away = makes_good(less, w, H)
@@ -265,7 +264,6 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def add_contacts_adjoint(
         m: Model,
-        law: Law,
         here: Lane,
         k: int,
         link: Link,
@@ -279,7 +277,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             centre, distance, on = place(m, c, link, height)
             if block.any_of(on):
-                p, _, state, of = contact_state(m, law, c, centre, distance, on, link.V, node.B)
+                p, _, state, of = contact_state(m, here, c, centre, distance, on, link.V, node.B)
                 jar = vec3()
                 for r in range(3):
                     jar[r] = kin.load(ck.a, here.row, 2 * NV + 3 * c + r, here.e)
@@ -287,16 +285,16 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 w = point_velocity(node.W, p)
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
-                if law.touchdown == 1:
+                if here.touchdown == 1:
                     numbers = m.contact_numbers[c]
-                    sinks = wp.max(-law.h * point_velocity(link.V, p)[2], T(LEAST_SINKING))
+                    sinks = wp.max(-here.h * point_velocity(link.V, p)[2], T(LEAST_SINKING))
                     jump = wp.dot(f, w + T(numbers[4]) * g_jar) / sinks
                     g_r = g_r + pick(T(numbers[10]) - distance, sinks, jump, T(0.0))
                 if wp.static(VARIED):
                     by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(link.V, p)) + g_jar[2] * state[2]
                     by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)
                     adj_factors[K_N] = adj_factors[K_N] + by_k / of[0]
-                    adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / law.k_d
+                    adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
                     adj_factors[MU] = adj_factors[MU] - T(m.contact_numbers[c][2]) * by_mu
                 G = force_at(p, g_jar)
                 wrench = force_at(p, f)
@@ -314,7 +312,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return adj
 
     @wp.func
-    def limit_row(m: Model, law: Law, i: int, q: T):
+    def limit_row(m: Model, here: Lane, i: int, q: T):
         """(D or 0 within the range, D' / D, k d r, (k d r)'), and the direction in which the joint returns."""
         numbers = m.limit_numbers[i]
         low = q - T(m.lower[i])
@@ -322,23 +320,23 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         r = wp.min(low, high) - T(numbers[10])
         stiffness = T(1.0)
         if wp.static(VARIED):
-            stiffness = law.k_limit
+            stiffness = here.k_limit
         state = row(numbers, stiffness, wp.min(r, T(0.0)))
         on = pick(r, T(0.0), T(1.0), T(0.0))
         return vec4(on * state[0], state[1], state[2], state[3]), pick(low, high, T(1.0), T(-1.0))
 
     @wp.func
-    def limit_damping(m: Model, law: Law, i: int):
+    def limit_damping(m: Model, here: Lane, i: int):
         b = T(m.limit_numbers[i][1])
         if wp.static(VARIED):
-            b = wp.sqrt(law.k_limit) * b
+            b = wp.sqrt(here.k_limit) * b
         return b
 
     @wp.func
-    def stop(m: Model, law: Law, i: int, q: T, qd: T):
+    def stop(m: Model, here: Lane, i: int, q: T, qd: T):
         """Of a joint's limit (D or 0, jar without acceleration, the direction in which the joint returns)."""
-        state, way = limit_row(m, law, i, q)
-        return vec3(state[0], way * limit_damping(m, law, i) * qd + state[2], way)
+        state, way = limit_row(m, here, i, q)
+        return vec3(state[0], way * limit_damping(m, here, i) * qd + state[2], way)
 
     @wp.func
     def joint_constraint(m: Model, i: int, stop: vec3, qd: T, qdd: T, stuck: T):
@@ -358,17 +356,17 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec2(force, slope)
 
     @wp.func
-    def joint_gain(m: Model, law: Law, i: int, q: T, qd: T, qdd: T):
+    def joint_gain(m: Model, here: Lane, i: int, q: T, qd: T, qdd: T):
         """Derivatives of that force with respect to q, qd and the factor of k_limit."""
         gain = vec3()
         if wp.static(LIMIT):
-            state, way = limit_row(m, law, i, q)
-            b = limit_damping(m, law, i)
+            state, way = limit_row(m, here, i, q)
+            b = limit_damping(m, here, i)
             jar = way * (qdd + b * qd) + state[2]
             D = pick(jar, T(0.0), state[0], T(0.0))
             gain = -D * vec3(state[3] + jar * state[1], b, T(0.0))
             if wp.static(VARIED):
-                gain[2] = -D * (T(0.5) * b * qd + way * state[2]) / law.k_limit
+                gain[2] = -D * (T(0.5) * b * qd + way * state[2]) / here.k_limit
         if wp.static(LOSS):
             loss = m.joint_loss[i]
             f = T(loss[1]) * (qdd + T(loss[2]) * qd)

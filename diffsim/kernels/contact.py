@@ -29,96 +29,96 @@ from diffsim.kernels.wide import blocks
 @cache
 def contact_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
-    T, vec3, vec4, Model, Law, Link = t.T, t.vec3, t.vec4, t.Model, t.Law, t.Link
+    T, vec3, vec4, Model, Lane, Link = t.T, t.vec3, t.vec4, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.array
     Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
     sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
     IMPLICIT, VARIED = spec.implicit, spec.varied
 
     @wp.func
-    def sphere_state(m: Model, law: Law, k: int, link: Link, height: T):
+    def sphere_state(m: Model, here: Lane, k: int, link: Link, height: T):
         """Lowest point p, its velocity, and the depth (predicted theta h ahead if implicit) of contact sphere k."""
         p = sp.on_link(link.R, link.x, m.contact_position[k])
         depth = height + p[2] - T(m.contact_radius[k])
         p = p - vec3(T(0.0), T(0.0), T(m.contact_radius[k]))
         v = point_velocity(link.V, p)
         if wp.static(IMPLICIT):
-            depth = depth + law.theta * law.h * v[2]
+            depth = depth + here.theta * here.h * v[2]
         return p, v, depth
 
     @wp.func
-    def touches(law: Law, d: T, v: vec3):
+    def touches(here: Lane, d: T, v: vec3):
         """1 where the ground pushes, else 0."""
-        return pick(d, T(0.0), pick(law.k_d * v[2], law.k_n, T(1.0), T(0.0)), T(0.0))
+        return pick(d, T(0.0), pick(here.k_d * v[2], here.k_n, T(1.0), T(0.0)), T(0.0))
 
     @wp.func
-    def friction_viscosity(law: Law, f_n: T, v: vec3):
+    def friction_viscosity(here: Lane, f_n: T, v: vec3):
         """(c, 1 if sliding else 0)."""
         speed = wp.sqrt(v[0] * v[0] + v[1] * v[1])
-        most = law.mu * f_n
-        viscous = law.k_t * speed
-        return pick(most, viscous, most / speed, law.k_t), pick(most, viscous, T(1.0), T(0.0))
+        most = here.mu * f_n
+        viscous = here.k_t * speed
+        return pick(most, viscous, most / speed, here.k_t), pick(most, viscous, T(1.0), T(0.0))
 
     @wp.func
-    def contact_force(law: Law, d: T, v: vec3):
+    def contact_force(here: Lane, d: T, v: vec3):
         """Force on the sphere, and the effective viscosity c of friction, as (f, c)."""
-        f_n = (law.k_d * v[2] - law.k_n) * d
-        c, sliding = friction_viscosity(law, f_n, v)
+        f_n = (here.k_d * v[2] - here.k_n) * d
+        c, sliding = friction_viscosity(here, f_n, v)
         return vec4(-c * v[0], -c * v[1], f_n, c)
 
     @wp.func
-    def contact_resistance(law: Law, d: T, c: T):
+    def contact_resistance(here: Lane, d: T, c: T):
         """The diagonal of B."""
-        return vec3(law.h * c, law.h * c, law.theta * law.h * law.h * law.k_n - law.h * law.k_d * d)
+        return vec3(here.h * c, here.h * c, here.theta * here.h * here.h * here.k_n - here.h * here.k_d * d)
 
     @wp.func
-    def contact_adjoint(law: Law, d: T, v: vec3, a: vec3, g: vec3, h: T):
+    def contact_adjoint(here: Lane, d: T, v: vec3, a: vec3, g: vec3, h: T):
         """(adjoint of v, adjoint of d at the start of the step) of g . f(d + theta h v_z, v, a); h = 0 if explicit."""
-        s = law.k_d * v[2] - law.k_n
+        s = here.k_d * v[2] - here.k_n
         f_n = s * d
-        c, sliding = friction_viscosity(law, f_n, v)
+        c, sliding = friction_viscosity(here, f_n, v)
         g_n = g[2]
         gx = -c * g[0]
         gy = -c * g[1]
         # Where the sphere slides, f_t - h c a_t = -c (v_t + h a_t) with c = mu f_n / |v_t|.
         speed2 = pick(T(0.0), sliding, v[0] * v[0] + v[1] * v[1], T(1.0))
         g_c = -sliding * (g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
-        g_n = g_n + g_c * law.mu / wp.sqrt(speed2)
+        g_n = g_n + g_c * here.mu / wp.sqrt(speed2)
         gx = gx - g_c * c * v[0] / speed2
         gy = gy - g_c * c * v[1] / speed2
-        g_d = g_n * s + g[2] * h * law.k_d * a[2]
-        return vec4(gx, gy, g_n * law.k_d * d + law.theta * h * g_d, g_d)
+        g_d = g_n * s + g[2] * h * here.k_d * a[2]
+        return vec4(gx, gy, g_n * here.k_d * d + here.theta * h * g_d, g_d)
 
     @wp.func
-    def contact_constants_adjoint(law: Law, d: T, v: vec3, a: vec3, g: vec3, h: T):
+    def contact_constants_adjoint(here: Lane, d: T, v: vec3, a: vec3, g: vec3, h: T):
         """The adjoints of (k_n, k_d, k_t, mu); arguments as of contact_adjoint."""
-        f_n = (law.k_d * v[2] - law.k_n) * d
-        c, sliding = friction_viscosity(law, f_n, v)
+        f_n = (here.k_d * v[2] - here.k_n) * d
+        c, sliding = friction_viscosity(here, f_n, v)
         g_c = -(g[0] * (v[0] + h * a[0]) + g[1] * (v[1] + h * a[1]))
         speed = pick(T(0.0), sliding, wp.sqrt(v[0] * v[0] + v[1] * v[1]), T(1.0))
-        g_n = g[2] + sliding * g_c * law.mu / speed
+        g_n = g[2] + sliding * g_c * here.mu / speed
         g_mu = sliding * g_c * f_n / speed
         g_c = (T(1.0) - sliding) * g_c
-        g_kn = -g_n * d - g[2] * law.theta * h * h * a[2]
+        g_kn = -g_n * d - g[2] * here.theta * h * h * a[2]
         return vec4(g_kn, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
     @wp.func
-    def add_contacts(m: Model, law: Law, k: int, link: Link, place: Place, load: t.Load):
+    def add_contacts(m: Model, here: Lane, k: int, link: Link, place: Place, load: t.Load):
         """The load of link k with its contacts."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, _ = sphere_on_terrain(m, law, c, link, place)
+                p, v, depth, E, _ = sphere_on_terrain(m, here, c, link, place)
             else:
-                p, v, depth = sphere_state(m, law, c, link, place)
-            on = touches(law, depth, v)
+                p, v, depth = sphere_state(m, here, c, link, place)
+            on = touches(here, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
-                fc = contact_force(law, depth, v)
+                fc = contact_force(here, depth, v)
                 f = vec3(fc[0], fc[1], fc[2])
                 if wp.static(TERRAIN):
                     f = E * f
                 if wp.static(IMPLICIT):
-                    B = on * contact_resistance(law, depth, fc[3])
+                    B = on * contact_resistance(here, depth, fc[3])
                     if wp.static(TERRAIN):
                         D = E * wp.diag(B) * wp.transpose(E)
                         f = f - D * vec3(m.gravity)
@@ -134,18 +134,18 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_contacts_adjoint(
-        m: Model, law: Law, k: int, link: Link, node: Node, place: Place, adj: Adjoint, adj_factors: Array
+        m: Model, here: Lane, k: int, link: Link, node: Node, place: Place, adj: Adjoint, adj_factors: Array
     ):
         """The adjoints of link k with its contacts' part of phi added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             if wp.static(TERRAIN):
-                p, v, depth, E, curvature = sphere_on_terrain(m, law, c, link, place)
+                p, v, depth, E, curvature = sphere_on_terrain(m, here, c, link, place)
             else:
-                p, v, depth = sphere_state(m, law, c, link, place)
-            on = touches(law, depth, v)
+                p, v, depth = sphere_state(m, here, c, link, place)
+            on = touches(here, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
-                fc = contact_force(law, depth, v)
+                fc = contact_force(here, depth, v)
                 f = vec3(fc[0], fc[1], fc[2])
                 g_f = -on * point_velocity(node.W, p)
                 if wp.static(TERRAIN):
@@ -153,15 +153,15 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 a = vec3()
                 hi = T(0.0)
                 if wp.static(IMPLICIT):
-                    hi = law.h
+                    hi = here.h
                     a = point_velocity(node.A, p) + vec3(m.gravity)
                     if wp.static(TERRAIN):
                         a = wp.transpose(E) * a
-                    B = on * contact_resistance(law, depth, fc[3])
+                    B = on * contact_resistance(here, depth, fc[3])
                     f = f - wp.cw_mul(B, a)
-                g = contact_adjoint(law, depth, v, a, g_f, hi)
+                g = contact_adjoint(here, depth, v, a, g_f, hi)
                 if wp.static(VARIED):
-                    gk = contact_constants_adjoint(law, depth, v, a, g_f, hi)
+                    gk = contact_constants_adjoint(here, depth, v, a, g_f, hi)
                     adj_factors[K_N] = adj_factors[K_N] + T(m.k_n) * gk[0]
                     adj_factors[K_D] = adj_factors[K_D] + T(m.k_d) * gk[1]
                     adj_factors[K_T] = adj_factors[K_T] + T(m.k_t) * gk[2]

@@ -16,38 +16,44 @@ K_N, K_D, K_T, MU, K_LIMIT, D_LIMIT, MASS, MOTOR = range(len(FACTORS))
 
 
 @cache
-def environment_law(spec: KernelSpec) -> wp.Function:
+def lane_of(spec: KernelSpec) -> wp.Function:
     t = types(spec)
-    T, Model, Law, read = t.T, t.Model, t.Law, blocks(spec).read
-    CONTACT, VARIED, TERRAIN = "contact" in spec.features, spec.varied, "terrain" in spec.features
-    CONSTRAINED = spec.constrained
+    T, Model, Lane, read = t.T, t.Model, t.Lane, blocks(spec).read
+    CONTACT, VARIED, CONSTRAINED = "contact" in spec.features, spec.varied, spec.constrained
+    THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.slots
 
     @wp.func
-    def law_of(m: Model, h: T, theta: T, factors: t.array2, e: int):
-        law = Law()
-        law.h = h
-        law.theta = theta
+    def lane_of(m: Model, first: int, thread: int, h: T, theta: T, factors: t.array2):
+        """What a thread computes in a launch from environment, or block, `first` on, and by which constants."""
+        here = Lane()
+        here.e = first + thread / THREADS_PER_ENV
+        here.lane = thread % THREADS_PER_ENV
+        here.at = here.lane * SLOTS
+        here.n = int(SLOTS)  # a variable, not a constant: Warp would unroll loops, and they outgrow a GPU's cache
+        if wp.static(THREADS_PER_ENV > 1):
+            here.n = m.count[here.lane]
+        e = here.e
+        here.h = h
+        here.theta = theta
         if wp.static(CONTACT and CONSTRAINED and VARIED):
-            law.k_n = read(factors, e, K_N)  # of the time constant's inverse square
-            law.k_d = read(factors, e, K_D)  # of D, and so of all of a contact's force for one motion
-            law.mu = read(factors, e, MU)
+            here.k_n = read(factors, e, K_N)  # of the time constant's inverse square
+            here.k_d = read(factors, e, K_D)  # of D, and so of all of a contact's force for one motion
+            here.mu = read(factors, e, MU)
         if wp.static(CONTACT and not CONSTRAINED):
-            law.k_n = T(m.k_n)
-            law.k_d = T(m.k_d)
-            law.k_t = T(m.k_t)
-            law.mu = T(m.mu)
+            here.k_n = T(m.k_n)
+            here.k_d = T(m.k_d)
+            here.k_t = T(m.k_t)
+            here.mu = T(m.mu)
             if wp.static(VARIED):
-                law.k_n = law.k_n * read(factors, e, K_N)
-                law.k_d = law.k_d * read(factors, e, K_D)
-                law.k_t = law.k_t * read(factors, e, K_T)
-                law.mu = law.mu * read(factors, e, MU)
+                here.k_n = here.k_n * read(factors, e, K_N)
+                here.k_d = here.k_d * read(factors, e, K_D)
+                here.k_t = here.k_t * read(factors, e, K_T)
+                here.mu = here.mu * read(factors, e, MU)
         if wp.static(VARIED):
-            law.k_limit = read(factors, e, K_LIMIT)
-            law.d_limit = read(factors, e, D_LIMIT)
-            law.mass = read(factors, e, MASS)
-            law.motor = read(factors, e, MOTOR)
-        if wp.static(TERRAIN):
-            law.block = e
-        return law
+            here.k_limit = read(factors, e, K_LIMIT)
+            here.d_limit = read(factors, e, D_LIMIT)
+            here.mass = read(factors, e, MASS)
+            here.motor = read(factors, e, MOTOR)
+        return here
 
-    return law_of
+    return lane_of

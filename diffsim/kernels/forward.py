@@ -13,7 +13,7 @@ import warp as wp
 
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
-from diffsim.kernels.factors import environment_law
+from diffsim.kernels.factors import lane_of
 from diffsim.kernels.force import external_force
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
@@ -21,53 +21,51 @@ from diffsim.kernels.link import link_law
 from diffsim.kernels.model import types
 from diffsim.kernels.muscle import muscle_law
 from diffsim.kernels.newton import newton_method
-from diffsim.kernels.solve import base_inertia
+from diffsim.kernels.solve import DONE, FACTOR, NEWTON, SOLVE, articulated
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import FAR, MAX_PLACE, MAX_SPEED, KernelSpec
 from diffsim.kernels.wide import blocks, module_options
-
-NEWTON, FACTOR, SOLVE, DONE = range(4)  # a substep's solves: Newton's passes, the factor at their end, and one more
 
 
 @cache
 def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
-    T, vec3, vec6, quat, law_of = t.T, t.vec3, t.vec6, t.quat, environment_law(spec)
-    Model, Law, Lane, Ck, Load, Link, Motion = t.Model, t.Law, t.Lane, t.Checkpoint, t.Load, t.Link, t.Motion
+    T, vec3, vec6, quat, lane = t.T, t.vec3, t.vec6, t.quat, lane_of(spec)
+    Model, Lane, Ck, Load, Link, Motion = t.Model, t.Lane, t.Checkpoint, t.Load, t.Link, t.Motion
     Links, Motions, Loads, Quats, Root, Touch, Newton = (
         getattr(t, name) for name in "Links Motions Loads quats Root Touch Newton".split()
     )
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
-    muscle, base, constraint, newton = muscle_law(spec), base_inertia(spec), constraint_law(spec), newton_method(spec)
+    muscle, sweep, constraint, newton = muscle_law(spec), articulated(spec), constraint_law(spec), newton_method(spec)
     CONTACT, MOTOR, CLAMP, MUSCLE = (name in spec.features for name in ("contact", "motor", "clamp", "muscle"))
-    NU, FLOATING, IMPLICIT, FORCED = spec.nu, spec.floating, spec.implicit, spec.forced > 0
+    NU, FLOATING, FORCED = spec.nu, spec.floating, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
-    BASE_DAMPED, NBALL, LIMIT = "base_damping" in spec.features, spec.nball, MAX_SPEED
+    NBALL, LIMIT = spec.nball, MAX_SPEED
     NV, VADR = spec.nv, spec.dof0 - 1  # link i's joint in qvel is VADR + i
-    THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
+    THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.slots
     SPHERES, BALLS, PULLS = max(spec.spheres, 1), max(NBALL, 1), NU if MUSCLE else 1  # no array has none
 
     @wp.func
-    def state_of(m: Model, here: Lane, start: t.Start, links: Links, turn: Quats):
+    def state_of(m: Model, here: Lane, batch: t.Batch, links: Links, turn: Quats):
         """Into links and turn the joints' state; returns the floating base's."""
         e = here.e
         for i in range(1, here.n):
-            links[i].q = read(start.qpos, e, qpos_adr(m, here.at + i))
-            links[i].qd = read(start.qvel, e, VADR + link_of(m, here.at + i))
+            links[i].q = read(batch.qpos, e, qpos_adr(m, here.at + i))
+            links[i].qd = read(batch.qvel, e, VADR + link_of(m, here.at + i))
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 adr = qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b])
-                turn[b] = wp.normalize(kin.load_quat(start.qpos, e, adr))
+                turn[b] = wp.normalize(kin.load_quat(batch.qpos, e, adr))
         links[0].R = wp.identity(3, dtype=T)
         root = Root()
         if wp.static(FLOATING):
-            root.pos = vec3(read(start.qpos, e, 0), read(start.qpos, e, 1), read(start.qpos, e, 2))
-            root.rot = wp.normalize(kin.load_quat(start.qpos, e, 3))
-            root.v = vec3(read(start.qvel, e, 0), read(start.qvel, e, 1), read(start.qvel, e, 2))
-            root.w = vec3(read(start.qvel, e, 3), read(start.qvel, e, 4), read(start.qvel, e, 5))
+            root.pos = vec3(read(batch.qpos, e, 0), read(batch.qpos, e, 1), read(batch.qpos, e, 2))
+            root.rot = wp.normalize(kin.load_quat(batch.qpos, e, 3))
+            root.v = vec3(read(batch.qvel, e, 0), read(batch.qvel, e, 1), read(batch.qvel, e, 2))
+            root.w = vec3(read(batch.qvel, e, 3), read(batch.qvel, e, 4), read(batch.qvel, e, 5))
         return root
 
     @wp.func
@@ -102,7 +100,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             store(ck.a, here.row, column + VADR + link_of(m, here.at + i), here.e, motions[i].u)
 
     @wp.func
-    def outward(m: Model, law: Law, here: Lane, place: t.Place, links: Links, motions: Motions, loads: Loads):
+    def outward(m: Model, here: Lane, place: t.Place, links: Links, motions: Motions, loads: Loads):
         """Velocity products, inertias and bias forces of links that are placed."""
         for i in range(1, here.n):
             turning = i
@@ -112,121 +110,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         for i in range(1, INERT + 1):
             loads[i] = Load()
         for i in range(FIRST, here.n):
-            loads[i] = link.link_inertia(m, law, here.at + i, links[i], place)
-
-    @wp.func
-    def joint_force(m: Model, law: Law, k: int, phase: int, link: Link, motion: Motion, d: T):
-        """(force of a joint, d with what its laws resist acceleration by)."""
-        q = link.q
-        if wp.static(IMPLICIT):
-            q = q + law.theta * law.h * link.qd
-        free = T(1.0)
-        if wp.static(CLAMP):
-            free = joint.actuation_free(m, k, motion.motor, q, link.qd)
-        if wp.static(IMPLICIT):
-            resistance = joint.resistance(m, law, k, q, link.qd, free)
-            d = d + law.theta * law.h * law.h * resistance[0] + law.h * resistance[1]
-        if wp.static(CONSTRAINED):
-            if phase == SOLVE:
-                damper = law.h * joint.damping(m, k, free)
-                d = d + damper
-                f = -damper * motion.rate
-            else:
-                d = d + motion.firm
-                f = motion.force + motion.held - T(m.armature[k]) * motion.rate
-        else:
-            f = joint.actuation(m, k, motion.motor, q, link.qd)
-            f = f + joint.passive_force(m, law, k, q, link.qd)
-        return f, d
-
-    @wp.func
-    def inward(
-        m: Model,
-        law: Law,
-        here: Lane,
-        phase: int,
-        factor_row: int,
-        record: int,
-        ck: Ck,
-        links: Links,
-        motions: Motions,
-        loads: Loads,
-    ):
-        """Articulated inertias; of each joint U, 1/d and u, the first two into the checkpoint if record is 1."""
-        slots = int(SLOTS)
-        if wp.static(SHARERS > 1):
-            sums.sharers.add_loads(loads)
-        for j in range(1, slots + 1):
-            i = slots - j
-            if wp.static(THREADS_PER_ENV > SHARERS):
-                if i == TRUNK:
-                    sums.limbs.add_loads(loads)
-            if i > 0 and i < here.n:
-                k = here.at + i
-                p = m.parent[k]
-                S = links[i].S
-                sa = wp.spatial_top(S)
-                sl = wp.spatial_bottom(S)
-                own = loads[i]
-                Ua = own.a * sa + own.b * sl
-                Ul = sa * own.b + own.d * sl
-                Ui = join(Ua, Ul)
-                d = wp.dot(S, Ui) + T(m.armature[k])
-                f, d = joint_force(m, law, k, phase, links[i], motions[i], d)
-                ui = f - wp.dot(S, own.f)
-                di = T(1.0) / d
-                if wp.static(FLOATING) or p > 0:
-                    va = Ua * di
-                    vl = Ul * di
-                    if wp.static(CONSTRAINED):
-                        loads[p].f = loads[p].f + own.f + join(va, vl) * ui
-                    else:
-                        C = motions[i].C
-                        ca = wp.spatial_top(C)
-                        cl = wp.spatial_bottom(C)
-                        bias = join(own.a * ca + own.b * cl, ca * own.b + own.d * cl)
-                        loads[p].f = loads[p].f + own.f + bias + join(va, vl) * (ui - wp.dot(Ui, C))
-                    loads[p].a = loads[p].a + own.a - wp.outer(Ua, va)
-                    loads[p].b = loads[p].b + own.b - wp.outer(Ua, vl)
-                    loads[p].d = loads[p].d + own.d - wp.outer(Ul, vl)
-                motions[i].U = Ui
-                motions[i].dinv = di
-                motions[i].u = ui
-                if record == 1:
-                    f0 = 7 * (link_of(m, k) - 1)
-                    for r in range(6):
-                        store(ck.f, factor_row, f0 + r, here.e, Ui[r])
-                    store(ck.f, factor_row, f0 + 6, here.e, di)
-
-    @wp.func
-    def accelerate(
-        m: Model,
-        law: Law,
-        here: Lane,
-        record: int,
-        ck: Ck,
-        links: Links,
-        motions: Motions,
-        load: Load,
-        root: Root,
-    ):
-        """Accelerations (minus gravity, which acts as an acceleration of the base), those of joints into u."""
-        motions[0].A = join(vec3(), -vec3(m.gravity))
-        if wp.static(FLOATING):
-            if wp.static(BASE_DAMPED):
-                load = base.damp_base(m, law, True, links[0], load, root)
-            L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
-            motions[0].A = a0
-            root.turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
-            root.speeding_up = wp.spatial_bottom(a0) + wp.cross(wp.spatial_top(links[0].V), root.v) + vec3(m.gravity)
-            if record == 1:
-                base.store_base(ck.f, here.row, here.e, L)
-        for i in range(1, here.n):
-            ai = motions[m.parent[here.at + i]].A + motions[i].C
-            qdd = (motions[i].u - wp.dot(motions[i].U, ai)) * motions[i].dinv
-            motions[i].A = ai + links[i].S * qdd
-            motions[i].u = qdd
-        return root
+            loads[i] = link.link_inertia(m, here, here.at + i, links[i], place)
 
     @wp.func
     def moved(place: T, rate: T, rest: T, h: T):
@@ -241,8 +125,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         return end, rest
 
     @wp.func
-    def integrate(m: Model, law: Law, here: Lane, links: Links, motions: Motions, turn: Quats, root: Root):
-        h = law.h
+    def integrate(m: Model, here: Lane, links: Links, motions: Motions, turn: Quats, root: Root):
+        h = here.h
         if wp.static(FLOATING):
             root.v = root.v + h * root.speeding_up
             root.w = root.w + h * root.turning_up
@@ -273,26 +157,26 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         return pick(wp.abs(place), T(MAX_PLACE), T(0.0), T(1.0))
 
     @wp.func
-    def no_turn(start: t.Start, here: Lane, adr: int):
+    def no_turn(batch: t.Batch, here: Lane, adr: int):
         """1 where the square of a quaternion that came in is near the ends of float32, or no number, else 0."""
-        given = kin.load_quat(start.qpos, here.e, adr)
+        given = kin.load_quat(batch.qpos, here.e, adr)
         square = wp.dot(given, given)
         return pick(T(1e-30), square, pick(square, T(1e30), T(0.0), T(1.0)), T(1.0))
 
     @wp.func
-    def broken_numbers(m: Model, here: Lane, start: t.Start, links: Links, turn: Quats, root: Root):
+    def broken_numbers(m: Model, here: Lane, batch: t.Batch, links: Links, turn: Quats, root: Root):
         """How many numbers of the state left the finite ones, or any imaginable speed, or came in without direction."""
         broken = T(0.0)
         if wp.static(FLOATING):
             for k in range(3):
                 broken = broken + too_far(root.pos[k]) + block.broken(root.rot[k])
                 broken = broken + too_fast(root.v[k]) + too_fast(root.w[k])
-            broken = broken + block.broken(root.rot[3]) + no_turn(start, here, 3)
+            broken = broken + block.broken(root.rot[3]) + no_turn(batch, here, 3)
         for i in range(1, here.n):
             broken = broken + too_far(links[i].q) + too_fast(links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
-                broken = broken + no_turn(start, here, qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b]))
+                broken = broken + no_turn(batch, here, qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b]))
                 for k in range(4):
                     broken = broken + block.broken(turn[b][k])
         if wp.static(THREADS_PER_ENV > 1):
@@ -305,34 +189,24 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         write(out, e, column, pick(T(0.0), broken, read(start, e, column), value))
 
     @wp.func
-    def write_state(
-        m: Model,
-        here: Lane,
-        broken: T,
-        start: t.Start,
-        qpos: t.array2,
-        qvel: t.array2,
-        links: Links,
-        turn: Quats,
-        root: Root,
-    ):
+    def write_state(m: Model, here: Lane, broken: T, batch: t.Batch, links: Links, turn: Quats, root: Root):
         e = here.e
         if wp.static(FLOATING):
             for k in range(3):
-                hand_back(qpos, start.qpos, e, k, broken, root.pos[k])
-                hand_back(qpos, start.qpos, e, 4 + k, broken, root.rot[k])
-                hand_back(qvel, start.qvel, e, k, broken, root.v[k])
-                hand_back(qvel, start.qvel, e, 3 + k, broken, root.w[k])
-            hand_back(qpos, start.qpos, e, 3, broken, root.rot[3])
+                hand_back(batch.qpos_out, batch.qpos, e, k, broken, root.pos[k])
+                hand_back(batch.qpos_out, batch.qpos, e, 4 + k, broken, root.rot[k])
+                hand_back(batch.qvel_out, batch.qvel, e, k, broken, root.v[k])
+                hand_back(batch.qvel_out, batch.qvel, e, 3 + k, broken, root.w[k])
+            hand_back(batch.qpos_out, batch.qpos, e, 3, broken, root.rot[3])
         for i in range(1, here.n):
-            hand_back(qpos, start.qpos, e, qpos_adr(m, here.at + i), broken, links[i].q)
-            hand_back(qvel, start.qvel, e, VADR + link_of(m, here.at + i), broken, links[i].qd)
+            hand_back(batch.qpos_out, batch.qpos, e, qpos_adr(m, here.at + i), broken, links[i].q)
+            hand_back(batch.qvel_out, batch.qvel, e, VADR + link_of(m, here.at + i), broken, links[i].qd)
         if wp.static(NBALL > 0):
             for b in range(m.ball_count[here.lane]):
                 adr = qpos_adr(m, here.at + m.ball_slot[here.lane * NBALL + b])
-                hand_back(qpos, start.qpos, e, adr, broken, turn[b][3])
+                hand_back(batch.qpos_out, batch.qpos, e, adr, broken, turn[b][3])
                 for k in range(3):
-                    hand_back(qpos, start.qpos, e, adr + 1 + k, broken, turn[b][k])
+                    hand_back(batch.qpos_out, batch.qpos, e, adr + 1 + k, broken, turn[b][k])
 
     @wp.kernel(module="unique", module_options=module_options(spec))
     def forward(
@@ -344,37 +218,34 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         substeps: int,
         passes: int,  # of Newton's method at most, and what it converges to: read with constraints
         tolerance: t.U,
-        start: t.Start,
+        batch: t.Batch,
         # checkpoint out: rows row0 .. row0 + substeps - 1, written if record is 1
         record: int,
         row0: int,
         ck: t.Checkpoint,
-        # state out; with constraints the last columns of qvel_out are the residual and the number of passes
-        qpos_out: t.array2,
-        qvel_out: t.array2,
+        # out; with constraints the last columns of qvel_out are the residual and the number of passes
         nonfinite: wp.array(dtype=wp.bool),
         unconverged: wp.array(dtype=int),
     ):
-        here = kin.lane_of(m, first, wp.tid())
-        law = law_of(m, T(seconds), T(implicitness), start.factors, here.e)
+        here = lane(m, first, wp.tid(), T(seconds), T(implicitness), batch.factors)
         links = wp.zeros(shape=SLOTS, dtype=Link)
         motions = wp.zeros(shape=SLOTS, dtype=Motion)
         loads = wp.zeros(shape=SLOTS, dtype=Load)
         turn = wp.zeros(shape=BALLS, dtype=quat)
         pull = wp.zeros(shape=PULLS, dtype=T)
         if wp.static(MUSCLE):
-            muscle.activate(m, law, here, start.ctrl, pull)
+            muscle.activate(m, here, batch.ctrl, pull)
         if wp.static(MOTOR):
             motor = wp.zeros(shape=SLOTS, dtype=T)
-            joint.drive(m, law, here, start.ctrl, motor)
+            joint.drive(m, here, batch.ctrl, motor)
             for i in range(1, here.n):
                 motions[i].motor = motor[i]
         if wp.static(CONSTRAINED):
-            free_loads = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
+            free = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
             touches = wp.zeros(shape=SPHERES, dtype=Touch)
             residual = T(0.0)
             count = T(0.0)
-        root = state_of(m, here, start, links, turn)
+        root = state_of(m, here, batch, links, turn)
         for sub in range(substeps):
             here.row = row0 + sub
             if record == 1:
@@ -388,9 +259,9 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(NBALL > 0):
                 kin.place_balls(m, here, turn, links)
             place = kin.place_links(m, here, links, place)
-            outward(m, law, here, place, links, motions, loads)
+            outward(m, here, place, links, motions, loads)
             if wp.static(FORCED):
-                force.add_forces(m, here, start.forces, links, loads)
+                force.add_forces(m, here, batch.forces, links, loads)
             if wp.static(MUSCLE):
                 muscle.add_muscles(m, here, pull, links, loads)
             # 2. inward and outward: articulated inertias, then accelerations. With constraints each pass is a step of
@@ -406,8 +277,8 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 root.turning_up = vec3()
                 root.speeding_up = vec3()
                 if wp.static(CONTACT):
-                    constraint.touch(m, law, here, links, place, touches)
-                newton.begin(m, law, here, links, motions, loads, free_loads, root)
+                    constraint.touch(m, here, links, place, touches)
+                newton.begin(m, here, links, motions, loads, free, root)
                 phase = int(NEWTON)
                 while phase < DONE:
                     if phase == NEWTON and (by.passes == passes or not block.any_of(by.going)):
@@ -416,24 +287,22 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         if record == 1:
                             phase = FACTOR
                     if phase < DONE:
-                        factor_row = SOLVES * here.row
+                        here.factor = SOLVES * here.row
                         if wp.static(DAMPED):
                             if phase == FACTOR:
-                                factor_row = factor_row + 1
+                                here.factor = here.factor + 1
                         if phase == SOLVE:
                             for i in range(here.n):
-                                loads[i] = free_loads[i]
+                                loads[i] = free[i]
                                 loads[i].f = vec6()
                         else:
-                            newton.linearize(m, here, motions, touches, free_loads, loads)
-                        keeps = record * wp.where(phase > NEWTON, 1, 0)
-                        inward(m, law, here, phase, factor_row, keeps, ck, links, motions, loads)
-                        root = newton.respond(
-                            m, law, here, phase == SOLVE, factor_row, keeps, ck, links, motions, loads[0], root
-                        )
+                            newton.linearize(m, here, motions, touches, free, loads)
+                        here.keep = record * wp.where(phase > NEWTON, 1, 0)
+                        sweep.inward(m, here, phase, ck, links, motions, loads)
+                        root = sweep.accelerate(m, here, phase, ck, links, motions, loads[0], root)
                         if phase == NEWTON:
                             count = count + by.going
-                            root, by = newton.step_on(m, law, here, links, motions, touches, free_loads, root, by)
+                            root, by = newton.step_on(m, here, links, motions, touches, free, root, by)
                         else:
                             phase = phase + 1
                             if wp.static(not DAMPED):
@@ -455,22 +324,24 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 root.speeding_up = root.vdot + root.speeding_up
                 root.turning_up = root.wdot + root.turning_up
             else:
-                inward(m, law, here, SOLVE, here.row, record, ck, links, motions, loads)
-                root = accelerate(m, law, here, record, ck, links, motions, loads[0], root)
+                here.factor = here.row
+                here.keep = record
+                sweep.inward(m, here, SOLVE, ck, links, motions, loads)
+                root = sweep.accelerate(m, here, SOLVE, ck, links, motions, loads[0], root)
             # 3. the new state
             if record == 1:
                 record_rates(m, here, ck, 0, root.speeding_up, root.turning_up, motions)
-            root = integrate(m, law, here, links, motions, turn, root)
+            root = integrate(m, here, links, motions, turn, root)
 
         # An environment that left the finite numbers, or any imaginable speed, is handed back as it came.
-        broken = broken_numbers(m, here, start, links, turn, root)
+        broken = broken_numbers(m, here, batch, links, turn, root)
         block.write_flags(nonfinite, here.e, broken)
         if wp.static(CONSTRAINED):
             residual = pick(T(0.0), broken, T(0.0), wp.sqrt(residual))
-            write(qvel_out, here.e, NV, residual)
-            write(qvel_out, here.e, NV + 1, count)
+            write(batch.qvel_out, here.e, NV, residual)
+            write(batch.qvel_out, here.e, NV + 1, count)
             if here.lane == 0:
                 block.count(unconverged, here.e, pick(T(tolerance), residual, T(1.0), T(0.0)))
-        write_state(m, here, broken, start, qpos_out, qvel_out, links, turn, root)
+        write_state(m, here, broken, batch, links, turn, root)
 
     return forward

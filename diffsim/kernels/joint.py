@@ -26,7 +26,7 @@ from diffsim.kernels.wide import blocks
 @cache
 def joint_law(spec: KernelSpec) -> SimpleNamespace:
     t = types(spec)
-    T, Model, Law, Lane = t.T, t.Model, t.Law, t.Lane
+    T, Model, Lane = t.T, t.Model, t.Lane
     vec2, block = t.vec2, blocks(spec)
     pick = block.pick
     STIFFNESS, DAMPING, LIMIT = (name in spec.features for name in ("stiffness", "damping", "limit"))
@@ -35,14 +35,14 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     CLAMP = "clamp" in spec.features
 
     @wp.func
-    def drive(m: Model, law: Law, here: Lane, ctrl: t.array2, motor: t.array):
+    def drive(m: Model, here: Lane, ctrl: t.array2, motor: t.array):
         """Adds the motors' forces to the links' of a lane."""
         for k in range(NU):
             i = m.motor_slot[here.lane * NU + k]
             motor[i] = motor[i] + T(m.gear[k]) * block.read(ctrl, here.e, k) + T(m.motor_bias[k])
         if wp.static(VARIED):
             for i in range(1, here.n):
-                motor[i] = law.motor * motor[i]
+                motor[i] = here.motor * motor[i]
 
     @wp.func
     def unbounded(m: Model, i: int, motor: T, q: T, qd: T):
@@ -78,12 +78,12 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         return pick(upper, q, upper - q, pick(q, lower, lower - q, T(0.0)))
 
     @wp.func
-    def limit_constants(m: Model, law: Law, i: int):
+    def limit_constants(m: Model, here: Lane, i: int):
         k = T(m.k_limit[i])
         d = T(m.d_limit[i])
         if wp.static(VARIED):
-            k = law.k_limit * k
-            d = law.d_limit * d
+            k = here.k_limit * k
+            d = here.d_limit * d
         return k, d
 
     @wp.func
@@ -97,7 +97,7 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         return pick(d * returning(way, qd), k, pick(T(0.0), wp.abs(way), T(1.0), T(0.0)), T(0.0))
 
     @wp.func
-    def passive_force(m: Model, law: Law, i: int, q: T, qd: T):
+    def passive_force(m: Model, here: Lane, i: int, q: T, qd: T):
         force = T(0.0)
         if wp.static(STIFFNESS):
             force = force - T(m.stiffness[i]) * (q - T(m.spring_ref[i]))
@@ -105,12 +105,12 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
             force = force - T(m.damping[i]) * qd
         if wp.static(LIMIT):
             way = way_back(m, i, q)
-            k, d = limit_constants(m, law, i)
+            k, d = limit_constants(m, here, i)
             force = force + pushes(k, d, way, qd) * (k - d * returning(way, qd)) * way
         return force
 
     @wp.func
-    def resistance(m: Model, law: Law, i: int, q: T, qd: T, free: T):
+    def resistance(m: Model, here: Lane, i: int, q: T, qd: T, free: T):
         """The parts of B that theta h^2 and h multiply."""
         kq = T(0.0)
         kv = T(0.0)
@@ -122,14 +122,14 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
             kq = kq + free * T(m.servo_stiffness[i])
         if wp.static(LIMIT):
             way = way_back(m, i, q)
-            k, d = limit_constants(m, law, i)
+            k, d = limit_constants(m, here, i)
             on = pushes(k, d, way, qd)
             kq = kq + on * k
             kv = kv + on * d * wp.abs(way)
         return vec2(kq, kv)
 
     @wp.func
-    def gain(m: Model, law: Law, i: int, q: T, qd: T, end_rate: T, free: T):
+    def gain(m: Model, here: Lane, i: int, q: T, qd: T, end_rate: T, free: T):
         """(d force / d q, d force / d qd), -B a included; end_rate is qd + h a, or qd if explicit."""
         kq = T(0.0)
         kv = T(0.0)
@@ -141,17 +141,17 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
             kq = kq - free * T(m.servo_stiffness[i])
         if wp.static(LIMIT):
             way = way_back(m, i, q)
-            k, d = limit_constants(m, law, i)
+            k, d = limit_constants(m, here, i)
             on = pushes(k, d, way, qd)
             kq = kq - on * k + on * d * returning(way, end_rate)
             kv = kv - on * d * wp.abs(way)
         return vec2(kq, kv)
 
     @wp.func
-    def limit_constants_gain(m: Model, law: Law, i: int, q: T, qd: T, end_rate: T, lead: T):
+    def limit_constants_gain(m: Model, here: Lane, i: int, q: T, qd: T, end_rate: T, lead: T):
         """d force / d factor of (k_limit, d_limit); lead is theta h, other arguments as of gain."""
         way = way_back(m, i, q)
-        k, d = limit_constants(m, law, i)
+        k, d = limit_constants(m, here, i)
         on = pushes(k, d, way, qd)
         by_k = T(m.k_limit[i]) * (way - lead * (end_rate - qd))
         return on * vec2(by_k, -T(m.d_limit[i]) * wp.abs(way) * end_rate)

@@ -20,20 +20,8 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
     BALL, STIFFNESS = "ball" in spec.features, "stiffness" in spec.features
     HINGE, SLIDE = "hinge" in spec.features, "slide" in spec.features
-    ENV_LAST, THREADS_PER_ENV, SLOTS = spec.env_last, spec.threads_per_env, spec.slots
+    ENV_LAST, THREADS_PER_ENV = spec.env_last, spec.threads_per_env
     TERRAIN, Place = "terrain" in spec.features, t.Place
-
-    @wp.func
-    def lane_of(m: Model, first: int, thread: int):
-        """What a thread of a launch that begins with environment, or block, `first` computes."""
-        here = Lane()
-        here.e = first + thread / THREADS_PER_ENV
-        here.lane = thread % THREADS_PER_ENV
-        here.at = here.lane * SLOTS
-        here.n = int(SLOTS)  # a variable, not a constant: Warp would unroll loops, and they outgrow a GPU's cache
-        if wp.static(THREADS_PER_ENV > 1):
-            here.n = m.count[here.lane]
-        return here
 
     @wp.func
     def load(a: t.array3, row: int, k: int, e: int):
@@ -133,6 +121,4 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             links[i].V = links[p].V + Si * links[i].qd
         return place
 
-    return by_name(
-        lane_of, load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, carrier_place, place_links
-    )
+    return by_name(load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, carrier_place, place_links)

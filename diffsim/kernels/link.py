@@ -16,7 +16,7 @@ from diffsim.kernels.spec import KernelSpec
 @cache
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
-    T, vec3, mat3, Model, Law, Link = t.T, t.vec3, t.mat3, t.Model, t.Law, t.Link
+    T, vec3, mat3, Model, Lane, Link = t.T, t.vec3, t.mat3, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.array
     momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
@@ -36,14 +36,14 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         return p, f, sp.force_at(p, f)
 
     @wp.func
-    def link_inertia(m: Model, law: Law, k: int, link: Link, place: Place):
+    def link_inertia(m: Model, here: Lane, k: int, link: Link, place: Place):
         """What link k alone weighs, contacts included."""
         com, inertia = mass_of(m, k, link)
         V = link.V
         mass = T(m.mass[k])
         if wp.static(VARIED):
-            inertia = law.mass * inertia
-            mass = law.mass * mass
+            inertia = here.mass * inertia
+            mass = here.mass * mass
         load = Load()
         load.b = mass * wp.skew(com)
         load.a = inertia - load.b * wp.skew(com)
@@ -52,16 +52,16 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(LIFT):
             _p, _f, up = lift(m, k, link)
             if wp.static(VARIED):
-                up = law.mass * up
+                up = here.mass * up
             load.f = load.f - up
         if wp.static(DRAG):
             load.f = load.f - drag.drag_wrench(m, k, link.R, com, V)
         if wp.static(CONTACT):
-            load = contact.add_contacts(m, law, k, link, place, load)
+            load = contact.add_contacts(m, here, k, link, place, load)
         return load
 
     @wp.func
-    def link_adjoint(m: Model, law: Law, k: int, link: Link, node: Node, place: Place, adj_factors: Array):
+    def link_adjoint(m: Model, here: Lane, k: int, link: Link, node: Node, place: Place, adj_factors: Array):
         """The adjoints of one link's part of phi, all about the carrier's position.
 
         adj_factors, here and in all laws, are written if varied only.
@@ -82,28 +82,28 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         if wp.static(VARIED):
             # phi's inertial part is W . adj_w, and all of this is that of a factor of one.
             adj_factors[MASS] = adj_factors[MASS] + wp.dot(W, adj.w)
-            adj.a = law.mass * adj.a
-            adj.w = law.mass * adj.w
-            adj.v = law.mass * adj.v
+            adj.a = here.mass * adj.a
+            adj.w = here.mass * adj.w
+            adj.v = here.mass * adj.v
             if wp.static(LIFT):
-                adj.p = law.mass * adj.p
+                adj.p = here.mass * adj.p
         if wp.static(DRAG):
             adj.w = adj.w - drag.drag_wrench(m, k, link.R, com, V)
             adj.v = adj.v + drag.drag_adjoint(m, k, link.R, com, V, W)
         if wp.static(CONTACT):
-            adj = contact.add_contacts_adjoint(m, law, k, link, node, place, adj, adj_factors)
+            adj = contact.add_contacts_adjoint(m, here, k, link, node, place, adj, adj_factors)
         return adj
 
     @wp.func
-    def add_damping_adjoint(m: Model, law: Law, k: int, link: Link, node: t.Node, adj: Adjoint, adj_factors: t.array):
+    def add_damping_adjoint(m: Model, here: Lane, k: int, link: Link, node: t.Node, adj: Adjoint, adj_factors: t.array):
         """With the adjoints of D and W1 in phi's part W1 . I D, where damping follows the constraints."""
         com, inertia = mass_of(m, k, link)
         adj.d = momentum(T(m.mass[k]), com, inertia, node.W1)
         adj.w1 = momentum(T(m.mass[k]), com, inertia, node.D)
         if wp.static(VARIED):
             adj_factors[MASS] = adj_factors[MASS] + wp.dot(node.W1, adj.w1)
-            adj.d = law.mass * adj.d
-            adj.w1 = law.mass * adj.w1
+            adj.d = here.mass * adj.d
+            adj.w1 = here.mass * adj.w1
         return adj
 
     @wp.func

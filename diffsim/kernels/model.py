@@ -239,7 +239,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     Node, Adjoint = struct("Node", Node), struct("Adjoint", Adjoint)
     Motion = dict.fromkeys("CAU", vec6) | dict.fromkeys(("dinv", "u", "motor", "rest"), T)
     if spec.constrained:
-        Motion |= {"twist": vec6, "stop": vec3} | dict.fromkeys("rate force held firm holds given".split(), T)
+        Motion |= {"iterate": vec6, "stop": vec3} | dict.fromkeys("rate force held firm holds given".split(), T)
     Motion = struct("Motion", Motion)
     root = {"pos": vec3, "rot": quat} | dict.fromkeys("v w rest speeding_up turning_up vdot wdot".split(), vec3)
     Touch = struct("Touch", dict.fromkeys("p jar f tried pushes Hs".split(), vec3) | {"H": mat3, "D": T, "on": T})
@@ -258,19 +258,20 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         array=wp.array(dtype=T),
         array2=wp.array2d(dtype=U),  # a row for each environment
         array3=array3,
-        # what a step depends on, a row for each environment; forces and factors have no columns unless they vary
-        Start=struct("Start", dict.fromkeys("qpos qvel ctrl factors forces".split(), wp.array2d(dtype=U))),
+        # what a step takes and gives, or its gradients, a row for each environment; forces and factors have no columns
+        # unless they vary
+        Batch=struct(
+            "Batch", dict.fromkeys("qpos qvel ctrl factors forces qpos_out qvel_out".split(), wp.array2d(dtype=U))
+        ),
         # what backward needs of each substep: qpos, qvel, qacc and the factor of the mass matrix
         Checkpoint=struct("Checkpoint", dict.fromkeys("qvaf", array3)),
         scene=scene_types(U),
         Model=scene_types(U).Model,
-        # h: s, of a substep; theta: how implicit it is; constants of the laws, or factors of those that each link has
-        # its own of (k_limit to motor, read where they vary); whose row of Model.terrain is read;
-        # 1 if gradients count that contacts begin with a jump
-        Law=struct("Law", constants | {"block": int, "touchdown": int}),
         # a lane of an environment, or of a block of them, e; its n links are entries at, at + 1, ... of Model's arrays;
-        # the substep's row of checkpoints
-        Lane=struct("Lane", dict.fromkeys(("e", "lane", "at", "n", "row"), int)),
+        # rows of checkpoints: the substep's, and the factor's, which is kept if keep is 1; touchdown: 1 if gradients count
+        # that contacts begin with a jump; h: s, of a substep; theta: how implicit it is; constants of the laws, or
+        # factors of those that each link has its own of (k_limit to motor, read where they vary)
+        Lane=struct("Lane", constants | dict.fromkeys("e lane at n row factor keep touchdown".split(), int)),
         # where a link is (about the carrier, in world axes), its joint's axis, its velocity, and its joint's state
         Link=Link,
         Links=wp.array(dtype=Link),
@@ -288,11 +289,11 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         Adjoints=wp.array(dtype=Adjoint),
         # gradients of a floating base's position, turn and velocities, its linear velocity and acceleration
         Base=struct("Base", dict.fromkeys("gp gr gv gw v vdot".split(), vec3)),
-        # what the forward kernel keeps of a link and its joint: the link's velocity product C and acceleration A; the
-        # factor U and 1/d, the right-hand side u and then the acceleration, the motors' force, what rounding the
-        # position lost. In Newton's method the joint's acceleration, the force on it without constraints, theirs (held;
-        # firm: minus its slope), theirs where a part of the step is tried (holds; given: the slope's share), the
-        # limit's stop, and the twist that the step gives the link
+        # what the forward kernel keeps of a link and its joint: the link's velocity product C and acceleration A, with
+        # constraints that of a step; the factor U and 1/d, the right-hand side u and then the acceleration, the motors'
+        # force, what rounding the position lost. In Newton's method the link's acceleration so far (iterate), the
+        # joint's (rate), the force on it without constraints, theirs (held; firm: minus its slope), theirs where a part
+        # of the step is tried (holds; given: the slope's share), and the limit's stop
         Motion=Motion,
         Motions=wp.array(dtype=Motion),
         # a floating base's state, accelerations or steps of a solve, and the iterate

@@ -29,18 +29,18 @@ SHORTEST = 1e-6  # m
 @cache
 def muscle_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp = types(spec), spatial(spec)
-    T, vec3, vec6, Model, Law, Lane, array = t.T, t.vec3, t.vec6, t.Model, t.Law, t.Lane, t.array
+    T, vec3, vec6, Model, Lane, array = t.T, t.vec3, t.vec6, t.Model, t.Lane, t.array
     Links, Nodes, Adjoints, join, point_velocity = t.Links, t.Nodes, t.Adjoints, sp.join, sp.point_velocity
     VARIED, block = spec.varied, blocks(spec)
 
     @wp.func
-    def activate(m: Model, law: Law, here: Lane, ctrl: t.array2, pull: array):
+    def activate(m: Model, here: Lane, ctrl: t.array2, pull: array):
         """Into pull the maximum force times the activation, of each of the lane's muscles."""
         for entry in range(m.muscle_begin[here.lane], m.muscle_begin[here.lane + 1]):
             k = m.muscle[entry]
             pull[k] = T(m.gear[k]) * block.read(ctrl, here.e, k) + T(m.motor_bias[k])
             if wp.static(VARIED):
-                pull[k] = law.motor * pull[k]
+                pull[k] = here.motor * pull[k]
 
     @wp.func
     def length_of(d: vec3):

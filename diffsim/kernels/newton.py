@@ -20,7 +20,6 @@ from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.model import by_name, types
-from diffsim.kernels.solve import base_inertia
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -37,46 +36,43 @@ PATIENCE = 6, 2  # passes, and with dry friction, for which a whole step may end
 @cache
 def newton_method(spec: KernelSpec) -> SimpleNamespace:
     t, sums, block, constraint = types(spec), lane_sums(spec), blocks(spec), constraint_law(spec)
-    T, vec3, vec4, vec6, Model, Law, Lane, pick = t.T, t.vec3, t.vec4, t.vec6, t.Model, t.Law, t.Lane, block.pick
+    T, vec3, vec4, vec6, Model, Lane, pick = t.T, t.vec3, t.vec4, t.vec6, t.Model, t.Lane, block.pick
     Links, Motions, Loads, Root, Newton = t.Links, t.Motions, t.Loads, t.Root, t.Newton
     joint, join, FLOATING = joint_law(spec), spatial(spec).join, spec.floating
     CONTACT, SHARED = "contact" in spec.features, spec.threads_per_env > 1
     LIMIT, HELD = "limit" in spec.features, bool(spec.features & {"limit", "frictionloss"})
-    BASE_DAMPED, base = "base_damping" in spec.features, base_inertia(spec)
     PATIENT = PATIENCE["frictionloss" in spec.features]
     ROUNDING = ROUND_OFF * (6e-8 if t.U == wp.float32 else 1.1e-16)
     FIRST = 0 if spec.floating else 1 + spec.inert  # the first link with inertia
 
     @wp.func
-    def begin(
-        m: Model, law: Law, here: Lane, links: Links, motions: Motions, loads: Loads, free_loads: Loads, root: Root
-    ):
+    def begin(m: Model, here: Lane, links: Links, motions: Motions, loads: Loads, free: Loads, root: Root):
         """No acceleration, where limits act as if the joints had run into them."""
-        motions[0].A = join(vec3(), -vec3(m.gravity) - wp.cross(wp.spatial_top(links[0].V), root.v))
+        motions[0].iterate = join(vec3(), -vec3(m.gravity) - wp.cross(wp.spatial_top(links[0].V), root.v))
         for i in range(here.n):
             k = here.at + i
-            free_loads[i] = loads[i]
+            free[i] = loads[i]
             motions[i].rate = T(0.0)
             if i > 0:
                 q = links[i].q
                 qd = links[i].qd
-                motions[i].A = motions[m.parent[k]].A + motions[i].C
+                motions[i].iterate = motions[m.parent[k]].iterate + motions[i].C
                 push = joint.actuation(m, k, motions[i].motor, q, qd)
-                motions[i].force = push + joint.passive_force(m, law, k, q, qd)
+                motions[i].force = push + joint.passive_force(m, here, k, q, qd)
                 if wp.static(LIMIT):
-                    motions[i].stop = constraint.stop(m, law, k, q, qd)
+                    motions[i].stop = constraint.stop(m, here, k, q, qd)
                 if wp.static(HELD):
                     held = constraint.joint_constraint(m, k, motions[i].stop, qd, T(0.0), T(1.0))
                     motions[i].held = held[0]
                     motions[i].firm = held[1]
 
     @wp.func
-    def linearize(m: Model, here: Lane, motions: Motions, touches: t.Touches, free_loads: Loads, loads: Loads):
+    def linearize(m: Model, here: Lane, motions: Motions, touches: t.Touches, free: Loads, loads: Loads):
         """Loads of the iterate, contacts included: what they and the joints' forces lack gives the next step."""
         for i in range(here.n):
-            load = free_loads[i]
-            a = wp.spatial_top(motions[i].A)
-            l = wp.spatial_bottom(motions[i].A)
+            load = free[i]
+            a = wp.spatial_top(motions[i].iterate)
+            l = wp.spatial_bottom(motions[i].iterate)
             load.f = load.f + join(load.a * a + load.b * l, a * load.b + load.d * l)
             if wp.static(CONTACT):
                 if i >= FIRST:
@@ -84,42 +80,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             loads[i] = load
 
     @wp.func
-    def respond(
-        m: Model,
-        law: Law,
-        here: Lane,
-        last: bool,
-        factor_row: int,
-        record: int,
-        ck: t.Checkpoint,
-        links: Links,
-        motions: Motions,
-        load: t.Load,  # of the base
-        root: Root,
-    ):
-        """Accelerations by the articulated inertias, of joints into u and of links into twist; all are zero without
-        force. The last solve is that of damping."""
-        motions[0].twist = vec6()
-        if wp.static(FLOATING):
-            if wp.static(BASE_DAMPED):
-                load = base.damp_base(m, law, last, links[0], load, root)
-            L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
-            motions[0].twist = a0
-            root.turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
-            root.speeding_up = wp.spatial_bottom(a0)
-            if record == 1:
-                base.store_base(ck.f, factor_row, here.e, L)
-        for i in range(1, here.n):
-            twist = motions[m.parent[here.at + i]].twist
-            qdd = (motions[i].u - wp.dot(motions[i].U, twist)) * motions[i].dinv
-            motions[i].twist = twist + links[i].S * qdd
-            motions[i].u = qdd
-        return root
-
-    @wp.func
-    def measure(
-        m: Model, law: Law, here: Lane, links: Links, motions: Motions, touches: t.Touches, part: T, tries: int
-    ):
+    def measure(m: Model, here: Lane, links: Links, motions: Motions, touches: t.Touches, part: T, tries: int):
         """Constraints after a part of the step s, the first try being all of it.
 
         Returns (s.(f - part H s - f(part)), s.H s, s.H(part) s, the square of that difference of forces as
@@ -145,21 +106,21 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                     motions[i].firm = held[1]
             if wp.static(CONTACT):
                 if i >= FIRST:
-                    found = found + constraint.try_contacts(m, law, here, k, motions[i].twist, part, tries, touches)
+                    found = found + constraint.try_contacts(m, here, k, motions[i].A, part, tries, touches)
         if wp.static(SHARED):
             for r in range(5):
                 found[r] = sums.add(found[r])
         return found
 
     @wp.func
-    def inertia_along(m: Model, here: Lane, motions: Motions, free_loads: Loads):
+    def inertia_along(m: Model, here: Lane, motions: Motions, free: Loads):
         """s.M s of the step s."""
         inertia = T(0.0)
         for i in range(here.n):
             k = here.at + i
-            a = wp.spatial_top(motions[i].twist)
-            l = wp.spatial_bottom(motions[i].twist)
-            load = free_loads[i]
+            a = wp.spatial_top(motions[i].A)
+            l = wp.spatial_bottom(motions[i].A)
+            load = free[i]
             inertia = inertia + wp.dot(a, load.a * a + T(2.0) * (load.b * l)) + wp.dot(l, load.d * l)
             if i > 0:
                 inertia = inertia + T(m.carried[k]) * T(m.armature[k]) * motions[i].u * motions[i].u
@@ -198,17 +159,9 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def far_enough(
-        m: Model,
-        law: Law,
-        here: Lane,
-        links: Links,
-        motions: Motions,
-        touches: t.Touches,
-        free_loads: Loads,
-        moved: T,  # square of the step
-        by: Newton,
+        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Touches, free: Loads, moved: T, by: Newton
     ):
-        """The part of the step after which the cost is least, or all of it while that is good enough."""
+        """The part of a step (moved: its square) after which the cost is least, or all of it if that is good enough."""
         square = by.tolerance * by.tolerance
         patience = T(wp.where(by.passes < PATIENT, 1.0, NEAR))
         part = T(1.0)
@@ -217,7 +170,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
         bracket = vec4()
         tries = int(0)
         while tries <= SEARCHES:
-            found = measure(m, law, here, links, motions, touches, part, tries)
+            found = measure(m, here, links, motions, touches, part, tries)
             rounding = T(ROUNDING) * found[4]
             away = (T(1.0) - part) * (T(1.0) - part) + rounding * rounding
             off = (T(ROWS * ROWS) * found[3] + away * moved) / by.size
@@ -225,7 +178,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             if tries == 0 and by.passes > 0:
                 rises = pick(square, off, by.going * (found[0] - patience * found[1]), T(0.0))
                 if block.any_of(rises):
-                    first = inertia_along(m, here, motions, free_loads) + found[1]
+                    first = inertia_along(m, here, motions, free) + found[1]
                     bracket[1] = -first
             tried = part
             if tries < SEARCHES and block.any_of(rises):
@@ -239,21 +192,13 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def step_on(
-        m: Model,
-        law: Law,
-        here: Lane,
-        links: Links,
-        motions: Motions,
-        touches: t.Touches,
-        free_loads: Loads,
-        root: Root,
-        by: Newton,
+        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Touches, free: Loads, root: Root, by: Newton
     ):
         """A step of the iterate in its direction, u and twists, where it goes on."""
         by.size = T(0.0)
         moved = T(0.0)
         for r in range(6):
-            motions[0].twist[r] = pick(T(0.0), by.going, motions[0].twist[r], T(0.0))
+            motions[0].A[r] = pick(T(0.0), by.going, motions[0].A[r], T(0.0))
         if wp.static(FLOATING):
             for k in range(3):
                 root.turning_up[k] = pick(T(0.0), by.going, root.turning_up[k], T(0.0))
@@ -266,24 +211,24 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             step = pick(T(0.0), by.going, motions[i].u, T(0.0))
             rate = motions[i].rate + step
             motions[i].u = step
-            motions[i].twist = motions[m.parent[here.at + i]].twist + links[i].S * step
+            motions[i].A = motions[m.parent[here.at + i]].A + links[i].S * step
             by.size = by.size + T(m.carried[here.at + i]) * rate * rate
             moved = moved + T(m.carried[here.at + i]) * step * step
         if wp.static(SHARED):
             by.size = sums.add(by.size)
             moved = sums.add(moved)
         by.size = by.size + T(1.0)
-        part, by = far_enough(m, law, here, links, motions, touches, free_loads, moved, by)
+        part, by = far_enough(m, here, links, motions, touches, free, moved, by)
         if wp.static(FLOATING):
             root.wdot = root.wdot + part * root.turning_up
             root.vdot = root.vdot + part * root.speeding_up
         for i in range(here.n):
             motions[i].rate = motions[i].rate + part * motions[i].u
-            motions[i].A = motions[i].A + part * motions[i].twist
+            motions[i].iterate = motions[i].iterate + part * motions[i].A
             motions[i].held = motions[i].holds
         if wp.static(CONTACT):
             constraint.keep_contacts(m, here, touches)
         by.passes = by.passes + 1
         return root, by
 
-    return by_name(begin, linearize, respond, step_on)
+    return by_name(begin, linearize, step_on)

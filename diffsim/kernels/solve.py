@@ -1,4 +1,4 @@
-"""The factorisation of the mass matrix that the forward kernel stores, and M lambda = -h g, solved with it."""
+"""The mass matrix: the sweeps that factorise it and solve for the accelerations, and M lambda = -h g by that factor."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -6,10 +6,13 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.exchange import lane_sums
+from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import by_name, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+
+NEWTON, FACTOR, SOLVE, DONE = range(4)  # a substep's solves: Newton's passes, the factor at their end, and one more
 
 
 @cache
@@ -18,7 +21,7 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
     t, kin = types(spec), kinematics(spec)
     T, vec3, vec6, mat3, mat6 = t.T, t.vec3, t.vec6, t.mat3, t.mat6
     load, store, join = kin.load, kin.store, spatial(spec).join
-    Model, Law, Link, Load, Root = t.Model, t.Law, t.Link, t.Load, t.Root
+    Model, Lane, Link, Load, Root = t.Model, t.Lane, t.Link, t.Load, t.Root
     CONSTRAINED, IMPLICIT = spec.constrained, spec.implicit
     BASE = 7 * (spec.nlink - 1)  # where the base's factor begins, packed by rows
 
@@ -79,10 +82,10 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
         return a
 
     @wp.func
-    def damp_base(m: Model, law: Law, last: bool, link: Link, load: Load, root: Root):
+    def damp_base(m: Model, here: Lane, last: bool, link: Link, load: Load, root: Root):
         """The base's load with its damping, implicit where that of joints is: with constraints in the last solve."""
         b = T(m.base_damping)
-        hb = law.h * b
+        hb = here.h * b
         implicit = int(IMPLICIT)
         if wp.static(CONSTRAINED):
             implicit = wp.where(last, 1, 0)
@@ -101,21 +104,139 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
 
 
 @cache
+def articulated(spec: KernelSpec) -> SimpleNamespace:
+    """The sweeps of the articulated-body algorithm after the first one, which places the links."""
+    t, kin, base, sums, joint = types(spec), kinematics(spec), base_inertia(spec), lane_sums(spec), joint_law(spec)
+    T, vec3, vec6, store, link_of, join = t.T, t.vec3, t.vec6, kin.store, kin.link_of, spatial(spec).join
+    Model, Lane, Ck, Link, Load, Motion, Root = t.Model, t.Lane, t.Checkpoint, t.Link, t.Load, t.Motion, t.Root
+    Links, Motions, Loads = t.Links, t.Motions, t.Loads
+    FLOATING, IMPLICIT, CONSTRAINED, CLAMP = spec.floating, spec.implicit, spec.constrained, "clamp" in spec.features
+    THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
+    BASE_DAMPED = "base_damping" in spec.features
+
+    @wp.func
+    def joint_force(m: Model, here: Lane, k: int, phase: int, link: Link, motion: Motion, d: T):
+        """(force of a joint, d with what its laws resist acceleration by)."""
+        q = link.q
+        if wp.static(IMPLICIT):
+            q = q + here.theta * here.h * link.qd
+        free = T(1.0)
+        if wp.static(CLAMP):
+            free = joint.actuation_free(m, k, motion.motor, q, link.qd)
+        if wp.static(IMPLICIT):
+            resistance = joint.resistance(m, here, k, q, link.qd, free)
+            d = d + here.theta * here.h * here.h * resistance[0] + here.h * resistance[1]
+        if wp.static(CONSTRAINED):
+            if phase == SOLVE:
+                damper = here.h * joint.damping(m, k, free)
+                d = d + damper
+                f = -damper * motion.rate
+            else:
+                d = d + motion.firm
+                f = motion.force + motion.held - T(m.armature[k]) * motion.rate
+        else:
+            f = joint.actuation(m, k, motion.motor, q, link.qd)
+            f = f + joint.passive_force(m, here, k, q, link.qd)
+        return f, d
+
+    @wp.func
+    def inward(m: Model, here: Lane, phase: int, ck: Ck, links: Links, motions: Motions, loads: Loads):
+        """Articulated inertias; of each joint U, 1/d and u, the first two into the checkpoint if here.keep is 1."""
+        slots = int(SLOTS)
+        if wp.static(SHARERS > 1):
+            sums.sharers.add_loads(loads)
+        for j in range(1, slots + 1):
+            i = slots - j
+            if wp.static(THREADS_PER_ENV > SHARERS):
+                if i == TRUNK:
+                    sums.limbs.add_loads(loads)
+            if i > 0 and i < here.n:
+                k = here.at + i
+                p = m.parent[k]
+                S = links[i].S
+                sa = wp.spatial_top(S)
+                sl = wp.spatial_bottom(S)
+                own = loads[i]
+                Ua = own.a * sa + own.b * sl
+                Ul = sa * own.b + own.d * sl
+                Ui = join(Ua, Ul)
+                d = wp.dot(S, Ui) + T(m.armature[k])
+                f, d = joint_force(m, here, k, phase, links[i], motions[i], d)
+                ui = f - wp.dot(S, own.f)
+                di = T(1.0) / d
+                if wp.static(FLOATING) or p > 0:
+                    va = Ua * di
+                    vl = Ul * di
+                    if wp.static(CONSTRAINED):
+                        loads[p].f = loads[p].f + own.f + join(va, vl) * ui
+                    else:
+                        C = motions[i].C
+                        ca = wp.spatial_top(C)
+                        cl = wp.spatial_bottom(C)
+                        bias = join(own.a * ca + own.b * cl, ca * own.b + own.d * cl)
+                        loads[p].f = loads[p].f + own.f + bias + join(va, vl) * (ui - wp.dot(Ui, C))
+                    loads[p].a = loads[p].a + own.a - wp.outer(Ua, va)
+                    loads[p].b = loads[p].b + own.b - wp.outer(Ua, vl)
+                    loads[p].d = loads[p].d + own.d - wp.outer(Ul, vl)
+                motions[i].U = Ui
+                motions[i].dinv = di
+                motions[i].u = ui
+                if here.keep == 1:
+                    f0 = 7 * (link_of(m, k) - 1)
+                    for r in range(6):
+                        store(ck.f, here.factor, f0 + r, here.e, Ui[r])
+                    store(ck.f, here.factor, f0 + 6, here.e, di)
+
+    @wp.func
+    def accelerate(m: Model, here: Lane, phase: int, ck: Ck, links: Links, motions: Motions, load: Load, root: Root):
+        """Accelerations, those of joints into u; load is the base's. Gravity acts as an acceleration of the base.
+
+        With constraints they are those of a step, from forces that lack something, and zero without.
+        """
+        motions[0].A = vec6()
+        if wp.static(not CONSTRAINED):
+            motions[0].A = join(vec3(), -vec3(m.gravity))
+        if wp.static(FLOATING):
+            if wp.static(BASE_DAMPED):
+                load = base.damp_base(m, here, phase == SOLVE, links[0], load, root)
+            L, a0 = base.factor_base(load.a, load.b, load.d, -load.f)
+            motions[0].A = a0
+            root.turning_up = wp.transpose(links[0].R) * wp.spatial_top(a0)
+            root.speeding_up = wp.spatial_bottom(a0)
+            if wp.static(not CONSTRAINED):
+                turning = wp.spatial_top(links[0].V)
+                root.speeding_up = wp.spatial_bottom(a0) + wp.cross(turning, root.v) + vec3(m.gravity)
+            if here.keep == 1:
+                base.store_base(ck.f, here.factor, here.e, L)
+        for i in range(1, here.n):
+            ai = motions[m.parent[here.at + i]].A
+            if wp.static(not CONSTRAINED):
+                ai = ai + motions[i].C
+            qdd = (motions[i].u - wp.dot(motions[i].U, ai)) * motions[i].dinv
+            motions[i].A = ai + links[i].S * qdd
+            motions[i].u = qdd
+        return root
+
+    return by_name(inward, accelerate)
+
+
+@cache
 def factor_solve(spec: KernelSpec) -> wp.Function:
-    t, kin, base, sums = types(spec), kinematics(spec), base_inertia(spec), lane_sums(spec)
-    T, vec6, load, link_of = t.T, t.vec6, kin.load, kin.link_of
-    Model, Law, Lane, Ck, Links, Nodes = t.Model, t.Law, t.Lane, t.Checkpoint, t.Links, t.Nodes
-    FLOATING, SLOTS = spec.floating, spec.slots
+    t, kin, inertia, sums, joint = types(spec), kinematics(spec), base_inertia(spec), lane_sums(spec), joint_law(spec)
+    T, vec6, load, link_of, join = t.T, t.vec6, kin.load, kin.link_of, spatial(spec).join
+    Model, Lane, Ck, Links, Nodes, Base = t.Model, t.Lane, t.Checkpoint, t.Links, t.Nodes, t.Base
+    FLOATING, SLOTS, SOLVES, DAMPED = spec.floating, spec.slots, spec.solves, spec.damped
+    BASE_DAMPED, CLAMP = "base_damping" in spec.features, "clamp" in spec.features
     THREADS_PER_ENV, SHARERS, TRUNK = spec.threads_per_env, spec.sharers, spec.trunk
 
     @wp.func
-    def solve(m: Model, law: Law, here: Lane, ck: Ck, row: int, links: Links, nodes: Nodes, g_base: vec6):
+    def solve(m: Model, here: Lane, ck: Ck, row: int, links: Links, nodes: Nodes, g_base: vec6):
         """lambda = -M^-1 h g and the twists W under it, into nodes; g_base is a floating base's.
 
         On the way in, W holds the articulated bias force.
         """
         slots = int(SLOTS)
-        h = law.h
+        h = here.h
         for i in range(here.n):
             nodes[i].W = vec6()
         for j in range(1, slots + 1):
@@ -135,7 +256,7 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
                         Ui[r] = load(ck.f, row, f0 + r, here.e)
                     nodes[p].W = nodes[p].W + W + Ui * (u * load(ck.f, row, f0 + 6, here.e))
         if wp.static(FLOATING):
-            nodes[0].W = base.solve_base(ck.f, row, here.e, g_base * (-h) - nodes[0].W)
+            nodes[0].W = inertia.solve_base(ck.f, row, here.e, g_base * (-h) - nodes[0].W)
         for i in range(1, here.n):
             W = nodes[m.parent[here.at + i]].W
             f0 = 7 * (link_of(m, here.at + i) - 1)
@@ -146,4 +267,24 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
             nodes[i].lam = lam
             nodes[i].W = W + links[i].S * lam
 
-    return solve
+    @wp.func
+    def solve_all(m: Model, here: Lane, ck: Ck, links: Links, nodes: Nodes, base: Base):
+        """lambda = -M^-1 g. Where damping follows the constraints, W1 = J lambda1 of (M + h b) lambda1 = -g comes
+        first, and g + h b lambda1 reaches the acceleration before it."""
+        g_base = vec6()
+        if wp.static(FLOATING):
+            g_base = join(links[0].R * base.gw, base.gv)
+        for s in range(SOLVES):
+            if wp.static(DAMPED and BASE_DAMPED):
+                g_base = g_base + T(s) * T(m.base_damping) * nodes[0].W
+            for i in range(here.n):
+                nodes[i].g = nodes[i].gqd
+                if wp.static(DAMPED):
+                    nodes[i].W1 = nodes[i].W
+                    within = T(1.0)
+                    if wp.static(CLAMP):
+                        within = nodes[i].free
+                    nodes[i].g = nodes[i].gqd + T(s) * joint.damping(m, here.at + i, within) * nodes[i].lam
+            solve(m, here, ck, SOLVES * here.row + s, links, nodes, g_base)
+
+    return solve_all

@@ -138,7 +138,7 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         return result
 
     @wp.func
-    def sphere_on_terrain(m: Model, law: t.Law, c: int, link: t.Link, place: vec2):
+    def sphere_on_terrain(m: Model, here: t.Lane, c: int, link: t.Link, place: vec2):
         """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
         theta h ahead if implicit), E and the curvature k."""
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
@@ -146,15 +146,15 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         reach = r
         if wp.static(IMPLICIT):
             fastest = wp.length(point_velocity(link.V, centre)) + r * wp.length(wp.spatial_top(link.V))
-            reach = r + law.theta * law.h * fastest
-        hit = nearest_of_each(m, law.block, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
+            reach = r + here.theta * here.h * fastest
+        hit = nearest_of_each(m, here.e, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
         n = vec3(hit[1], T(0.0), hit[2])
         E = mat3(n[2], T(0.0), n[0], T(0.0), T(1.0), T(0.0), -n[0], T(0.0), n[2])
         p = centre - r * n
         v = wp.transpose(E) * point_velocity(link.V, p)
         depth = hit[0]
         if wp.static(IMPLICIT):
-            depth = depth + law.theta * law.h * v[2]
+            depth = depth + here.theta * here.h * v[2]
         return p, v, depth, E, hit[3]
 
     return sphere_on_terrain

@@ -96,10 +96,11 @@ class Launcher:
                 for first, end in self._shares
             ]
 
-    def start(self, parts: Iterable[torch.Tensor]) -> Any:
-        """The kernels' struct Start, of qpos, qvel, ctrl, factors and forces."""
-        result = types(self.spec).Start()
-        for name, part in zip(("qpos", "qvel", "ctrl", "factors", "forces"), parts, strict=True):
+    def batch(self, parts: Iterable[torch.Tensor]) -> Any:
+        """The kernels' struct Batch, of its fields."""
+        Batch = types(self.spec).Batch
+        result = Batch()
+        for name, part in zip(Batch.vars, parts, strict=True):
             setattr(result, name, wp.from_torch(part))
         return result
 

@@ -249,19 +249,19 @@ class Simulator:
             self._rows = self._launcher.checkpoints(self.horizon * how.substeps)
         rows = self._rows if record else self._launcher.checkpoints(0)
         row0 = slot * how.substeps if record else 0
-        start, g_start = (
-            self._launcher.start(buffer.split(self._widths, dim=1)) for buffer in (self._start[slot], self._g_start)
-        )
-        end, g_end = (
-            [wp.from_torch(part) for part in buffer.split(widths, dim=1)]
-            for buffer, widths in ((self._end, self._end_widths), (self._g_end, self._widths[:2]))
+        batch, gradients = (
+            self._launcher.batch([*start.split(self._widths, dim=1), *end.split(widths, dim=1)])
+            for start, end, widths in (
+                (self._start[slot], self._end, self._end_widths),
+                (self._g_start, self._g_end, self._widths[:2]),
+            )
         )
         real, nonfinite = self._launcher.spec.dtype, wp.from_torch(self._nonfinite[slot])
         scalars = [real(self.control_dt / how.substeps), real(how.theta), how.substeps]
         missed, blown_up = wp.from_torch(self.unconverged), wp.from_torch(self.nonfinite_gradients)
         if kernel == "forward":
-            return [*scalars, how.passes, real(how.tolerance), start, int(record), row0, rows, *end, nonfinite, missed]
-        return [*scalars, int(how.touchdown), row0, rows, start, nonfinite, *g_end, g_start, blown_up]
+            return [*scalars, how.passes, real(how.tolerance), batch, int(record), row0, rows, nonfinite, missed]
+        return [*scalars, int(how.touchdown), row0, rows, batch, nonfinite, gradients, blown_up]
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
