@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,16 @@ import torch
 from numpy.typing import ArrayLike
 
 from diffsim import startup
-from diffsim.env import DiffEnv
+from diffsim.env import DiffEnv, RenderMode
+from diffsim.kernels.lanes import Division
 from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
 from diffsim.sim.integration import Integration
 from diffsim.sim.modes import in_plain_mode
-from diffsim.sim.options import Options, check_device, check_dtype
+from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
-from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, find_task, tracking
+from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, TaskError, find_task, tracking
 from diffsim.tasks.imitation.clip import Clip, read_clip
 
 __all__ = [
@@ -32,15 +34,12 @@ __all__ = [
     "Scene",
     "SceneError",
     "Simulator",
+    "Task",
+    "TaskError",
     "load_scene",
     "make",
     "read_clip",
 ]
-
-
-# Arguments of `make` that it hands on
-KEYWORDS = {*"stochastic_init early_termination max_episode_steps adjoint_clip render_mode".split(), *Options._fields}
-KEYWORDS -= {"integration", "device", "dtype"}
 
 
 @in_plain_mode
@@ -63,36 +62,65 @@ def make(
     clip: Clip | Path | str | None = None,
     terrain: ArrayLike | None = None,
     control_dt: float | None = None,
-    **others: Any,
+    stochastic_init: bool = True,
+    early_termination: bool = True,
+    max_episode_steps: int | None = None,
+    adjoint_clip: float = 0.0,
+    render_mode: RenderMode | None = None,
+    threads: int | None = None,
+    factors: bool = False,
+    forces: bool = False,
+    block: int | None = None,
+    division: Division | None = None,
+    **unknown: Any,
 ) -> DiffEnv:
     """Build the tensor environment of a task.
 
+    Example:
+        env = diffsim.make("ant", num_envs=64, horizon=32)
+        obs, info = env.reset(seed=1)  # (64, 37)
+        obs, reward, terminated, truncated, info = env.step(torch.zeros(64, 8))
+
     Args:
-        name: one of diffsim.TASKS, a file with a task of your own, "my_task.py" or "my_task.py:Class", or its class.
-        num_envs, device, dtype: how many environments, where, and in which precision.
-        seed, horizon: see DiffEnv.
-        accuracy: the task's preset of integrator, theta and substeps, "fast", "default" (the paper's) or "accurate";
-            docs/numerics.md has what each costs and how much it errs.
-        substeps, integrator, theta, passes, tolerance, touchdown: each in place of the preset's, if given.
-        contact: "soft" (the paper's springs) or "mujoco" (MuJoCo's own constraints, see Integration): the laws of
-            contact and limits and how they are integrated; docs/transfer.md has what policies keep of their speed.
-            Default the task's: soft for those of the papers, mujoco for go1, go2, g1 and tasks of your own.
-        penalty: constants of contact and limits in place of the MJCF's, e.g. {"k_n": 1e5}; docs/physics.md lists them.
-        terrain: the ground in place of the plane z = 0, vertices (x, z) [m] of one profile (K, 2), or (num_envs, K, 2)
-            of one for each environment: see Scene.with_terrain; diffsim.terrain makes some. Heights that the task
-            observes, rewards and ends by are then those over the ground below the root.
-        control_dt: seconds of a control step in place of the task's; the substeps divide it.
-        clip: the motions that g1_track tracks, or the one of humanoid_imitation; or their file or folder, see
-            read_clip. Default a shipped one.
-        **others: stochastic_init, early_termination, max_episode_steps, adjoint_clip, render_mode: see DiffEnv;
-            threads, factors, forces: see sim.Options.
+        name: one of diffsim.TASKS, a file with a task of your own ("my_task.py" or "my_task.py:Class"), or its class.
+        num_envs: number of environments N.
+        device: "cpu" or a CUDA device.
+        seed: of the random start states, commands and noise; by default another one for each environment that is made.
+        horizon: most differentiable steps between two calls of DiffEnv.detach.
+        substeps, integrator, theta, passes, tolerance, touchdown: replace parts of the preset, see Integration.
+        accuracy: preset of the integration, "fast", "default" (the papers') or "accurate", see docs/numerics.md.
+        contact: "soft" (penalty law) or "mujoco" (MuJoCo's constraints). Default: the task's, "mujoco" for go1, go2,
+            g1, g1_track and tasks of your own, "soft" for the others.
+        penalty: constants of the penalty law that replace the MJCF's, e.g. {"k_n": 1e5}, see docs/physics.md.
+        dtype: torch.float32 or torch.float64.
+        clip: motions that g1_track or humanoid_imitation tracks, or their file or folder, see read_clip. Default: a
+            clip of the package.
+        terrain: replaces the plane z = 0: vertices (x, z) [m] of one profile, (K, 2), or of one for each environment,
+            (N, K, 2), see Scene.with_terrain and diffsim.terrain. The task then measures heights from the ground below
+            the root.
+        control_dt: seconds of a control step. Default: the task's.
+        stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
+        early_termination: end episodes where the task reports a fall.
+        max_episode_steps: control steps after which an episode is truncated. Default: the task's episode_length.
+        adjoint_clip: bound of each environment's state gradients, as a multiple of the batch's median; 0: none.
+        render_mode: "rgb_array" (DiffEnv.render returns pictures) or "human" (a window).
+        threads: CPU threads of the kernels. Default: as many as have work.
+        factors, forces: enable Simulator.factors (constants that differ between environments), Simulator.forces.
+        block: environments per vector of a CPU thread, 1, 8 or 16. Default: the fastest.
+        division: distribution of an environment over GPU threads. Default: the fastest.
+
+    Returns:
+        A gymnasium.vector.VectorEnv on torch tensors: observations (N, obs_dim), actions (N, nu) in [-1, 1], rewards
+        (N,). docs/tasks.md lists obs_dim, nu, rate and episode length of each task.
 
     Raises:
-        ValueError: an argument out of range, with what is allowed, or a kernel cache that cannot be written.
-        TypeError: an argument of another name.
+        ValueError: an argument out of range, with what is allowed; a kernel cache that cannot be written.
+        TypeError: an argument with an unknown name.
+        SceneError, TaskError: both ValueErrors: a robot or a task that cannot be simulated.
     """
-    if unknown := sorted(others.keys() - KEYWORDS):
-        raise TypeError(f"make has no argument {unknown[0]!r}: choose from {', '.join(sorted(KEYWORDS))}")
+    if unknown:
+        known = sorted(inspect.signature(make).parameters.keys() - {"unknown"})
+        raise TypeError(f"make has no argument {min(unknown)!r}: choose from {', '.join(known)}")
     device, dtype = check_device(device), check_dtype(dtype)
     kind = find_task(name)
     startup.check_kernel_cache()
@@ -113,9 +141,11 @@ def make(
         raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
     scene = scene.with_penalty(penalty or {})
     scene = scene if terrain is None else scene.with_terrain(terrain)
-    return DiffEnv(
-        task, scene, num_envs, integration=integration, seed=seed, horizon=horizon, device=device, dtype=dtype, **others
-    )
+    episodes: Any = dict(stochastic_init=stochastic_init, early_termination=early_termination)
+    episodes |= dict(max_episode_steps=max_episode_steps, adjoint_clip=adjoint_clip, render_mode=render_mode)
+    options: Any = dict(threads=threads, factors=factors, forces=forces, block=block, division=division)
+    options |= dict(integration=integration, device=device, dtype=dtype)
+    return DiffEnv(task, scene, num_envs, seed=seed, horizon=horizon, **episodes, **options)
 
 
 def _make_one(name: str, **arguments: Any) -> NumpyEnv:

@@ -10,18 +10,22 @@ import importlib
 import json
 import re
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from statistics import mean, median
 from typing import NamedTuple
 
 import pytest
+
+from diffsim import TASKS
+from tools import api
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 LOG = ROOT / "results" / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", LOG, *sorted((ROOT / "docs").glob("*.md"))]
 # Tables of these pages use the column names of the csv file that the text below them names.
-LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo", "sac", "mbpo", "pfpn", "humanoid_mtu", "experiments")
+LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo", "sac", "mbpo", "pfpn", "experiments")
 CHECKED = [README, *(ROOT / "docs" / f"{name}.md" for name in (*LEARNERS, "robustness"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CASES = json.loads((ROOT / "benchmarks" / "cases.json").read_text())
@@ -147,9 +151,113 @@ def test_tables_of_the_simulator_agree_with_their_files() -> None:
     assert checked
 
 
+def test_the_page_of_tasks_has_their_sizes() -> None:
+    shown: dict[str, list[str]] = {}
+    for table in tables(ROOT / "docs" / "tasks.md"):
+        if "observations" in table.header:
+            shown |= {name: cells for first, *cells in table.rows for name in first.split(", ")}
+    assert shown == {
+        name: [
+            *(str(task.obs_dim), str(task.load_robot().nu), f"{1 / task.control_dt:.0f}"),
+            *(str(task.substeps), task.contact, str(task.episode_length)),
+        ]
+        for name, task in TASKS.items()
+    }
+
+
+def test_the_page_of_the_api_is_that_of_the_docstrings() -> None:
+    assert api.PAGE.read_text() == api.page(), "python tools/api.py writes it"
+
+
 @each_page
 def test_no_spread_of_a_single_seed(page: Path) -> None:
     assert not re.search(r"±\s*0(?![.\d])", page.read_text()), "the spread of one run is not 0: print the seed count"
+
+
+# Where the numbers before it come from: <!-- =FILE:COLUMN:KEY=VALUE&KEY=VALUE:RULES -->. RULES are as many as the
+# numbers, joined by commas; " / " divides two such sources. FILE is in results/, or begins with diffsim/.
+MARK = re.compile(r"(.*?)<!-- =(.+?) -->")
+RULES: dict[str, Callable[[list[float]], float]] = {
+    **{"median": median, "mean": mean, "min": min, "max": max, "sum": sum, "count": len},
+    "percent": lambda values: 100 * median(values),
+    "milli": lambda values: 1000 * median(values),
+}
+
+
+def recompute(source: str) -> list[float]:
+    """What a mark asks for."""
+    if " / " in source:
+        above, below = map(recompute, source.split(" / "))
+        return [one / other for one, other in zip(above, below, strict=True)]
+    file, column, where, rules = source.split(":")
+    rows = read_csv(ROOT / file if file.startswith("diffsim/") else ROOT / "results" / file)
+    wanted = [part.split("=") for part in where.split("&") if part]
+    found = [row for row in rows if all(same(row[key], value) for key, value in wanted)]
+    values = [float(row[column].rstrip("%")) for row in found if row[column]]
+    assert values, f"{source}: no such rows"
+    return [RULES[rule](values) for rule in rules.split(",")]
+
+
+@each_page
+def test_marked_numbers_are_those_of_their_files(page: Path) -> None:
+    for before, source in MARK.findall(page.read_text()):
+        expected, shown = recompute(source), re.findall(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?", before)
+        assert len(shown) >= len(expected), f"{page.name}: no number before {source}"
+        for number, value in zip(shown[-len(expected) :], expected, strict=True):
+            unit = 10.0 ** -len(number.partition(".")[2])
+            off = abs(float(number.replace(",", "")) - value)
+            assert off <= 0.501 * unit, f"{page.name}: {number} is {value:.6g}, by {source}"
+
+
+# English --------------------------------------------------------------------------------------------------------------
+
+
+BANNED = {
+    r"live[sd]? from": "relies on",
+    r"for want of": "without",
+    r"but for": "except",
+    r"beside": "next to, compared with",
+    r"whole": "complete, without a fall",
+    r"alone": "only",
+    r"kept": "retained",
+    r"anew": "again",
+    r"hardly": "barely",
+    r"upon": "on",
+    r"else a": "otherwise",
+    r"nats to": "per step",
+    r", as (it|they|this|these|there|its|their)": "because, before its clause",
+    r"\]\([^)]*\) (has|have|says?|tells?)": "lists, shows, reports",
+    r"(the|this) (page|table|column) (has|says|tells)": "lists, shows, reports",
+    r"what (is lost|came of it|follows|is left)": "the thing's name",
+}
+REWRITTEN_LATER = set(
+    "bptt experiments gymnasium joystick mbpo numerics performance pfpn physics pods ppo robustness "
+    "sac sapo shac tracking transfer viewing".split()
+)
+READ = [page for page in (README, *sorted((ROOT / "docs").glob("*.md"))) if page.stem not in REWRITTEN_LATER]
+
+
+def paragraphs(page: Path) -> Iterator[str]:
+    """Prose: no code, formulas, tables, headings and comments. An item of a list is one."""
+    text = FENCE.sub("", page.read_text())
+    text = re.sub(r"`[^`\n]*`|<!--.*?-->|\$\$.*?\$\$|\$[^$\n]+\$", "x", text, flags=re.DOTALL)
+    text = re.sub(r"^(\||#).*$", "", text, flags=re.MULTILINE)
+    for part in re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", text):
+        if words := " ".join(part.split()):
+            yield words
+
+
+@pytest.mark.parametrize("page", READ, ids=lambda page: page.stem)
+def test_a_page_is_plain_english(page: Path) -> None:
+    for text in paragraphs(page):
+        for words, better in BANNED.items():
+            found = re.search(rf"(?<![\w-]){words}(?![\w-])", text, re.IGNORECASE)
+            assert not found, f"{page.name}: {found[0]!r}, rather: {better}; in: {text[:200]}"
+        assert text.count(";") <= 1, f"{page.name}: more than one semicolon in: {text[:200]}"
+        for sentence in re.split(r"(?<=[.!?]) (?=[A-Z])", text):
+            assert not re.match(r"Of (?!course)", sentence), f"{page.name}: a sentence that begins with Of: {sentence}"
+            never = re.search(r"\bnever\b", sentence) and not re.search(r"\d", sentence)
+            assert not never, f"{page.name}: never, without a count: {sentence}"
 
 
 # Links and files ------------------------------------------------------------------------------------------------------
@@ -185,7 +293,7 @@ def test_readme_is_short_and_begins_with_the_commands_of_a_fresh_machine() -> No
         "pip install -e . && python shac.py --env ant --seed 1",
         'pip install -e ".[test]" && pytest',
     ]
-    assert len(text.split()) <= 800
+    assert len(re.sub(r"<!--.*?-->|\|", " ", text).split()) <= 700
 
 
 def test_what_is_where_names_all_scripts_and_packages_once() -> None:
@@ -198,7 +306,8 @@ def test_what_is_where_names_all_scripts_and_packages_once() -> None:
 
 
 def test_readme_links_the_page_of_every_learner() -> None:
-    rows = re.findall(r"^\| .*\[(\w+)\]\(docs/(\w+)\.md\)", README.read_text(), re.MULTILINE)
+    lines = re.findall(r"^\| (\[.*)$", README.read_text(), re.MULTILINE)
+    rows = [link for line in lines for link in re.findall(r"\[(\w+)\]\(docs/(\w+)\.md\)", line)]
     learners = {path.stem for path in ROOT.glob("*.py")} - {"view"}
     assert {name for name, page in rows if name.startswith(page)} == learners
 

@@ -130,19 +130,23 @@ class Simulator:
 
     @property
     def nonfinite(self) -> torch.Tensor:
+        """(N,) bool: environments whose last step was not finite or out of bounds, and was undone. See the class."""
         bad = self._nonfinite[self._last]
         return bad if self._coarse is None else bad | self._coarse.nonfinite
 
     @property
     def residual(self) -> torch.Tensor:
+        """(N,) largest residual of Newton's method among the substeps of the last step; zeros on soft contact."""
         return self._end[:, self.nq + self.nv :][:, :1].sum(1)
 
     @property
     def passes(self) -> torch.Tensor:
+        """(N,) mean passes of Newton's method per substep of the last step; zeros on soft contact."""
         return self._end[:, self.nq + self.nv :][:, 1:].sum(1) / self.integration.substeps
 
     @property
     def factors(self) -> torch.Tensor:
+        """(N, 8) multipliers of constants, columns as in scene.FACTORS; (N, 0) without factors=True. See the class."""
         return self._factors
 
     @factors.setter
@@ -151,6 +155,7 @@ class Simulator:
 
     @property
     def forces(self) -> torch.Tensor:
+        """(N, nbody, 6) external force [N] and torque [N m] on each body, world axes; (N, 0, 6) without forces=True."""
         return self._forces
 
     @forces.setter

@@ -15,7 +15,7 @@ SETTLING = 1.0  # s at the start of an episode that are left out
 TOUCHING = 0.03  # a body that touches the ground in a smaller share of the frames is no foot
 BOUNCE = 0.05  # s; a foot that leaves the ground for no longer has not made a step
 END = 0.99  # of half its range, beyond which an action is saturated
-FOOT = "duty", "steps/s", "clearance (m)", "slip (m/s)", "depth (m)"  # docs/shac.md says what each is
+FOOT = "duty", "steps/s", "clearance (m)", "slip (m/s)", "depth (m)"  # docs/running.md says what each is
 ROBOT = "left-right", "diagonal", "action change", "saturated", "cost of transport"
 Gait = dict[str, dict[str, float]]  # those of each foot by its body's name, and of the "robot"
 

@@ -105,28 +105,6 @@ def test_pages_show_the_lines_of_the_cells() -> None:
     assert shown
 
 
-def test_readme_shows_medians_of_five_seeds_for_every_task() -> None:
-    if not history():
-        pytest.skip("the history is not here")
-    readme, cores = (tables.ROOT / "README.md").read_text(), paper.GROUPS["cores"]
-    args = paper.Args(output=common.RESULTS / "cpu")
-    lines = {(line["task"], line["learner"]): line for line in paper.table(args, "cores")}
-    shown = re.findall(r"^\| `(\w+)` \| \[?(\w+).*\| ([-\d,]+) \| (\d+) \|$", readme, re.MULTILINE)
-    assert cores.seeds == 5 and [task for task, *_ in shown] == [*cores.tasks]
-    for task, learner, value, seconds in shown:
-        line = lines[task, learner]
-        assert (f"{int(str(line['return']).split()[0]):,}", seconds) == (value, line["training (s)"])
-    headline = {(line["task"], line["learner"]): line for line in paper.table(args, "headline")}
-    ends = re.findall(r"`(\w+)` (?:ends )?at ([\d,]+) after (\d+) s", readme)
-    assert [task for task, *_ in ends] == ["hopper", "humanoid"]
-    for task, value, seconds in ends:
-        line = headline[task, "sapo"]
-        assert (f"{int(str(line['return']).split()[0]):,}", seconds) == (value, line["training (s)"])
-    (claimed,) = re.findall(r"^\*\*(\d+) seconds\*\* .* at (\d\.\d) m/s", readme, re.MULTILINE)
-    line = lines["humanoid", "sapo"]
-    assert claimed == (line["training (s)"], f"{float(str(line['speed'])):.1f}")
-
-
 def test_a_picture_has_the_curves_of_whole_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Seconds are of cells and groups that are timed and had their machine alone; all seeds of the group are drawn."""
     args = paper.Args(runs=tmp_path / "runs", output=tmp_path / "h200")

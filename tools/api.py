@@ -1,0 +1,59 @@
+"""Write docs/api.md, the public names of diffsim, from their docstrings: python tools/api.py"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import diffsim
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
+HEAD = """# API
+
+`python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. Errors of
+files and tasks (`SceneError`, `TaskError`) are `ValueError`s.
+"""
+NAMES = "make DiffEnv NumpyEnv NumpyVectorEnv Simulator Integration Task load_scene Scene read_clip Clip".split()
+INTERNAL = {*"pin carry_over take_statistics check_tensor rewind carrier inert drag check advance bind falls".split()}
+
+
+def signature(thing: object) -> str:
+    """The parameters without annotations and self, in lines of at most 100 characters."""
+    lines = [""]
+    for each in inspect.signature(thing).parameters.values():  # type: ignore[arg-type]
+        if each.name not in ("self", "cls", "unknown"):
+            star = "*" * (each.kind == each.VAR_POSITIONAL) + "**" * (each.kind == each.VAR_KEYWORD)
+            word = f"{star}{each.name}" + ("" if each.default is each.empty else f"={each.default!r}")
+            joined = f"{lines[-1]}, {word}".removeprefix(", ")
+            lines = [*lines, word] if len(joined) > 100 else [*lines[:-1], joined]
+    return ",\n    ".join(lines)
+
+
+def members(kind: type) -> Iterator[str]:
+    """A row for each public method or property that the class documents: its first sentence."""
+    for name, each in vars(kind).items():
+        each = getattr(each, "func", getattr(each, "__func__", each))
+        doc = each.__doc__ if inspect.isfunction(each) or isinstance(each, property) else None
+        if doc and not name.startswith("_") and name not in INTERNAL:
+            call = "" if isinstance(each, property) else re.sub(r"\s+", " ", f"({signature(each)})")
+            yield f"| `{name}{call}` | {re.split(r'(?<=[.:;]) ', ' '.join(doc.split()))[0].rstrip(':;')} |"
+
+
+def page() -> str:
+    """The text of the page. Classes have what help shows before and after their arguments."""
+    parts = [HEAD]
+    for name in NAMES:
+        thing, kind = getattr(diffsim, name), isinstance(getattr(diffsim, name), type)
+        doc = inspect.getdoc(thing) or ""
+        doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
+        call = "" if name in ("Scene", "Task") else f"({signature(thing)})"
+        parts.append(f"## {name}\n\n```python\ndiffsim.{name}{call}\n```\n\n```text\n{doc}\n```\n")
+        if kind and (rows := [*members(thing)]):
+            parts.append("\n".join(["| member | meaning |", "|---|---|", *rows]) + "\n")
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
