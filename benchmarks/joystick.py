@@ -8,12 +8,13 @@ over a second, from the command, after the first second. The joints are those of
 targets, and a motor the torque that the task's servo would have. Nothing else of the file is changed. The gait is that
 at 0.5 m/s forward; the change of actions that of all commands.
 
-Writes joystick.csv, a row for each policy and world, and with --update-results the tables of docs/joystick.md.
+Writes joystick.csv, a row for each policy and world, and with --update-results the tables of docs/joystick.md; with
+--race joystick_race.csv, of checkpoints that were copied beside their run's progress.csv while it trained.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -37,6 +38,8 @@ COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) 
 COMMANDS += [(0.0, 0.0, w) for w in TURNING] + [(v, 0.0, w) for v in (0.5, -0.5) for w in TURNING]
 WALK = COMMANDS.index((0.5, 0.0, 0.0))
 PUSHED_EVERY = 4.0  # s
+RACE = (0.1, 0.05)  # m/s, errors to which learners race
+PAGE = "joystick.md"
 Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # the first second does not count
 
 
@@ -49,6 +52,7 @@ class Args(common.CheckpointFlags):
     latency: Annotated[float, Range("from 0 to 40", lambda ms: 0 <= ms <= 40)] = 0.0  # ms by which actions come late
     push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
     seconds: Long = 20.0  # of an episode
+    race: bool = False  # checkpoints are those along the way of runs: seconds of training to an error
 
 
 def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array, Array, Array]:
@@ -86,6 +90,7 @@ def errors(velocities: Array, second: int) -> Array:
 def training(case: Case) -> dict[str, object]:
     """Where the policy was trained, for how long, and its last evaluation's return, of what its run says."""
     rows = tables.read_csv(case.path.parent / "progress.csv")
+    rows = [row for row in rows if int(row["iteration"]) <= case.saved.iteration]
     device = str(case.saved.args.get("device", "")).partition(":")[0]
     found: dict[str, object] = {"device": device, "return": ["", *numbers(rows, "eval_return")][-1]}
     return found | {"training s": float(rows[-1]["seconds"]) if rows else ""}
@@ -123,54 +128,104 @@ def walk(case: Case, qpos: Array, action: Array) -> dict[str, object]:
     return found | {"saturated": float(np.mean(np.abs(action) > gait.END))}
 
 
-def of_policies(rows: list[dict[str, str]]) -> Iterator[tuple[Row, list[dict[str, str]], list[dict[str, str]]]]:
-    """For each task, learner, machine and file: these, its rows, and those without disturbance at its friction."""
-    rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
-    rows.sort(key=lambda row: (row["task"], row["checkpoint"]))
-    for key, group in grouped(rows, "task", "learner", "machine", "file").items():
-        about = dict(zip(("task", "learner", "machine", "judged on"), key, strict=True))
-        yield about, group, [row for row in group if not disturbed(row) and float(row["friction"]) == 1]
+def worlds(row: dict[str, str]) -> list[str]:
+    """What a row's world differs in from the file's; by its friction alone, nothing but this."""
+    nominal = {"push": "pushes of {:g} m/s", "latency": "{:g} ms late", "mass": "mass x {:g}", "gains": "gains x {:g}"}
+    found = [
+        text.format(value)
+        for name, text in nominal.items()
+        if (value := float(row[name])) != (name in ("mass", "gains"))
+    ]
+    return found or [f"friction x {float(row['friction']):g}"]
 
 
-def disturbed(row: dict[str, str]) -> tuple[str, ...]:
-    """By what, besides friction."""
-    nominal = {"push": 0.0, "latency": 0.0, "mass": 1.0, "gains": 1.0}
-    return tuple(name for name, value in nominal.items() if float(row[name]) != value)
+def policies(rows: list[dict[str, str]]) -> dict[str, list[dict[str, str]]]:
+    """The rows of each task, learner and machine, by these; of other files than the task's, if there are any."""
+    rows = [row | {"by": row["learner"].partition(" ")[0], "on": row["checkpoint"].partition("/")[0]} for row in rows]
+    rows.sort(key=lambda row: (row["task"], row["by"], row["on"]))
+    rows = [row for row in rows if row["file"]] or rows
+    return {", ".join(key): group for key, group in grouped(rows, "task", "by", "on").items()}
+
+
+def with_worst(rows: list[dict[str, str]], column: str, form: str, worst: Callable[[Sequence[float]], float]) -> str:
+    """The median over seeds, in brackets the worst seed's."""
+    values = numbers(rows, column)
+    return f"{middle(rows, column, form)} ({worst(values):{form}})" if values else ""
+
+
+def undisturbed(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    return [row for row in rows if worlds(row) == ["friction x 1"]]
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task, learner and machine, over seeds: medians, and the worst command of the worst seed.
-
-    Errors are those without disturbance at the file's friction, and empty if only others were measured. Of whole
-    episodes it has the least: undisturbed, only pushed, and otherwise disturbed.
-    """
+    """A line for each task, learner and machine: how well it follows commands in the file's world."""
     lines = list[Row]()
-    for about, group, plain in of_policies(rows):
-        kinds: dict[str, list[dict[str, str]]] = {"whole": [], "pushed": [], "disturbed": []}
-        for row in group:
-            kinds[{(): "whole", ("push",): "pushed"}.get(disturbed(row), "disturbed")].append(row)
-        line = {"seeds": len({row["checkpoint"] for row in group}), "training (s)": middle(plain, "training s", ".0f")}
-        line |= {"error (m/s)": middle(plain, "error", ".3f"), "yaw (rad/s)": middle(plain, "yaw error", ".2f")}
-        line |= {"worst command": f"{max(numbers(plain, 'worst error')):.2f}" if plain else ""}
-        least = {name: f"{min(numbers(some, 'whole')):.0%}" if some else "" for name, some in kinds.items()}
-        lines.append({**about, **line, **least})
+    for policy, group in policies(rows).items():
+        plain = undisturbed(group)
+        line = {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
+        line |= {"training (s)": middle(plain, "training s", ".0f")}
+        errors = {"error (m/s)": "error", "worst command (m/s)": "worst error", "yaw rate (rad/s)": "yaw error"}
+        lines.append(line | {title: with_worst(plain, column, ".3f", max) for title, column in errors.items()})
     return lines
 
 
-def gaits(rows: list[dict[str, str]]) -> list[Row]:
-    """The gaits of the same policies, medians over seeds."""
-    forms = {"left-right": ".2f", "diagonal": ".2f", "clearance (m)": ".3f", "slip (m/s)": ".2f"}
-    forms |= {"action change": ".0%", "saturated": ".0%", "cost of transport": ".2f"}
+def whole(rows: list[dict[str, str]]) -> list[Row]:
+    """The share of episodes without a fall: a line for each world, a column for each task, learner and machine."""
+    lines: dict[str, dict[str, str]] = {}
+    for policy, group in policies(rows).items():
+        kinds: dict[str, list[dict[str, str]]] = {}
+        for row in group:
+            kinds.setdefault(" and ".join(found) if len(found := worlds(row)) < 3 else "all", []).append(row)
+        for kind, own in kinds.items():
+            lines.setdefault(kind, {})[policy] = with_worst(own, "whole", ".0%", min)
+    order = "friction", "pushes", "20", "mass", "gains", "all"
+    kinds_in_order = sorted(lines, key=lambda kind: [not kind.startswith(name) for name in order])
     return [
-        {**about, **{name: middle(plain, name, form) for name, form in forms.items()}}
-        for about, _, plain in of_policies(rows)
+        {"world": kind} | {policy: lines[kind].get(policy, "") for policy in policies(rows)} for kind in kinds_in_order
     ]
+
+
+GAIT: dict[str, tuple[str, Callable[[Sequence[float]], float]]] = {
+    "left-right": (".2f", max),
+    "diagonal": (".2f", max),
+    "clearance (m)": (".3f", min),
+    "slip (m/s)": (".2f", max),
+    "action change": (".0%", max),
+    "saturated": (".0%", max),
+    "cost of transport": (".2f", max),
+}
+
+
+def gaits(rows: list[dict[str, str]]) -> list[Row]:
+    """Gaits in the file's world: a line for each number, a column for each task, learner and machine."""
+    plain = {policy: undisturbed(group) for policy, group in policies(rows).items()}
+    return [
+        {"gait": name} | {policy: with_worst(own, name, *how) for policy, own in plain.items()}
+        for name, how in GAIT.items()
+    ]
+
+
+def race(rows: list[dict[str, str]]) -> list[Row]:
+    """Seconds of training to an error, from checkpoints along the way: a line for each task, learner and seed."""
+    lines = list[Row]()
+    for (task, learner, seed), group in grouped(rows, "task", "learner", "seed").items():
+        group.sort(key=lambda row: float(row["training s"]))
+        line: dict[str, object] = {"task": task, "learner": learner, "seed": seed}
+        for most in RACE:
+            reached = (row["training s"] for row in group if float(row["error"]) <= most and float(row["whole"]) == 1)
+            line[f"s to {most:g} m/s"] = next(reached, "")
+        lines.append(line | {"in all (s)": group[-1]["training s"], "last error (m/s)": group[-1]["error"]})
+    return lines
 
 
 def main(args: Args) -> None:
     key = (*ABOUT[:-1], "file", "friction", "push", "mass", "gains", "latency")
-    rows = measured(args, Part("joystick", measure, key, "joystick", "joystick.md", table))
-    args.publish("gaits", tables.markdown(gaits(rows)), "joystick.md")
+    if args.race:
+        measured(args, Part("joystick_race", measure, key, "race", PAGE, race))
+        return
+    rows = measured(args, Part("joystick", measure, key, "joystick", PAGE, table))
+    args.publish("whole", tables.markdown(whole(rows)), PAGE)
+    args.publish("gaits", tables.markdown(gaits(rows)), PAGE)
 
 
 if __name__ == "__main__":

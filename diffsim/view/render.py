@@ -28,7 +28,7 @@ GHOST = np.array([0.2, 0.6, 0.3, 0.35], dtype=np.float32)
 DRAWN_END, DRAWN_SIZE = 50.0, (5.0, 0.05)  # m: of an endless segment of a terrain; half width and half thickness
 SOFTWARE = "llvmpipe", "softpipe", "swrast"  # OpenGL that runs on the CPU
 VIDEO_SIZE = (480, 352)  # pixels; the encoder wants multiples of 16
-VIDEO_FPS = 30.0  # at most
+VIDEO_FPS = 30.0  # at least, of tasks with as many control steps
 LARGEST = 4096  # pixels of a side of a picture
 BLOCK = 16  # pixels; libx264 pads the sides of a picture to multiples of it
 # faststart: browsers begin to play before they have loaded all of it
@@ -190,13 +190,13 @@ def film(
     size: tuple[int, int] = VIDEO_SIZE,
     ghost: ArrayLike | None = None,
 ) -> Path:
-    """Film qpos (T, nq), ctrl (T, nu) and ghost (T, nq), a row per control step [s], at true speed with at most 30
-    frames/s.
+    """Film qpos (T, nq), ctrl (T, nu) and ghost (T, nq), a row per control step [s], at true speed: of every
+    k-th row, with the largest whole k that leaves 30 frames/s or more.
 
     See save_video; size is width and height in pixels.
     """
     check_video(path, size)
-    stride = max(1, math.ceil(1 / (VIDEO_FPS * control_dt) - 1e-6))
+    stride = max(1, math.floor(1 / (VIDEO_FPS * control_dt) + 1e-6))
     others = (itertools.repeat(None) if each is None else np.asarray(each)[::stride] for each in (ctrl, ghost))
     with Renderer(scene, *size) as renderer:
         rows = zip(np.asarray(qpos)[::stride], *others, strict=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import joystick
@@ -28,23 +29,69 @@ def test_errors_are_those_of_means_over_a_second() -> None:
     np.testing.assert_allclose([error, yaw], expected, atol=1e-12)
 
 
-def test_pushes_alone_have_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its errors, which are those without pushes, are empty until these are measured; its gait, too."""
-    flags, shown = [str(POLICIES / "go2.pt"), *"--seconds 5 --friction 1 --output".split(), str(tmp_path)], list[str]()
-    for more in ("--push 0.5", "--push 0", "--latency 20 --mass 1.15 --gains 0.8"):
-        joystick.main(parse(joystick.Args, None, [*flags, *more.split()]))
-        shown += [line for line in capsys.readouterr().out.splitlines() if line.startswith("| go2 ")]
-    pushed, calm, disturbed = read_csv(tmp_path / "joystick.csv")
-    assert shown[:2] == [
-        "| go2 | shac | policies |  | 1 |  |  |  |  |  | 100% |  |",
-        "| go2 | shac | policies |" + "  |" * 8,
+def judged(flags: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    joystick.main(
+        parse(joystick.Args, None, [*flags.split(), *"--seconds 5 --friction 1 --output".split(), str(folder)])
+    )
+    return capsys.readouterr().out
+
+
+def test_tables_have_worlds_and_gaits_of_each_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Errors and the gait are those without disturbance, and empty until these are measured."""
+    policy = str(POLICIES / "go2.pt")
+    shown = [
+        judged(f"{policy} {more}", tmp_path, capsys)
+        for more in ("--push 0.5", "--push 0", "--latency 20 --mass 1.15 --gains 0.8")
     ]
-    assert shown[2].endswith("| 100% | 100% |  |") and f"{float(calm['error']):.3f}" in shown[2]
-    assert f"| {float(calm['action change']):.0%} |" in shown[3] and shown[4].endswith("% | 100% | 100% |") is False
+    pushed, calm, disturbed = read_csv(tmp_path / "joystick.csv")
+    error = f"{float(calm['error']):.3f}"
+    assert "| go2, shac, policies | 1 |  |  |  |  |" in shown[0] and "| slip (m/s) |  |" in shown[0]
+    assert "| pushes of 0.5 m/s | 100% (100%) |" in shown[0] and "| friction" not in shown[0]
+    assert f"| go2, shac, policies | 1 |  | {error} ({error}) |" in shown[1]
+    change = f"{float(calm['action change']):.0%}"
+    assert f"| action change | {change} ({change}) |" in shown[1]
+    words = [line.split(" | ")[0] for line in shown[2].partition("| world")[2].splitlines()[2:5]]
+    assert words == ["| friction x 1", "| pushes of 0.5 m/s", "| all"]
     assert 0 < float(calm["error"]) < float(pushed["error"]) < 0.1
-    assert float(disturbed["error"]) != float(calm["error"]) and disturbed["latency"] == "20.0"
+    assert float(disturbed["error"]) != float(calm["error"]) and disturbed["latency"] == "20"
     for column, most in (("left-right", 0.5), ("clearance (m)", 0.2), ("slip (m/s)", 0.5), ("cost of transport", 5)):
         assert 0 <= float(calm[column]) < most
+
+
+def test_worlds_and_worst_seeds() -> None:
+    """Medians over seeds, and the worst; other files than the task's count alone."""
+    same = {"task": "g1", "learner": "sapo --symmetric", "friction": "1", "push": "0", "mass": "1", "gains": "1"}
+    same |= {"latency": "0", "file": "unitree_g1", "training s": "9", "yaw error": "0"}
+    rows = [
+        same | {"checkpoint": f"h100/{k}", "error": f"0.0{k}", "worst error": "1", "whole": f"0.{k}"} for k in (1, 2, 6)
+    ]
+    rows += [rows[0] | {"file": "", "error": "7"}, rows[0] | {"gains": "0.8", "whole": "0.3"}]
+    (line,) = joystick.table(rows)
+    assert line["policy"] == "g1, sapo, h100" and line["seeds"] == 3 and line["error (m/s)"] == "0.020 (0.060)"
+    assert joystick.whole(rows) == [
+        {"world": "friction x 1", "g1, sapo, h100": "20% (10%)"},
+        {"world": "gains x 0.8", "g1, sapo, h100": "30% (30%)"},
+    ]
+    named = same | {"push": "1.0", "latency": "20.0", "mass": "0.85", "gains": "1.2"}
+    assert joystick.worlds(named) == ["pushes of 1 m/s", "20 ms late", "mass x 0.85", "gains x 1.2"]
+
+
+def test_a_race_is_won_by_the_first_checkpoint_that_is_good_enough(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A checkpoint beside a progress.csv has the seconds of its own iteration; falls do not count as reached."""
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(POLICIES / "go2.pt", run / "at_600.pt")
+    (run / "progress.csv").write_text("iteration,seconds,eval_return\n1,5,\n600,77,\n601,99,\n")
+    out = judged(f"{run / 'at_600.pt'} --race", tmp_path, capsys)
+    (row,) = read_csv(tmp_path / "joystick_race.csv")
+    assert row["checkpoint"] == "run/at_600" and row["training s"] == "77"
+    assert "| go2 | shac --symmetric --randomise |" in out and "| 77 |" in out
+    later = [row | {"training s": "80", "error": "0.01"}, row | {"training s": "9", "error": "0.01", "whole": "0.9"}]
+    first = row | {"training s": "8", "error": "0.07"}
+    (line,) = joystick.race([*later, first])
+    assert line["s to 0.1 m/s"] == "8" and line["s to 0.05 m/s"] == "80" and line["in all (s)"] == "80"
 
 
 def test_what_cannot_be_judged(capsys: pytest.CaptureFixture[str]) -> None:

@@ -214,8 +214,8 @@ def test_a_gif_plays_at_true_speed(fps: float, kept: int, tmp_path: Path) -> Non
     assert abs(np.array(levels) / 2 / fps - starts).max() < 0.006
 
 
-def test_a_film_is_drawn_at_most_thirty_times_a_second(opengl: None, tmp_path: Path) -> None:
-    for dt, steps, frames, fps in ((1 / 60, 9, 5, 30.0), (1 / 50, 6, 3, 25.0), (1 / 25, 3, 3, 25.0)):
+def test_a_film_has_thirty_frames_a_second_or_more(opengl: None, tmp_path: Path) -> None:
+    for dt, steps, frames, fps in ((1 / 60, 9, 5, 30.0), (1 / 50, 6, 6, 50.0), (1 / 25, 3, 3, 25.0)):
         video, rate = read_mp4(film(tmp_path / "film.mp4", HOPPER, np.zeros((steps, 6)), dt, size=(32, 16)))
         assert len(video) == frames and rate == fps and video.shape[1:] == (16, 32, 3)
 
