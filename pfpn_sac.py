@@ -44,6 +44,7 @@ PER_TASK = {
 # fmt: on
 LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation of a component
 MAX_GRAD_NORM = 100.0  # sac_baseline.py's
+DENSITY = 0.01  # of an action, at least, in the implicit gradient
 
 
 @dataclass
@@ -56,6 +57,8 @@ class Args(ParallelFlags):
     """particles, or one Gaussian"""
     particles: Several = 35
     """particles of each action"""
+    estimator: Literal["straight-through", "implicit"] = "straight-through"
+    """gradient of a sampled action in the particles' weights: the paper's, or the one without bias"""
     resampling_interval: Count = 20
     """iterations between resamplings"""
     resampling_noise: NonNegative = 0.1
@@ -122,12 +125,15 @@ class Mixture:
         loc, scale = (x.expand_as(self.logits).gather(-1, index).squeeze(-1) for x in pair)
         return loc + scale * noise
 
-    def log_prob(self, u: Tensor) -> Tensor:
-        """log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
+    def log_density(self, u: Tensor) -> Tensor:
+        """Of each u by itself (..., m)."""
         rate = (-self.log_std).exp() * math.sqrt(0.5)
         z = torch.addcmul(-self.loc * rate, u.unsqueeze(-1), rate)
-        density = logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
-        return (density - log_slope(u)).sum(-1)
+        return logsumexp(self.log_weight - self.log_std - z.square()) - 0.5 * math.log(2 * math.pi)
+
+    def log_prob(self, u: Tensor) -> Tensor:
+        """log pi(a|s) (...) of the actions of u (..., m): Eq. 28, with the slope outside of the logarithm."""
+        return (self.log_density(u) - log_slope(u)).sum(-1)
 
 
 def log_slope(u: Tensor) -> Tensor:
@@ -222,6 +228,18 @@ def straight_through(mixture: Mixture) -> Tensor:
     return u + (gap * (x - x.detach())).sum(-1)
 
 
+def implicit(mixture: Mixture) -> Tensor:
+    """A sample whose gradient has no bias: its cumulative probability F(u) stays, so du = -dF / p(u).
+
+    Figurnov et al. 2018, https://arxiv.org/abs/1805.08498. Where hardly any action is drawn p has a floor.
+    """
+    u = mixture.sample().detach()
+    z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()
+    cumulative = (mixture.log_weight.exp() * torch.special.ndtr(z)).sum(-1)
+    density = torch.maximum(mixture.log_density(u).detach(), math.log(DENSITY) + log_slope(u)).exp()
+    return u - (cumulative - cumulative.detach()) / density
+
+
 # Resampling -----------------------------------------------------------------------------------------------------------
 
 
@@ -294,6 +312,8 @@ class SAC:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
+        estimator = straight_through if args.estimator == "straight-through" else implicit
+        self.sample = Mixture.sample if args.policy == "gaussian" else estimator
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
@@ -356,7 +376,7 @@ class SAC:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         mixture = self.actor(obs)
-        u = mixture.sample() if self.args.policy == "gaussian" else straight_through(mixture)
+        u = self.sample(mixture)
         density = mixture.log_prob(u)
         value = values(self.critics, obs, torch.tanh(u)).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()

@@ -56,7 +56,9 @@ def test_density_far_from_every_particle_is_finite_as_is_its_gradient(script: An
 
 
 @pytest.mark.parametrize(
-    "sample", [pfpn.Mixture.sample, pfpn_sac.Mixture.sample, pfpn_sac.straight_through], ids=["ppo", "sac", "gumbel"]
+    "sample",
+    [pfpn.Mixture.sample, pfpn_sac.Mixture.sample, pfpn_sac.straight_through, pfpn_sac.implicit],
+    ids=["ppo", "sac", "gumbel", "implicit"],
 )
 def test_draws_follow_the_density(sample: Callable[[Any], Tensor]) -> None:
     """Kolmogorov and Smirnov's distance of 100,000 draws of each action, which do not depend on each other."""
@@ -137,6 +139,29 @@ def test_straight_through_gradient() -> None:
     slope = (1 - action.square()).unsqueeze(-1) * hot
     torch.testing.assert_close(gradients[1:], (slope, slope * inputs[2].exp() * noise))
     torch.testing.assert_close(gradients[0].sum(-1), torch.zeros(M, dtype=torch.float64))
+
+
+def test_the_implicit_gradient_has_no_bias() -> None:
+    """Of the mean of a curved function of the action, against quadrature; the straight-through one points elsewhere."""
+    logits, loc, log_std = inputs = parameters()
+    torch.manual_seed(0)
+    grid = torch.linspace(-12, 12, 20_001, dtype=torch.float64)[:, None].expand(-1, M)
+    density = pfpn_sac.Mixture(*inputs).log_density(grid).exp()
+
+    def curved(u: Tensor) -> Tensor:
+        return torch.cos(4 * torch.tanh(u)).sum(-1)
+
+    exact = torch.autograd.grad((torch.cos(4 * torch.tanh(grid)) * density).sum() * 24 / 20_000, inputs)
+    cosines = {}
+    for sample in (pfpn_sac.implicit, pfpn_sac.straight_through):
+        drawn = sample(pfpn_sac.Mixture(logits.expand(400_000, M, N), loc, log_std))
+        found = torch.autograd.grad(curved(drawn).mean(), inputs)
+        cosines[sample] = [
+            torch.cosine_similarity(a.flatten(), b.flatten(), 0) for a, b in zip(exact, found, strict=True)
+        ]
+        if sample is pfpn_sac.implicit:
+            torch.testing.assert_close(found, exact, rtol=0.05, atol=0.01)
+    assert min(cosines[pfpn_sac.implicit]) > 0.995 and cosines[pfpn_sac.straight_through][0] < 0.8
 
 
 # Resampling -----------------------------------------------------------------------------------------------------------
