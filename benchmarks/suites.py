@@ -91,14 +91,14 @@ def line(suite: Suite, folder: Path) -> dict[str, object]:
 
 
 def table(suite: Suite, rows: Sequence[Cells]) -> list[Row]:
-    """A line for each cell."""
-    lines = list[Row]()
-    for (cell,), own in grouped(rows, "cell").items():
-        values = {title: (how, numbers(own, column)) for title, (how, column) in suite.table.items()}
-        lines.append(
-            {"case": cell} | {title: SHOW[how](found) if found else "" for title, (how, found) in values.items()}
-        )
-    return lines
+    """A line for each cell; cells "a at b" share the line of a, where the first column of each one is b."""
+    lines, found = dict[str, dict[str, object]](), grouped(rows, "cell")
+    for cell in (cell for cell in suite.cells if (cell,) in found):
+        values = {title: (how, numbers(found[(cell,)], column)) for title, (how, column) in suite.table.items()}
+        shown = {title: SHOW[how](own) if own else "" for title, (how, own) in values.items()}
+        name, _, at = cell.partition(" at ")
+        lines.setdefault(name, {"case": name}).update({at: next(iter(shown.values()))} if at else shown)
+    return [*lines.values()]
 
 
 def main(args: Args) -> None:
