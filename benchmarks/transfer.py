@@ -84,7 +84,9 @@ def in_mujoco(case: Case) -> dict[str, object]:
     env = case.env
     if "muscle" in env.scene.features:
         return {}
-    return summary(travel(case, MuJoCo(env.scene, env.num_envs, env.control_dt), env.episode_length), env)
+    exact = env.sim.integration.constrained
+    world = MuJoCo(env.scene, env.num_envs, env.control_dt, own_friction=exact)
+    return summary(travel(case, world, env.episode_length), env)
 
 
 def conditions(case: Case, args: Args) -> dict[str, World]:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffsim import DiffEnv, Scene, Simulator, load_scene
 from diffsim.sim.launcher import available_cores
-from diffsim.tasks import Task
+from diffsim.tasks import Imitation, Task
 from diffsim.training import fail
 from diffsim.training.evaluation import SEED
 
@@ -50,11 +50,13 @@ class Here:
 
 
 def mujoco_model(scene: Scene, control_dt: float, substeps: int | None = None) -> mujoco.MjModel:
-    """A scene's file as MuJoCo reads it, with the fewest steps of equal length that are no longer than the file's.
+    """A scene's file as MuJoCo reads it, with the fewest steps of equal length that are no longer than the file's. Of a
+    scene that is no file's, as a task may make one, its model.
 
     Given substeps of a control step, with those and elliptic cones: the law of --contact mujoco.
     """
-    model = mujoco.MjModel.from_xml_path(scene.path)
+    file = Path(scene.path).is_file()
+    model = mujoco.MjModel.from_xml_path(scene.path) if file else copy.copy(scene.mj_model)
     if substeps is not None:
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     model.opt.timestep = control_dt / (substeps or math.ceil(control_dt / model.opt.timestep - 1e-6))
@@ -254,7 +256,9 @@ def episodes(world: World, task: Task, policy: Callable[[Tensor], Tensor], start
 
 def in_double(env: DiffEnv) -> Task:
     """The environment's task in float64 on the CPU."""
-    return type(env.task)(dtype=torch.float64).bind(env.scene)
+    task = env.task
+    twin = type(task)(dtype=torch.float64, clip=task.clip) if isinstance(task, Imitation) else None
+    return (twin or type(task)(dtype=torch.float64)).bind(env.scene)
 
 
 def travel(case: Case, world: World, steps: int) -> Motion:

@@ -144,16 +144,19 @@ def _give_up(robot: Path, seconds: float) -> None:
     os._exit(1)
 
 
-def export(checkpoint: Positional[Path], output: Positional[Path], env: str | None = None) -> None:
+def export(
+    checkpoint: Positional[Path], output: Positional[Path], env: str | None = None, half: bool = False
+) -> None:
     """Write the policy of a checkpoint alone: OUTPUT.pt for this package, or OUTPUT.onnx for other programs.
 
     Args:
         env: file of the task, if it is your own and the output is .onnx: it is run.
+        half: of OUTPUT.pt, round the weights to 16 bits: half the size.
     """
     saved = load_policy(checkpoint)
     with render.whole_file(output) as part:
         if output.suffix == ".pt":
-            export_policy(checkpoint, part)
+            export_policy(checkpoint, part, half)
         elif output.suffix == ".onnx":
             export_onnx(saved, make_policy_env(saved, 1, env=env), part)
         else:

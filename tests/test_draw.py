@@ -58,11 +58,14 @@ def test_webp_plays_at_true_speed_for_ever(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one with a clock, both worlds above diagrams, and of one without, alone."""
+    """Of one with a clock, both worlds above diagrams, and of one without, alone; a clip."""
     monkeypatch.setattr(draw, "FIGURES", tmp_path)
     policies = Path(diffsim.__file__).parent / "policies"
     draw.films((policies / "go2.pt",), size=(96, 64))
     draw.films((policies / "ant.pt",), size=(96, 64), beside=False)
+    draw.films((policies / "g1_track.pt",), size=(96, 64))
+    with Image.open(tmp_path / "g1_track.webp") as dance:
+        assert dance.size == (2 * 96, 64) and dance.n_frames == 25 * draw.DANCE[1]  # type: ignore[attr-defined]
     with Image.open(tmp_path / "go2.webp") as both, Image.open(tmp_path / "ant_here.webp") as one:
         assert both.size == (2 * 96, 64 + 12 + 4 * draw.ROW) and one.size == (96, 64)
         cycles = both.n_frames * Go2.control_dt * Go2.robot.cycle  # type: ignore[attr-defined]

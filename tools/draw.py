@@ -8,7 +8,8 @@ A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own
 the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
 that it plays in a loop; a robot that falls or does not travel is shown from its start. Robots that follow commands go
 forward, above a diagram of the time in which each foot is on the ground (Hildebrand 1965). Muscles, which are not
-simulated in MuJoCo, are coloured by activation, as in the SHAC paper's Figure 5. The gait is that of the first of a few
+simulated in MuJoCo, are coloured by activation, as in the SHAC paper's Figure 5. What a robot tracks is drawn as a
+ghost. The gait is that of the first of a few
 random episodes that lasts long enough.
 """
 
@@ -28,6 +29,7 @@ from tyro.conf import Positional
 
 from diffsim import Scene
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
+from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.tasks.joystick import Joystick
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.gait import TOUCHING, contact_bodies, trace
@@ -48,8 +50,10 @@ CLOSER = {
     "humanoid_mtu": (1.2, 0.52),
     "go2": (1.3, 0.55),
     "g1": (1.4, 0.51),
+    "g1_track": (1.35, 0.5),
 }
 FLOOR, AROUND = 2.0, 2.8  # m after which the floor repeats; s that a robot with a clock takes for it, in whole cycles
+DANCE = 12.0, 6.0  # s of the clip that a film of tracking begins with, and how many it shows
 LEAST_FPS, QUALITY = 30.0, 45  # of a film; WebP's, of 100
 ROW, LABELS = 16, 56  # pixels of a foot's line in the diagram, and of its name
 INK, PAPER, PALE = (40, 46, 58), (255, 255, 255), (226, 230, 236)
@@ -61,9 +65,11 @@ class Motion(NamedTuple):
     qpos: NDArray[np.float64]  # (F, nq)
     action: NDArray[np.float64]  # (F, nu)
     fallen: bool  # by the end
+    ghost: NDArray[np.float64] | None = None  # (F, nq) what it tracks
 
     def part(self, begin: int, length: int | None = None) -> Motion:
-        return self._replace(qpos=self.qpos[begin:][:length], action=self.action[begin:][:length])
+        ghost = None if self.ghost is None else self.ghost[begin:][:length]
+        return self._replace(qpos=self.qpos[begin:][:length], action=self.action[begin:][:length], ghost=ghost)
 
 
 def films(
@@ -85,11 +91,17 @@ def films(
     for checkpoint in checkpoints or [POLICIES / f"{task}.pt" for task in CLOSER]:
         case = load_case(checkpoint, DEMO_EPISODES, "cpu")
         task, dt = case.env.task, case.env.control_dt
-        every = max(1, int(1 / (LEAST_FPS * dt) + 1e-6))
+        every, tracks = max(1, int(1 / (LEAST_FPS * dt) + 1e-6)), isinstance(task, Tracking)
         fps, clock = 1 / (every * dt), isinstance(task, Joystick)
         shortest, longest = (stride(task), stride(task)) if isinstance(task, Joystick) else seconds
+        if tracks:  # of the clip, from its beginning on
+            case.env.stochastic_init, every, fps = False, 2 * every, fps / 2
+            start, longest = DANCE
         sides = motions(case, round((start + longest + 2.0) / dt), every, beside)
-        if any(motion.fallen for motion in sides.values()) or not (clock or task.forward_column is not None):
+        if tracks:
+            sides = {name: motion.part(round(start * fps), round(longest * fps)) for name, motion in sides.items()}
+            pictures = {name: drawn(case, motion, size) for name, motion in sides.items()}
+        elif any(motion.fallen for motion in sides.values()) or not (clock or task.forward_column is not None):
             sides = {name: motion.part(0, round(3.5 * fps)) for name, motion in sides.items()}
             pictures = {name: drawn(case, motion, size) for name, motion in sides.items()}
         else:
@@ -116,7 +128,9 @@ def drawn(case: Case, motion: Motion, size: tuple[int, int]) -> list[Frame]:
     width, height, wide, high = *size, *(round(2 * zoom * side) for side in size)
     left, top = wide // 2 - width, round(middle * high) - height
     with Renderer(case.env.scene, wide, high) as renderer:
-        whole = map(renderer.draw, motion.qpos, motion.action)
+        ghosts = [None] * len(motion.qpos) if motion.ghost is None else motion.ghost
+        rows = zip(motion.qpos, motion.action, ghosts, strict=True)
+        whole = (renderer.draw(qpos, action, ghost=ghost) for qpos, action, ghost in rows)
         return [halve(frame[top : top + 2 * height, left : left + 2 * width]) for frame in whole]
 
 
@@ -142,7 +156,9 @@ def motions(case: Case, steps: int, every: int, beside: bool) -> dict[str, Motio
             returns = torch.stack([step.reward for step in taken]).masked_fill(fallen, 0.0).sum(0)
             episode = int(returns.median(0).indices)
         qpos, action = (torch.stack([getattr(x, part)[episode] for x in states]).numpy() for part in ("qpos", "action"))
-        found[name] = Motion(qpos, action, bool(fallen[-1, episode]))
+        tracked = task.ghost(torch.stack([x.memory[episode] for x in states]))
+        ghost = None if tracked is None else tracked.numpy()
+        found[name] = Motion(qpos, action, bool(fallen[-1, episode]), ghost)
     return found
 
 

@@ -20,7 +20,7 @@ from torch import nn
 from diffsim.env import DiffEnv
 from diffsim.robot.elements import control_range, servos
 from diffsim.tasks import FILE, TASKS
-from diffsim.tasks.imitation.clip import Clip
+from diffsim.tasks.imitation.clip import Clip, read_clip, shipped
 from diffsim.training.errors import fail
 from diffsim.training.layers import Both, First, Fold, Likeliest, ObsNormalizer
 
@@ -129,6 +129,8 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
             state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         form = state["format"]
         whole = whole and (form != FORMAT or state.keys() >= POLICY)
+        if whole and isinstance(name := state["args"].get("clip"), str):
+            state["args"]["clip"] = read_clip(shipped()[name])
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         whole = False
     if not whole:
@@ -156,9 +158,16 @@ def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
     return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))
 
 
-def export_policy(path: str | os.PathLike[str], output: Path) -> None:
-    """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB."""
+def export_policy(path: str | os.PathLike[str], output: Path, half: bool = False) -> None:
+    """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB.
+
+    A clip that comes with the package is kept by its name. half: weights are rounded to 16 bits.
+    """
     state = load(path)
+    if isinstance(clip := state["args"].get("clip"), Clip) and clip.name in shipped():
+        state["args"]["clip"] = clip.name if read_clip(clip.name) == clip else clip
+    if half:
+        state["policy"]["weights"] = {name: w.half() for name, w in state["policy"]["weights"].items()}
     _write(output, {name: value for name, value in state.items() if name in {"format", "simulator", *POLICY}})
 
 

@@ -258,6 +258,27 @@ def test_a_policy_that_tracks_takes_the_clip_as_an_input(tmp_path: Path) -> None
         env.step(wanted)
 
 
+@pytest.mark.parametrize("name", ["g1_jazz_walk", "a copy", "another"])
+def test_an_exported_policy_names_a_shipped_clip_and_may_have_16_bits(name: str, tmp_path: Path) -> None:
+    clip = diffsim.read_clip("g1_jazz_walk")
+    if name != "g1_jazz_walk":
+        clip = diffsim.Clip(name, clip.qpos, False)
+    torch.manual_seed(0)
+    policy = nn.Sequential(nn.Linear(224, 29))
+    args = {"env": "g1_track", "clip": clip}
+    save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": args, "iteration": 7})
+    sizes = []
+    for half in ([], ["--half"]):
+        command.main(["export", str(path), str(output := tmp_path / "policy.pt"), *half])
+        sizes.append(output.stat().st_size)
+        saved = load_policy(output)
+        assert saved.args["clip"] == clip
+        assert (output.stat().st_size < 50_000) == (name == "g1_jazz_walk")
+        wanted = policy[0].weight.half().float() if half else policy[0].weight
+        assert torch.equal(saved.network[0].weight, wanted)
+    assert sizes[0] - sizes[1] == pytest.approx(2 * (224 + 1) * 29, abs=200)
+
+
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_onnx_takes_only_what_the_actor_sees(symmetric: bool, tmp_path: Path) -> None:
     torch.manual_seed(0)

@@ -24,6 +24,7 @@ import torch
 from browser import Browser
 from learners import refusal
 
+import diffsim
 from diffsim import __main__ as command
 from diffsim import startup
 from diffsim.robot.mjcf import load_scene
@@ -202,6 +203,19 @@ def test_each_command_moves_the_robot_its_way() -> None:
         start = fly(pilot, 0.5, Wish())
         moved = fly(pilot, 0.5, Wish(pull=(1, *(start[:2] + (0, 3)), 0.3))) - start
         assert moved[1] > 0.2, "pulled to the left"
+
+
+def test_a_clip_is_played_from_its_beginning_beside_its_ghost_and_again_after_its_end() -> None:
+    env = diffsim.make("g1_track", 1, clip="g1_jazz_walk", forces=True)
+    bodies, pilot = env.scene.nbody, Pilot(env, lambda obs: torch.zeros(len(obs), 29))
+    assert env.memory[0, 0] == 0 and env.episode_length == int(env.task.motions[1])  # type: ignore[attr-defined]
+    picture = pilot.step([Wish()])
+    poses = np.frombuffer(base64.b64decode(picture["poses"]), "<f4").reshape(2, bodies, 7)
+    np.testing.assert_allclose(poses[0, 1:, :3], poses[1, 1:, :3], atol=0.05)
+    np.testing.assert_allclose(poses[1, 1, :3], env.task.reference(env.memory)[0][0, :3], atol=1e-5)  # type: ignore[attr-defined]
+    env.episode_step[:] = env.episode_length - 1
+    pilot.step([Wish()])
+    assert env.memory[0, 0] == 0 and env.episode_step == 0
 
 
 @pytest.mark.slow

@@ -115,6 +115,22 @@ def test_a_long_motion_keeps_fewer_frames() -> None:
     assert 1000 < motion["frames"] < 4000 and motion["frames"] * motion["dt"] == pytest.approx(4000 / 60, abs=0.1)
 
 
+def test_a_ghost_has_bodies_of_its_own() -> None:
+    scene = load_scene(ASSETS / "ant.xml")
+    qpos, ghost = np.tile(scene.mj_model.qpos0, (3, 1)), np.tile(scene.mj_model.qpos0, (5, 1))
+    ghost[:, 0] += 2.0
+    plain, both = web.describe(scene, qpos, 0.1), web.describe(scene, qpos, 0.1, None, ghost)
+    bodies, own = scene.nbody, len(plain["geoms"])
+    assert (both["robot"], both["bodies"], both["frames"]) == (bodies, 2 * bodies, 3)
+    assert both["geoms"][:own] == plain["geoms"] and both["track"] == plain["track"]
+    others = both["geoms"][own:]
+    assert [geom["body"] - bodies for geom in others] == [geom["body"] for geom in plain["geoms"] if geom["body"]]
+    assert all(0 < geom["rgba"][3] < 1 for geom in others)
+    poses = numbers(both["poses"], "<f4").reshape(3, 2 * bodies, 7)
+    np.testing.assert_array_equal(poses[:, :bodies], numbers(plain["poses"], "<f4").reshape(3, bodies, 7))
+    np.testing.assert_allclose(poses[:, bodies + 1 :, 0], poses[:, 1:bodies, 0] + 2.0, atol=1e-6)
+
+
 def motion_of_model(model: mujoco.MjModel, *profiles: np.ndarray, qpos: Any = None) -> dict[str, Any]:
     scene: Any = SimpleNamespace(mj_model=model, terrain=profiles or None)
     return web.describe(scene, [model.qpos0 if qpos is None else qpos], 0.1)
