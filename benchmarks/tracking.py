@@ -94,20 +94,24 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each clip, learner and machine, over seeds: medians. `success` is on the file's friction, the others
-    are least shares over seeds and frictions, without and with pushes; errors are those on the file's friction."""
+    """A line for each clip, learner and machine, over seeds: medians on the file's friction. In brackets and of pushes
+    the least share over seeds and frictions."""
     rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
     lines = list[Row]()
-    for (clip, learner, machine, file), group in grouped(rows, "clip", "learner", "machine", "file").items():
+    for (clip, learner, machine), group in grouped(rows, "clip", "learner", "machine").items():
+        name, drawn, _ = learner.partition(" --randomise")
+        policy = f"{clip}, {name}, {machine}{'' if drawn else ', not randomised'}"
         calm = [row for row in group if float(row["push"]) == 0]
         plain = [row for row in calm if float(row["friction"]) == 1]
-        pushed = numbers([row for row in group if float(row["push"]) > 0], "success")
-        least = numbers(calm, "success")
+        least, pushed = (
+            min(numbers(part, "success"), default=None)
+            for part in (calm, [row for row in group if float(row["push"]) > 0])
+        )
         lines.append(
-            {"clip": clip, "learner": learner, "machine": machine, "seeds": len({row["checkpoint"] for row in group})}
-            | {"training (s)": middle(plain, "training s", ".0f"), "judged on": file}
-            | {"success": middle(plain, "success", ".0%"), "least": f"{min(least):.0%}" if least else ""}
-            | {"least, pushed": f"{min(pushed):.0%}" if pushed else ""}
+            {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
+            | {"training (s)": middle(plain, "training s", ".0f")}
+            | {"success": f"{middle(plain, 'success', '.0%')}{'' if least is None else f' ({least:.0%})'}"}
+            | {"pushed": "" if pushed is None else f"{pushed:.0%}"}
             | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
         )
     return lines

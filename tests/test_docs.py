@@ -232,7 +232,7 @@ BANNED = {
 }
 REWRITTEN_LATER = set(
     "bptt experiments gymnasium joystick mbpo numerics performance pfpn physics pods ppo robustness "
-    "sac sapo shac tracking transfer viewing".split()
+    "sac sapo shac transfer viewing".split()
 )
 READ = [page for page in (README, *sorted((ROOT / "docs").glob("*.md"))) if page.stem not in REWRITTEN_LATER]
 
