@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from diffsim import DiffEnv
 from diffsim.tasks import find_task
-from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED, VIDEO_SECONDS, gait_lines
 from diffsim.view import render, web
@@ -112,17 +111,12 @@ def show(args: Args) -> None:
     print(f"{task}, {name}, {args.episodes} episodes: {evaluation}")
     if feet := evaluation.gait():
         print(gait_lines(feet))
-    qpos, action = evaluation.median_episode(args.seconds)
+    (qpos, action), ghost = evaluation.median_episode(args.seconds), evaluation.median_ghost()
     if args.video:
-        ghost = None
-        if isinstance(env.task, Tracking):  # the reference, from where the episode has started
-            env.reset(seed=args.seed)
-            memory = env.memory[evaluation.median].expand(len(qpos), -1)
-            ghost = env.task.reference(memory, torch.arange(len(qpos)))[0].numpy()
         print(f"video: {render.film(args.video, env.scene, qpos, env.control_dt, action, args.size, ghost)}")
     if args.web:
         caption = f"{name}\nreturn {evaluation.returns.median():.1f}"
-        print(f"page: {web.write_page(args.web, env.scene, qpos, env.control_dt, action, task, caption)}")
+        print(f"page: {web.write_page(args.web, env.scene, qpos, env.control_dt, action, task, caption, ghost)}")
 
 
 @torch.no_grad()

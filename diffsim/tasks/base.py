@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, TypeAlias
 import mujoco
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
@@ -232,6 +232,15 @@ class Task:
             noise: (..., num_noise) uniform in [0, 1).
         """
         return memory
+
+    def ghost(self, memory: Tensor) -> Tensor | None:
+        """qpos (..., nq) of what the robot is to track, which films and pages draw beside it; None if there is none."""
+        return None
+
+    def program(self, policy: nn.Module, columns: int) -> tuple[nn.Module, dict[str, tuple[int, ...]], list[str]]:
+        """What `export` writes as ONNX of a policy of observations (batch, columns): a module, its inputs' names and
+        shapes without the batch, and its outputs' names."""
+        return policy, {"observation": (columns,)}, ["action"]
 
     def metadata(self) -> dict[str, str]:
         """What a program needs to know of the task that runs its policy, for `export`."""

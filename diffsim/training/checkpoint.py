@@ -165,7 +165,8 @@ def export_policy(path: str | os.PathLike[str], output: Path) -> None:
 def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
     """Write the policy as ONNX, "observation" (batch, n) -> "action" (batch, nu), clipped to [-1, 1] as env does.
 
-    n is how many columns the policy sees (Task.actor_dim). `describe` says what all the numbers are.
+    n is how many columns the policy sees (Task.actor_dim). Some tasks have other inputs, see Task.program. `describe`
+    says what all the numbers are.
     """
     try:
         import onnx
@@ -177,22 +178,26 @@ def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
         case [ObsNormalizer() as whole, First(columns=n), *others]:
             layers = [normalizer := ObsNormalizer(n), *others]
             normalizer.mean, normalizer.std = whole.mean[:n], whole.std[:n]
-    policy = nn.Sequential(*layers, nn.Hardtanh()).eval(), (torch.zeros(2, n),)
-    names: dict[str, Any] = dict(input_names=["observation"], output_names=["action"], verbose=False)
+    module, shapes, outputs = env.task.program(nn.Sequential(*layers, nn.Hardtanh()), n)
+    policy = module.eval(), tuple(torch.zeros(2, *shape) for shape in shapes.values())
+    names: dict[str, Any] = dict(input_names=[*shapes], output_names=outputs, verbose=False)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that there is no torchvision
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch, about its own code
-        batch = {0: torch.export.Dim("batch")}
-        program: Any = torch.onnx.export(*policy, dynamo=True, dynamic_shapes=(batch,), **names)
+        batch = ({0: torch.export.Dim("batch")},) * len(shapes)
+        # Its optimizer takes the tiny number that keeps a root from 0 for 0.
+        program: Any = torch.onnx.export(*policy, dynamo=True, dynamic_shapes=batch, optimize=False, **names)
     model = program.model_proto
     for node in model.graph.node:
         del node.metadata_props[:]  # paths of this machine
-    onnx.helper.set_model_props(model, describe(saved, env, n))
+    onnx.helper.set_model_props(model, describe(saved, env, sum(shapes.get("observation", ()))))
     output.write_bytes(model.SerializeToString())
 
 
 def describe(saved: SavedPolicy, env: DiffEnv, columns: int) -> dict[str, str]:
-    """What a program needs to know that runs the policy, as an ONNX file's metadata; columns are those that it sees.
+    """What a program needs to know that runs the policy, as an ONNX file's metadata.
+
+    columns are those of the observation that it sees, 0 if it takes none.
 
     Keys and formats are mjlab's where it has one: lists are separated by commas, and joints are in the action's order.
     What does not hold for a task is left out.
@@ -202,14 +207,15 @@ def describe(saved: SavedPolicy, env: DiffEnv, columns: int) -> dict[str, str]:
     controls = zip(range(m.nu), low, high, strict=True)
     told = dict(task=task.name, script=saved.script, iteration=str(saved.iteration), control_dt=str(env.control_dt))
     told["actuators"] = joined(f"{m.actuator(a).name or a}[{least:.9g}:{most:.9g}]" for a, least, most in controls)
-    if task.obs_parts:
+    if task.obs_parts and columns:
         seen = Counter([name for name, size in task.obs_parts for _ in range(size)][:columns])
         told |= dict(observation_names=joined(seen), observation_sizes=joined(seen.values()))
     if (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT).all():
         told["joint_names"] = joined(m.joint(j).name for j in m.actuator_trnid[:, 0])
-        if servos(m).all() and (m.actuator_gear[:, 0] == 1).all():  # target = default_joint_pos + action_scale * action
+        if servos(m).all() and (m.actuator_gear[:, 0] == 1).all():
             told |= dict(joint_stiffness=joined(m.actuator_gainprm[:, 0]))
             told |= dict(joint_damping=joined(0.0 - m.actuator_biasprm[:, 2]))
+        if "joint_stiffness" in told and columns:  # target = default_joint_pos + action_scale * action
             told |= dict(default_joint_pos=joined((low + high) / 2), action_scale=joined((high - low) / 2))
     return told | task.metadata()
 

@@ -50,6 +50,7 @@ class Evaluation:
     scene: Scene  # to draw the episodes; of several terrains episode i has number i % M
     control_dt: float  # s
     others: dict[str, float] = field(default_factory=dict)  # what else a script measured, by name
+    ghost: Tensor | None = None  # (T, n, nq) what was to be tracked, before each step; see Task.ghost
 
     @property
     def length(self) -> float:
@@ -93,6 +94,10 @@ class Evaluation:
         steps = max(1, round(min(len(qpos), seconds / self.control_dt)))
         return qpos[:steps], action[:steps]
 
+    def median_ghost(self) -> NDArray[np.float32] | None:
+        """(T, nq) what the episode of median return was to track, if anything."""
+        return None if self.ghost is None else self.ghost[:, self.median].numpy(force=True)
+
     def episode(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """qpos (T, nq) and action (T, nu) of all steps of an episode."""
         steps = int(self.lengths[number])
@@ -113,7 +118,7 @@ class Evaluation:
         (qpos, action), scene = self.median_episode(seconds), self.scene
         if scene.terrain is not None:
             scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])
-        return render.film(path, scene, qpos, self.control_dt, action)
+        return render.film(path, scene, qpos, self.control_dt, action, ghost=self.median_ghost())
 
 
 def gait_lines(parts: gait.Gait) -> str:
@@ -136,9 +141,11 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
     obs, _ = env.reset(seed=seed)
     alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     returns, lengths = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long)
-    qpos, actions = [], []
+    qpos, actions, ghosts = [], [], []
     while alive.any():
         qpos.append(env.qpos)
+        if (ghost := env.task.ghost(env.memory)) is not None:
+            ghosts.append(ghost)
         actions.append(policy(obs))
         obs, reward, terminated, truncated, _ = env.step(actions[-1])
         returns += torch.where(alive, reward, torch.zeros_like(reward))
@@ -151,7 +158,8 @@ def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED)
         speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
     missed = env.sim.unconverged.sum().item()
     others = {"unconverged": missed} if missed else {}  # control steps, of Newton's method
-    return Evaluation(returns, lengths, speed, path, torch.stack(actions), env.scene, env.control_dt, others)
+    about, followed = (env.scene, env.control_dt, others), torch.stack(ghosts) if ghosts else None
+    return Evaluation(returns, lengths, speed, path, torch.stack(actions), *about, followed)
 
 
 def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:

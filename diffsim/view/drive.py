@@ -30,12 +30,14 @@ from torch import Tensor
 
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Array
+from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.tasks.joystick import Joystick
 from diffsim.tasks.locomotion import Locomotion
 from diffsim.view import web
 
 KEYS = {  # of the tasks that can be driven
     Joystick: "arrows or gamepad: walk, turn · Q, E: sideways · shift + drag: pull · enter: start anew",
+    Tracking: "shift + drag: pull · enter: start anew",
     Locomotion: "left, right or gamepad: turn · shift + drag: pull · enter: start anew",
 }
 TURN = 0.3  # rad/s by which a key turns the way of a robot that otherwise runs straight on; at 1 rad/s the ant falls
@@ -67,12 +69,14 @@ class Pilot:
     """A policy that acts on one environment, made with forces, as it is commanded.
 
     A policy of Joystick gets the command that it was trained for. One of Locomotion, which runs along x, gets the state
-    as it looks from a frame that a command turns.
+    as it looks from a frame that a command turns. One of Tracking plays its clip again and again.
     """
 
     def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> None:
         self.env, self._policy = env, policy
         env.episode_length = 2**62  # until the robot falls
+        if isinstance(env.task, Tracking):
+            env.stochastic_init, env.episode_length = False, int(env.task.motions[1][0])
         self._mass, self._places = float(env.scene.mj_model.body_mass.sum()), np.zeros((env.scene.nbody, 3))
         self.restart()
 
@@ -87,7 +91,7 @@ class Pilot:
         env.sim.forces = torch.as_tensor(self._forces(wishes), dtype=env.dtype)[None]
         action = self._action = self._policy(self._see(move)).clamp(-1.0, 1.0)
         _, _, terminated, truncated, _ = env.step(action)
-        poses, track = web.poses(env.scene.mj_model, env.qpos.double().numpy())
+        poses, track = web.poses(env.scene.mj_model, *shown(env))
         self._places = poses[0, :, :3]
         if bool(terminated | truncated):
             self._heading, self._action = 0.0, torch.zeros_like(self._action)
@@ -98,18 +102,25 @@ class Pilot:
         if isinstance(task, Joystick):
             command = torch.as_tensor(move * task.robot.command, dtype=env.dtype)[None]
             env.memory = torch.cat((command, env.memory[:, 3:]), dim=1)
+        if not isinstance(task, Locomotion):
             return env.observe(env.qpos, env.qvel, self._action)
         self._heading += TURN * float(move[2]) * env.control_dt
         return task.observe(*turned(-self._heading, env.qpos, env.qvel), self._action)
 
     def _forces(self, wishes: Sequence[Wish]) -> Array:
         """(nbody, 6) of all pulls, as Simulator.forces has them."""
-        forces = np.zeros((len(self._places), 6))
+        forces = np.zeros((self.env.scene.nbody, 6))
         for body, *point in (wish.pull for wish in wishes if wish.pull):
             way = point - self._places[int(body)]
             strength = min(STIFFNESS, MAX_PULL / max(float(np.linalg.norm(way)), 1e-9))
             forces[int(body), :3] += self._mass * strength * way
         return forces
+
+
+def shown(env: DiffEnv) -> list[Array]:
+    """qpos (1, nq) of the robot, and that of a ghost if there is one."""
+    states = env.qpos, env.task.ghost(env.memory)
+    return [state.double().numpy() for state in states if state is not None]
 
 
 def turned(angle: float, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
@@ -239,7 +250,8 @@ def serve(env: DiffEnv, policy: Callable[[Tensor], Tensor], caption: str, host: 
         OSError: nothing can listen at host and port, in one line.
     """
     stage, scene, name, restarts, due = Stage(), env.scene, env.task.name, 0, 0.0
-    motion = web.describe(scene, np.repeat(env.qpos.numpy(), 2, 0), env.control_dt)
+    qpos, *ghost = (np.repeat(state, 2, 0) for state in shown(env))
+    motion = web.describe(scene, qpos, env.control_dt, None, *ghost)
     motion["live"] = next(text for kind, text in KEYS.items() if isinstance(env.task, kind))
     try:
         page = web.fill_page(motion, name, caption).encode()

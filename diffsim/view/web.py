@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffsim.robot.scene import Scene
-from diffsim.view.render import activations, orbit, whole_file
+from diffsim.view.render import GHOST, activations, orbit, whole_file
 
 MAX_BYTES = 700_000  # of poses; a longer motion keeps every second control step, or fewer
 MESH_BYTES = 1_500_000  # of meshes; vertices of finer ones are merged
@@ -33,8 +33,10 @@ def write_page(
     ctrl: ArrayLike | None = None,
     title: str = "",
     caption: str = "",
+    ghost: ArrayLike | None = None,
 ) -> Path:
-    """Write a page that plays qpos (T, nq), with muscles coloured by ctrl (T, nu) in [-1, 1]; returns the file.
+    """Write a page that plays qpos (T, nq), with muscles coloured by ctrl (T, nu) in [-1, 1], and a transparent ghost
+    (T or more, nq); returns the file.
 
     A row is a control step of control_dt [s]; the path ends in .html. The page says title and caption, which may have
     several lines. Muscles are drawn straight from point to point, terrain as the first environment has it.
@@ -46,7 +48,7 @@ def write_page(
     path = Path(path)
     if path.suffix != ".html":
         raise ValueError(f"a page ends in .html, not {path.suffix!r}")
-    page = fill_page(describe(scene, qpos, control_dt, ctrl), title, caption)
+    page = fill_page(describe(scene, qpos, control_dt, ctrl, ghost), title, caption)
     with whole_file(path) as part:
         part.write_text(page, encoding="utf-8")
     return path
@@ -60,10 +62,14 @@ def fill_page(motion: dict[str, Any], title: str, caption: str) -> str:
     return re.sub(r"\$(title|caption|motion)\b", lambda name: parts[name[1]], page)
 
 
-def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike | None = None) -> dict[str, Any]:
+def describe(
+    scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike | None = None, ghost: ArrayLike | None = None
+) -> dict[str, Any]:
     """What the page draws: shapes once, and of every frame the pose of each body and the activation of each muscle."""
     model, qpos = scene.mj_model, np.asarray(qpos, dtype=np.float64)
-    stride = 1 + len(qpos) * model.nbody * 28 // MAX_BYTES
+    shown = [qpos] if ghost is None else [qpos, np.asarray(ghost, dtype=np.float64)[: len(qpos)]]
+    bodies = len(shown) * model.nbody
+    stride = 1 + len(qpos) * bodies * 28 // MAX_BYTES
     relaxed = np.full((len(qpos), model.nu), -1.0)
     ctrl = (relaxed if ctrl is None else np.asarray(ctrl))[::stride]
     planes, painted = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, model.geom_matid >= 0
@@ -80,6 +86,9 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
             geoms.append(geom | {"type": "mesh", "mesh": [*surfaces].index(key)})
         else:
             geoms.append(geom | {"type": kind.name.removeprefix("mjGEOM_").lower()})
+    if ghost is not None:
+        moving, colour = [geom for geom in geoms if geom["body"]], {"rgba": _rounded(GHOST)}
+        geoms += [geom | colour | {"body": geom["body"] + model.nbody} for geom in moving]
     ground = None
     if scene.terrain is not None:
         ground = [_rounded(vertex) for vertex in scene.terrain[0]]
@@ -88,13 +97,14 @@ def describe(scene: Scene, qpos: ArrayLike, control_dt: float, ctrl: ArrayLike |
     return {
         "dt": stride * control_dt,
         "frames": len(ctrl),
-        "bodies": model.nbody,
+        "bodies": bodies,
+        "robot": model.nbody,  # bodies, before those of the ghost
         "ground": ground,  # a profile (K, 2) of x and z, whose first and last segment go on for ever
         "geoms": geoms,
         "meshes": _meshes([*surfaces.values()]),
         "muscles": [_muscle(model, tendon) for tendon in activations(model, ctrl)[0]],
         "camera": orbit(model),
-        **encode(model, *poses(model, qpos[::stride]), ctrl),
+        **encode(model, *poses(model, *(each[::stride] for each in shown)), ctrl),
     }
 
 
@@ -108,20 +118,21 @@ def encode(model: mujoco.MjModel, poses: Array, track: Array, ctrl: Array) -> di
     }
 
 
-def poses(model: mujoco.MjModel, qpos: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poses(model: mujoco.MjModel, qpos: Array, ghost: Array | None = None) -> tuple[Array, Array]:
     """(T, nbody, 7) position and quaternion wxyz of each body, and (T, 3) what the camera follows.
 
     That is the centre of mass of the body that carries the camera, at its mean height, so that the picture keeps still.
+    The bodies of a ghost follow the robot's.
     """
     data, carrier = mujoco.MjData(model), model.cam_bodyid[0] if model.ncam else min(1, model.nbody - 1)
-    poses, track = np.empty((len(qpos), model.nbody, 7)), np.empty((len(qpos), 3))
+    places, track = np.empty((len(qpos), model.nbody, 7)), np.empty((len(qpos), 3))
     for t, row in enumerate(qpos):
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        poses[t, :, :3], poses[t, :, 3:], track[t] = data.xpos, data.xquat, data.subtree_com[carrier]
+        places[t, :, :3], places[t, :, 3:], track[t] = data.xpos, data.xquat, data.subtree_com[carrier]
     track[:, 2] = track[:, 2].mean()
-    return poses, track
+    return places if ghost is None else np.concatenate((places, poses(model, ghost)[0]), 1), track
 
 
 def _surface(model: mujoco.MjModel, is_field: bool, number: int) -> tuple[Array, Array]:

@@ -228,6 +228,36 @@ def test_the_shipped_ant_as_onnx(tmp_path: Path) -> None:
     }
 
 
+def test_a_policy_that_tracks_takes_the_clip_as_an_input(tmp_path: Path) -> None:
+    """At the start of an episode, where nothing is off, and somewhat later."""
+    torch.manual_seed(0)
+    env = diffsim.make("g1_track", 3, seed=0, clip="g1_jazz_walk")
+    args = parse(shac.Args, "--env g1_track --device cpu --actor-hidden 16 --clip g1_jazz_walk".split())
+    policy = shac.Actor(args, env.task.obs_dim, 29).deterministic()
+    kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
+    save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": kept, "iteration": 7})
+    model, told = export(path, tmp_path / "policy.onnx")
+    assert [each.name for each in model.graph.output] == ["action", "joint_targets"]
+    assert told["clip_name"] == "g1_jazz_walk" and told["reference_frames"] == "0,1,2,3"
+    assert "action_scale" not in told and "observation_names" not in told and "joint_stiffness" in told
+    from onnx.reference import ReferenceEvaluator
+
+    evaluator, names = ReferenceEvaluator(model), [each.name for each in model.graph.input]
+    low, high = torch.from_numpy(env.scene.mj_model.actuator_ctrlrange).float().T
+    for _ in range(3):
+        qpos, qvel, memory = env.qpos, env.qvel, env.memory
+        frames = torch.stack([env.task.reference(memory, k)[0] for k in range(4)], 1)  # type: ignore[attr-defined]
+        last, before, speed = memory[:, 1:30], memory[:, 30:59], env.task.reference(memory)[1]  # type: ignore[attr-defined]
+        parts = dict(zip(names, (qpos, qvel, last, before, frames, speed), strict=True))
+        action, targets = evaluator.run(None, {name: part.numpy() for name, part in parts.items()})
+        with torch.no_grad():
+            wanted = policy(env.observe(qpos, qvel, last)).clamp(-1, 1)
+        torch.testing.assert_close(torch.from_numpy(action), wanted, rtol=0, atol=1e-5)
+        told_servos = (low + high + (high - low) * env.task.disturb(qvel, wanted, memory)[1]) / 2
+        torch.testing.assert_close(torch.from_numpy(targets), told_servos, rtol=0, atol=1e-5)
+        env.step(wanted)
+
+
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_onnx_takes_only_what_the_actor_sees(symmetric: bool, tmp_path: Path) -> None:
     torch.manual_seed(0)

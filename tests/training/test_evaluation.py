@@ -91,7 +91,7 @@ def test_the_video_is_of_the_median_episode(
 ) -> None:
     filmed = []
 
-    def film(path: Path, scene: diffsim.Scene, qpos: np.ndarray, dt: float, ctrl: np.ndarray) -> Path:
+    def film(path: Path, scene: diffsim.Scene, qpos: np.ndarray, dt: float, ctrl: np.ndarray, ghost: None) -> Path:
         filmed.append((scene, qpos, dt, ctrl))
         return path
 

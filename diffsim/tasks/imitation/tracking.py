@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
@@ -138,20 +138,49 @@ class Tracking(Imitation):
         qvel = torch.cat((qvel[..., :2] + memory[..., -2:], qvel[..., 2:]), dim=-1)
         return qvel, ((target - middle) / half).clamp(-1.0, 1.0)
 
+    def program(self, policy: nn.Module, columns: int) -> tuple[nn.Module, dict[str, tuple[int, ...]], list[str]]:
+        """See Task: the clip is an input, its frames from now on until AHEAD."""
+        n = self.joints
+        shapes: dict[str, tuple[int, ...]] = {
+            "qpos": (7 + n,),
+            "qvel": (6 + n,),
+            "last_action": (n,),
+            "action_before": (n,),
+        }
+        shapes |= {"reference_qpos": (1 + AHEAD, 7 + n), "reference_qvel": (6 + n,)}
+        return Program(self, policy), shapes, ["action", "joint_targets"]
+
     def reference(self, memory: Tensor, ahead: int | Tensor = 0) -> tuple[Tensor, Tensor]:
         """qpos (..., nq) and qvel (..., nv) of the clip, now or so many frames later, be it (...) int64."""
         step = memory[..., 0].long()
         step = torch.minimum(step + ahead, self._ends[step])
         return self._qpos[step], self._qvel[step]
 
+    def ghost(self, memory: Tensor) -> Tensor:
+        return self.reference(memory)[0]
+
+    def metadata(self) -> dict[str, str]:
+        """See Task; the frames of reference_qpos are so many control steps ahead."""
+        return dict(clip_name=str(self.clip), reference_frames=",".join(map(str, range(1 + AHEAD))))
+
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
-        """In the body's frame: velocity, gravity's direction, the way to the reference's root, the reference's
-        velocity and its way until AHEAD, the turn to the reference's rotation, angular velocity; then joints and 0.1
-        joint rates, first from the reference's, the last action, its change, and the reference's joints until AHEAD."""
-        position, quat, joints = qpos.split((3, 4, self.joints), dim=-1)
-        velocity, angular, rates = qvel.split((3, 3, self.joints), dim=-1)
         _, last, before, _ = memory.split((1, self.joints, self.joints, 2), dim=-1)
         (target, speed), (later, _) = self.reference(memory), self.reference(memory, AHEAD)
+        return self.see(qpos, qvel, last, before, target, speed, later)
+
+    def see(
+        self, qpos: Tensor, qvel: Tensor, last: Tensor, before: Tensor, target: Tensor, speed: Tensor, later: Tensor
+    ) -> Tensor:
+        """In the body's frame: velocity, gravity's direction, the way to the reference's root, the reference's
+        velocity and its way until AHEAD, the turn to the reference's rotation, angular velocity; then joints and 0.1
+        joint rates, first from the reference's, the last action, its change, and the reference's joints until AHEAD.
+
+        Args:
+            last, before: (..., nu) actions.
+            target, speed, later: the reference's qpos (..., nq) and qvel (..., nv), and its qpos at AHEAD.
+        """
+        position, quat, joints = qpos.split((3, 4, self.joints), dim=-1)
+        velocity, angular, rates = qvel.split((3, 3, self.joints), dim=-1)
         seen = velocity, self._down, target[..., :3] - position, speed[..., :3], later[..., :3] - target[..., :3]
         inverse = torch.cat((quat[..., :1], -quat[..., 1:]), dim=-1).unsqueeze(-2)
         root = rotate(inverse, torch.stack(torch.broadcast_tensors(*seen), dim=-2)).flatten(-2)
@@ -174,6 +203,21 @@ class Tracking(Imitation):
         """The root strays from the reference or is turned from it."""
         off, turned = obs[..., 6:9], obs[..., 15:18]
         return (off.square().sum(-1) > STRAY**2) | (turned.square().sum(-1) > TURNED**2)
+
+
+class Program(nn.Module):
+    """State, the last two actions and the reference -> the action and the servos' targets [rad], see `export`."""
+
+    def __init__(self, task: Tracking, policy: nn.Module) -> None:
+        super().__init__()
+        self.task, self.policy = task, policy
+
+    def forward(
+        self, qpos: Tensor, qvel: Tensor, last: Tensor, before: Tensor, frames: Tensor, speed: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        action = self.policy(self.task.see(qpos, qvel, last, before, frames[:, 0], speed, frames[:, AHEAD]))
+        target = frames[:, 1, 7:] + REACH * action
+        return action, target.clamp(self.task._low, self.task._high)
 
 
 class G1Track(Tracking):

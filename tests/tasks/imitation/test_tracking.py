@@ -15,6 +15,7 @@ import diffsim
 from diffsim import Clip, read_clip
 from diffsim.tasks.imitation.task import STRAY
 from diffsim.tasks.imitation.tracking import AHEAD, BEFORE_END, REACH, STANDING, TURNED, G1Track
+from diffsim.tasks.locomotion import FREQUENCY_OF_PUSHES
 
 REAL = torch.float64
 N = 29
@@ -45,7 +46,7 @@ def some(task: G1Track, count: int, off: float = 0.1) -> tuple[Tensor, Tensor, T
     """qpos, qvel, action and memory of robots that are beside the reference."""
     generator = torch.Generator().manual_seed(0)
     memory = task.begin(torch.rand(count, 1, dtype=REAL, generator=generator))
-    memory[:, 1:] = torch.rand(count, 2 * N, dtype=REAL, generator=generator) - 0.5
+    memory[:, 1:] = torch.rand(count, 2 * N + 2, dtype=REAL, generator=generator) - 0.5
     qpos, qvel = task.reference(memory)
     qpos = qpos + off * torch.randn(qpos.shape, dtype=REAL, generator=generator)
     qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
@@ -169,7 +170,7 @@ def test_parts_of_the_observation_are_what_they_are_called(task: G1Track) -> Non
     expected |= dict(reference_ahead=here(later[:, :3] - target[:, :3]), angular_velocity=qvel[:, 3:6])
     expected |= {"joints_off": qpos[:, 7:] - target[:, 7:], "rates_off_x0.1": 0.1 * (qvel - speed)[:, 6:]}
     expected |= {"joints": qpos[:, 7:], "joint_rates_x0.1": 0.1 * qvel[:, 6:], "last_action": action}
-    expected |= {"action_change": action - memory[:, 1 + N :], "joints_ahead": (later - target)[:, 7:]}
+    expected |= {"action_change": action - memory[:, 1 + N : -2], "joints_ahead": (later - target)[:, 7:]}
     expected["gravity"] = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3)
     turn = np.zeros((3, 3))
     for k in range(3):
@@ -182,7 +183,7 @@ def test_parts_of_the_observation_are_what_they_are_called(task: G1Track) -> Non
 
 def test_the_reward_is_largest_on_the_reference_and_its_gradient_exact(task: G1Track) -> None:
     qpos, qvel, action, memory = some(task, 4, off=0.0)
-    memory[:, 1 + N :] = action
+    memory[:, 1 + N : -2] = action
     best = task.reward(task.observe_with(qpos, qvel, action, memory), action)
     torch.testing.assert_close(best, torch.full((4,), 3.0, dtype=REAL))
     for k in (0, 2, 3, 5, 8, 20, 35):
@@ -197,10 +198,10 @@ def test_the_reward_is_largest_on_the_reference_and_its_gradient_exact(task: G1T
     qpos, qvel, action, memory = some(task, 2)
 
     def reward(qpos: Tensor, qvel: Tensor, last: Tensor, before: Tensor) -> Tensor:
-        memory_ = torch.cat((memory[:, :1], last, before), 1)
+        memory_ = torch.cat((memory[:, :1], last, before, memory[:, -2:]), 1)
         return task.reward(task.observe_with(qpos, qvel, last, memory_), last)
 
-    parts = qpos, qvel, action, memory[:, 1 + N :]
+    parts = qpos, qvel, action, memory[:, 1 + N : -2]
     assert torch.autograd.gradcheck(reward, [part.clone().requires_grad_() for part in parts])
 
 
@@ -210,11 +211,17 @@ def test_the_image_tracks_the_mirrored_clip(task: G1Track) -> None:
     image = G1Track(dtype=REAL, clip=Clip("image", mirror.qpos(task.clip.qpos), False))
     torch.testing.assert_close(image._qpos, mirror.qpos(task._qpos), rtol=0, atol=1e-9)
     qpos, qvel, action, memory = some(task, 50)
-    mirrored = torch.cat((memory[:, :1], *map(mirror.action, memory[:, 1:].split(N, 1))), 1)
+    step, last, before, kick = memory.split((1, N, N, 2), 1)
+    flip = torch.tensor([1.0, -1.0], dtype=REAL)
+    mirrored = torch.cat((step, mirror.action(last), mirror.action(before), flip * kick), 1)
     seen = image.observe_with(mirror.qpos(qpos), mirror.qvel(qvel), mirror.action(action), mirrored)
     obs = task.observe_with(qpos, qvel, action, memory)
     torch.testing.assert_close(seen, mirror.obs(obs), rtol=0, atol=1e-9)
     torch.testing.assert_close(image.reward(seen, action), task.reward(obs, action))
+    pushed, targets = image.disturb(mirror.qvel(qvel), mirror.action(action), mirrored)
+    expected, told = task.disturb(qvel, action, memory)
+    torch.testing.assert_close(pushed, mirror.qvel(expected), rtol=0, atol=1e-9)
+    torch.testing.assert_close(targets, mirror.action(told), rtol=0, atol=1e-6)
     np.testing.assert_allclose(
         image.scene().mj_model.actuator_ctrlrange, task.scene().mj_model.actuator_ctrlrange, atol=1e-6
     )
@@ -237,10 +244,25 @@ def test_episodes_start_anywhere_but_near_an_end(tmp_path: Path) -> None:
     frames = []
     for k in range(30):
         action = torch.full((2, N), float(k), dtype=REAL)
-        memory = task.remember(memory, action, action[:, :0])
+        memory = task.remember(memory, action, torch.full((2, 3), 0.5, dtype=REAL))
         frames.append(memory[:, 0].tolist())
     assert frames[:3] == [[199, 202], [200, 203], [200, 204]] and frames[-1] == [200, 226]  # held at the ends
-    assert torch.equal(memory[:, 1 : 1 + N], action) and torch.equal(memory[:, 1 + N :], action - 1)
+    assert torch.equal(memory[:, 1 : 1 + N], action) and torch.equal(memory[:, 1 + N : -2], action - 1)
+    assert not memory[:, -2:].any()
+
+
+def test_pushes_come_at_random_and_as_large_as_asked() -> None:
+    env = diffsim.make("g1_track", 2000, seed=0, clip="g1_jazz_walk")
+    env.task.disturbances = {"push": (0.2, 0.4)}
+    memory, noise = env.memory, torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
+    kick = env.task.remember(memory, torch.zeros(2000, N), noise)[:, -2:]
+    size = kick.norm(dim=1)
+    share = float((size > 0).float().mean())
+    assert share == pytest.approx(0.02 * FREQUENCY_OF_PUSHES, abs=0.004)
+    assert size[size > 0].min() >= 0.2 - 1e-6 and size.max() <= 0.4 + 1e-6
+    memory = env.task.remember(memory, torch.zeros(2000, N), noise)
+    pushed, _ = env.task.disturb(env.qvel, torch.zeros(2000, N), memory)
+    torch.testing.assert_close(pushed - env.qvel, torch.cat((kick, torch.zeros(2000, 33)), 1), atol=1e-6, rtol=0)
 
 
 def test_the_end(task: G1Track) -> None:
@@ -258,13 +280,20 @@ def test_the_end(task: G1Track) -> None:
     assert not ends(turn=TURNED - 1e-3) and ends(turn=TURNED + 1e-3) and ends(turn=-TURNED - 1e-3)
 
 
-def test_a_robot_follows_for_a_while_when_its_servos_are_told_the_reference() -> None:
+def test_an_action_changes_the_next_joints_of_the_reference(task: G1Track) -> None:
+    qpos, qvel, action, memory = some(task, 5)
+    low, high = torch.from_numpy(task.scene().mj_model.actuator_ctrlrange).T
+    _, told = task.disturb(qvel, action, memory)
+    target = (low + high + (high - low) * told) / 2
+    expected = (task.reference(memory, 1)[0][:, 7:] + REACH * action).clamp(low, high)
+    torch.testing.assert_close(target, expected)
+
+
+def test_a_robot_follows_for_a_while_when_it_does_nothing() -> None:
     env = diffsim.make("g1_track", 4, seed=0, clip="g1_jazz_walk", stochastic_init=False)
-    low, high = torch.from_numpy(env.scene.mj_model.actuator_ctrlrange).float().T
     for step in range(20):
-        target = env.task.reference(env.memory, 1)[0][:, 7:]  # type: ignore[attr-defined]
         with torch.no_grad():
-            _, reward, terminated, _, _ = env.step((2 * target - low - high) / (high - low))
+            _, reward, terminated, _, _ = env.step(torch.zeros(4, N))
         assert reward.min() > 2.0 and not terminated.any() and (env.memory[:, 0] == step + 1).all()
 
 
