@@ -47,6 +47,7 @@ class Tracking(Imitation):
     control_dt = 0.02
     episode_length = 500  # 10 s
     forward_column = None  # what counts is the reference
+    randomise = "friction=0.7:1.3", "push=0:0.5"
     disturbances = MappingProxyType({"push": (0.0, 0.0)})  # m/s, how large those are that come at random
 
     def __init_subclass__(cls) -> None:
