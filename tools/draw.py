@@ -53,7 +53,7 @@ CLOSER = {
     "g1_track": (1.25, 0.49),
 }
 FLOOR, AROUND = 2.0, 2.8  # m after which the floor repeats; s that a robot with a clock takes for it, in whole cycles
-DANCE = 12.0, 6.0  # s of the clip that a film of tracking begins with, and how many it shows
+DANCE = 12.6, 5.0  # s of the clip that a film of tracking begins with, and how many it shows
 ASIDE = -0.9, 0.4  # m, where a film draws a ghost, from where it is
 LEAST_FPS, QUALITY = 30.0, 45  # of a film; WebP's, of 100
 ROW, LABELS = 16, 56  # pixels of a foot's line in the diagram, and of its name
