@@ -113,7 +113,7 @@ def train(learner: Positional[str]) -> None:
 
 
 def view() -> None:
-    """Show a run as video, page, window or plot: diffsim view runs/<run> --web ant.html, and --help for its flags."""
+    """Show a run as video or page: diffsim view runs/<run> --web ant.html, and --help for its flags."""
 
 
 def check(robot: Positional[Path], contact: Contact = "mujoco", seconds: float = 20.0) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Iterable, Mapping
 from numbers import Integral
 from typing import Any, Literal
@@ -28,11 +26,7 @@ from diffsim.tasks import Task
 from diffsim.terrain import Elevation
 
 State = tuple[Tensor, Tensor, Tensor, Tensor]  # qpos, qvel, observation and memory, (N, ...) each
-RenderMode = Literal["rgb_array", "human"]
 Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
-# What works here, as tools try whatever an environment declares: a window needs a display.
-DISPLAY = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-RENDER_MODES = ["rgb_array", "human"] if DISPLAY else ["rgb_array"]
 STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_statistics
 
 
@@ -67,7 +61,7 @@ class DiffEnv(VectorEnv):
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
         adjoint_clip: after each step, gradients with respect to an environment's state are scaled down to at most this
             many times the batch's median, see sim/adjoint.py; 0: not at all.
-        render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
+        render_mode: with "rgb_array" `render` returns a frame of each environment.
         **options: device, dtype, threads, factors, forces, block, division: see sim.Options. `env.sim` has the factors
             and the forces.
 
@@ -78,7 +72,7 @@ class DiffEnv(VectorEnv):
         generator: the torch.Generator of the start states.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": RENDER_MODES}
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"]}
 
     @in_plain_mode
     def __init__(
@@ -94,7 +88,7 @@ class DiffEnv(VectorEnv):
         early_termination: bool = True,
         max_episode_steps: int | None = None,
         adjoint_clip: float = 0.0,
-        render_mode: RenderMode | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
         **options: Any,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
@@ -109,11 +103,10 @@ class DiffEnv(VectorEnv):
             self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
         self.sim = Simulator(scene, num_envs, control_dt=task.control_dt, horizon=horizon, **asked._asdict())
         self.metadata = self.metadata | {"render_fps": round(1 / task.control_dt)}
-        self.render_mode, self._screen = render_mode, None
-        if render_mode:  # otherwise no picture is loaded
-            from diffsim.view.screen import Screen
-
-            self._screen = Screen(scene, render_mode, 1 / task.control_dt)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is {render_mode!r}, must be 'rgb_array'; `diffsim drive` shows a robot live")
+        self.render_mode = render_mode
+        self._renderer: Any = None  # made with the first picture
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
         if not is_real(adjoint_clip) or not 0 <= adjoint_clip < math.inf:
             raise ValueError(f"adjoint_clip is {adjoint_clip!r}, must be a factor of at least 0")
@@ -160,7 +153,6 @@ class DiffEnv(VectorEnv):
             self._cut()
         self._begin(mask, self._draw(1)[0])
         self._starts, self._time = self._draw(self.horizon), 0
-        self._show()
         return self._obs.clone(), {}
 
     @in_plain_mode
@@ -223,7 +215,6 @@ class DiffEnv(VectorEnv):
             self._statistics["return"].addcmul_(done, self._episode_return)
             self._statistics["length"].addcmul_(done, length)
             self._statistics["nonfinite"] += nonfinite
-        self._show()
         info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
         return obs, reward, terminated, truncated, info
 
@@ -244,19 +235,24 @@ class DiffEnv(VectorEnv):
             raise ValueError(f"reset_mask must be an array or a tensor, bool ({self.num_envs},)")
         return mask.to(self.device)
 
-    def render(self) -> Frames | None:
-        """A frame (height, width, 3) of each environment in render_mode "rgb_array"; None in "human".
+    def render(self) -> Frames:
+        """A frame (height, width, 3) of each environment.
 
         Raises:
-            RuntimeError: made without render_mode; no OpenGL, or no display for a window.
+            RuntimeError: made without render_mode; no OpenGL.
         """
-        if self._screen is None:
+        if not self.render_mode:
             raise RuntimeError('there is no picture without a render_mode: make the environment with "rgb_array"')
-        return self._screen.show(self.qpos.numpy(force=True))
+        if self._renderer is None:
+            from diffsim.view import render  # here: otherwise no picture is loaded
+
+            self._renderer = render.Renderer(self.scene, *render.VIDEO_SIZE)
+        return tuple(self._renderer.draw(row, profile=k) for k, row in enumerate(self.qpos.numpy(force=True)))
 
     def close_extras(self, **_: Any) -> None:
-        if self._screen is not None:
-            self._screen.close()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     @in_plain_mode
     def detach(self) -> Tensor:
@@ -367,7 +363,3 @@ class DiffEnv(VectorEnv):
 
     def _uniform(self, *size: int) -> Tensor:
         return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
-
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self.render()

@@ -43,10 +43,9 @@ class NumpyEnv(gymnasium.Env[Array, Array]):
         obs, reward, terminated, _, info = self.env.advance(to_action(self.env, np.reshape(action, (1, -1))))
         return to_numpy(obs)[0], reward.item(), bool(terminated), False, {"nonfinite": bool(info["nonfinite"])}
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """A frame (height, width, 3) in render_mode "rgb_array"; in "human" the window has it after every step."""
-        frames = self.env.render()
-        return frames[0] if frames else None
+    def render(self) -> NDArray[np.uint8]:
+        """A frame (height, width, 3)."""
+        return self.env.render()[0]
 
     def close(self) -> None:
         self.env.close()

@@ -153,7 +153,8 @@ def without(scene: Scene, part: str) -> Scene:
 
     spheres: Any = (values[:0] for values in scene.spheres)
     changes: dict[str, Any] = {
-        "contact": empty("contact_link contact_position contact_radius") | {"spheres": Spheres(*spheres), "terrain": None},
+        "contact": empty("contact_link contact_position contact_radius")
+        | {"spheres": Spheres(*spheres), "terrain": None},
         "limit": {"lower": np.full(scene.nlink, -np.inf), "upper": np.full(scene.nlink, np.inf)},
         "muscle": empty("segment_link segment_position segment_muscle"),
         "terrain": {"terrain": None},
