@@ -330,7 +330,7 @@ def flags(script: Path) -> set[str]:
 
 
 def of_commands(path: Path) -> set[str]:
-    """The flags of the commands that a module of the package defines: the parameters of its functions."""
+    """The flags of the commands that a module defines: the parameters of its functions."""
     functions = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef))
     return {f"--{each.arg.replace('_', '-')}" for node in functions for each in node.args.args}
 
@@ -366,7 +366,7 @@ def test_flags_exist(page: Path) -> None:
         if mentioned and scripts:
             script, name = ROOT / words[scripts[0]], words[scripts[0]]
             assert script.is_file(), f"{page.name} mentions {name}, which does not exist"
-            known = (script in SCRIPTS and flags(script)) or of_argparse(script) or ANY
+            known = (script in SCRIPTS and flags(script)) or of_argparse(script) or of_commands(script) or ANY
         assert mentioned <= known, f"{page.name}: {name} has no {sorted(mentioned - known)}"
 
 
