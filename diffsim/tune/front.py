@@ -93,13 +93,13 @@ def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> li
                 sim.rewind()
                 q, v, *leaves = (x.to(sim.device, sim.dtype) for x in states)
                 leaves = [leaf.requires_grad_(grad) for leaf in leaves]
-                start = clock(sim)
+                start = clock(sim.device)
                 for leaf in leaves:
                     q, v = sim.step(q, v, leaf)
                 if grad:
                     v.sum().backward()
                 if turn:
-                    row[k] = min(row[k], (clock(sim) - start) / len(leaves) / sim.num_envs * 1e6)
+                    row[k] = min(row[k], (clock(sim.device) - start) / len(leaves) / sim.num_envs * 1e6)
     return best.tolist()
 
 
@@ -126,9 +126,10 @@ def measure(motion: Motion, found: list[Setting], rows: list[Row], **options: An
         rows.append(Row(setting, numbers | Reference(motion, setting).errors(truth)))
 
 
-def clock(sim: Simulator) -> float:
-    if sim.device.type == "cuda":
-        torch.cuda.synchronize(sim.device)
+def clock(device: torch.device) -> float:
+    """Seconds, once the device has done what it was told."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
