@@ -24,9 +24,7 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return error
 
 
-def test_video_and_page_of_a_run(
-    opengl: None, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_video_and_page_of_a_run(opengl, tiny_run, tmp_path, capsys):
     outputs = [tmp_path / name for name in ("a.mp4", "a.html")]
     options = ["--seconds", "0.5", "--episodes", "3", "--size", "64", "48", "--substeps", "2"]
     flags = [word for pair in zip(("--video", "--web"), map(str, outputs), strict=True) for word in pair]
@@ -37,16 +35,14 @@ def test_video_and_page_of_a_run(
     assert all(str(path) in printed for path in outputs)
 
 
-def test_substeps_are_those_of_the_training_unless_given(tiny_run: Path) -> None:
+def test_substeps_are_those_of_the_training_unless_given(tiny_run):
     saved = load_policy(str(tiny_run / "checkpoint.pt"))
     assert make_policy_env(saved, 1).sim.integration.substeps == saved.args["substeps"]
     assert make_policy_env(saved, 1, substeps=7).sim.integration.substeps == 7
 
 
 @pytest.mark.parametrize("words", ["view --web x.html", "drive ant --port 0 --checkpoint", "export x.onnx"])
-def test_a_checkpoint_names_no_code_to_run(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_checkpoint_names_no_code_to_run(words, tmp_path, monkeypatch, capsys):
     """A file that a policy's env names is run only where the command line names it, too."""
     monkeypatch.chdir(tmp_path)
     state = torch.load(command.shipped("ant"), weights_only=True)
@@ -80,18 +76,14 @@ def test_a_checkpoint_names_no_code_to_run(
         ("{run} --episodes 3 --web {run}/progress.csv/a.html", "File exists"),
     ],
 )
-def test_mistakes_are_one_line(
-    arguments: str, message: str, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line(arguments, message, tiny_run, tmp_path, capsys):
     places = {"run": tiny_run, "new": tmp_path}
     assert message.format(**places) in refused(arguments.format(**places).split(), capsys)
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 @pytest.mark.parametrize("flags", ["--video {0}/a.mp4", "--video {0}/a.gif", "--web {0}/a.html"])
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(
-    opengl: None, flags: str, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(opengl, flags, tiny_run, tmp_path, capsys):
     path = Path(flags.format(tmp_path).split()[1])
     path.write_text("an older file")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
