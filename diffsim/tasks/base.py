@@ -162,7 +162,7 @@ class Task:
     def presets(cls, contact: str | None = None) -> dict[str, Integration]:
         """The presets "fast", "default" (the paper's) and "accurate" that it has on a contact model, its own if None.
 
-        None is "fast" on MuJoCo's contact: what is much faster there errs too much (docs/numerics.md).
+        There is no "fast" on MuJoCo's contact: what saves much time there errs too much (docs/numerics.md).
 
         Raises:
             ValueError: another contact model.
