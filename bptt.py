@@ -150,7 +150,8 @@ class BPTT:
         norm = self.optimizer.step(loss)
         if args.normalize_obs:
             self.actor.normalizer.update(rollout.obs.detach())
-        return {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        found = {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        return found | {"charts/learning_rate": self.optimizer.lr}
 
 
 def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:

@@ -322,6 +322,7 @@ class MBPO:
             obs, next_obs = (self.actor.normalizer(x) for x in (batch.obs, batch.next_obs))
             metrics.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
         found = {name: torch.stack([row[name] for row in metrics]).mean() for name in metrics[0]}
+        found["charts/learning_rate"] = self.actor_optimizer.lr
         return found | {"charts/temperature": self.temperature["log"].detach().exp()}
 
     def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:

@@ -355,6 +355,7 @@ class SAC:
             **{name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]},
             "grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum(),
             "charts/temperature": self.temperature["log"].detach().exp(),
+            "charts/learning_rate": self.optimizer.lr,
             **self.resampling.end_iteration(self.actor.head, self.optimizer),
         }
 

@@ -304,7 +304,8 @@ class PODS:
                 losses.append(loss.detach())
         per_epoch = torch.stack(losses).view(args.epochs, -1).mean(1)
         found = {"losses/imitation": per_epoch[-1], "losses/first_epoch": per_epoch[0]}
-        return found | {"grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        found |= {"grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        return found | {"charts/learning_rate": self.optimizer.lr}
 
 
 # The run --------------------------------------------------------------------------------------------------------------

@@ -200,6 +200,7 @@ class SAC:
         found = {name: torch.stack([row[name] for row in metrics]).mean() for name in (metrics[0] if learning else ())}
         optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
         found["grad/skipped"] = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
+        found |= {"charts/actor_lr": self.actor_optimizer.lr, "charts/critic_lr": self.critic_optimizer.lr}
         return found | {"charts/temperature": self.temperature["log"].detach().exp()}
 
     @torch.no_grad()

@@ -294,6 +294,7 @@ class SAPO:
             "charts/reward": gained.mean(),
             "charts/entropy": entropy.mean(),
             "charts/temperature": self.temperature["log"].detach().exp().mean(),
+            "charts/actor_lr": self.actor_optimizer.lr,
         }
 
     def update_critic(self) -> dict[str, Tensor]:
@@ -309,7 +310,8 @@ class SAPO:
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
         skipped = torch.stack([optimizer.skipped for optimizer in self.optimizers]).sum()
-        return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        found = {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        return found | {"charts/critic_lr": self.critic_optimizer.lr}
 
     # Their parts ------------------------------------------------------------------------------------------------------
 

@@ -208,7 +208,7 @@ class SHAC:
         self.value.copy_(value.view(-1, 1))
         self.obs.copy_(normalizer(rollout.obs).flatten(0, 1))
         normalizer.update(rollout.obs)
-        return {"losses/actor": loss.detach(), "grad/norm": norm}
+        return {"losses/actor": loss.detach(), "grad/norm": norm, "charts/actor_lr": self.actor_optimizer.lr}
 
     def update_critic(self) -> dict[str, Tensor]:
         """Fit the critic to the window's TD(lambda) returns (Eq. 6), and let the target critic follow."""
@@ -224,7 +224,8 @@ class SHAC:
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
         skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped
-        return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        found = {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        return found | {"charts/critic_lr": self.critic_optimizer.lr}
 
     def next_values(self, rollout: Rollout) -> Tensor:
         """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""

@@ -21,16 +21,19 @@ from diffsim.training import graph
 from diffsim.training.directory import COLUMNS, column
 
 NOT_COMPARED = {"seconds"}
+PPO_LOSSES = " ".join(  # by CleanRL's names
+    f"losses/{name}" for name in "policy_loss value_loss entropy approx_kl clipfrac explained_variance".split()
+)
 SCALARS = {
-    "shac": "losses/actor losses/critic time/update_actor time/update_critic",
+    "shac": "losses/actor losses/critic charts/actor_lr charts/critic_lr time/update_actor time/update_critic",
     "sapo": (
-        "losses/actor losses/critic charts/reward charts/entropy charts/temperature "
+        "losses/actor losses/critic charts/actor_lr charts/critic_lr charts/reward charts/entropy charts/temperature "
         "time/update_actor time/update_critic"
     ),
-    "bptt": "losses/actor time/update",
-    "ppo_baseline": "losses/policy losses/value losses/kl charts/learning_rate charts/std time/collect time/update",
+    "bptt": "losses/actor charts/learning_rate time/update",
+    "ppo_baseline": f"{PPO_LOSSES} charts/learning_rate charts/std time/collect time/update",
     "pfpn": (
-        "losses/policy losses/value losses/kl charts/learning_rate charts/entropy time/interact time/learn "
+        f"{PPO_LOSSES} charts/learning_rate time/interact time/learn "
         "particles/dead_mean particles/dead_max particles/moved particles/active particles/std"
     ),
 }
