@@ -42,7 +42,8 @@ from diffsim.training.evaluation import kept
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 SENTINELS = 3  # cells, each with as many seeds
-UNTIMED = ("task", "learner", "return", "in the reference", "target", "steps to target")
+TIMED = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")  # that a page shows
+UNTIMED = ("task", "learner", "return", "in the reference", "steps to target")
 
 
 @dataclass
@@ -216,8 +217,9 @@ def line(rows: Sequence[Cells]) -> Row:
     shown |= {"in the reference": middle(rows, "in the reference", ".0f")}
     shown |= {name: middle(rows, name, ".2f") for name in ("speed", "speed in MuJoCo")}
     target = RETURNS[task].target
-    seconds, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
-    shown |= {"target": target, "s to target": "" if math.isnan(seconds) else tell(seconds, ".0f")}
+    time, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
+    shown |= {"paced": max(row.get("paced", "") for row in rows)}
+    shown |= {"s to target": "" if math.isnan(time) else tell(time, ".0f")}
     return shown | {"steps to target": tell(steps / 1e6, ".3g") + " M" * (steps < math.inf)}
 
 
@@ -239,13 +241,20 @@ def table(args: Args, name: str) -> list[Row]:
     return lines
 
 
+def seconds(row: Row) -> str:
+    """Of the training, marked if computed from the time of an iteration, and in all, from the command to its end."""
+    whole = f" ({row['in all (s)']})" if row["in all (s)"] else ""
+    return f"{row['training (s)']}{row['paced']}{whole}"
+
+
 def printed(args: Args, name: str) -> str:
     """A group's table, without tasks that have a single line, which compares nothing."""
     if GROUPS[name].ratios:
         return markdown(ratios(args, name))
     rows = table(args, name)
     count = Counter(row["task"] for row in rows)
-    return markdown([row for row in rows if count[row["task"]] > 1], None if GROUPS[name].timed else UNTIMED)
+    rows = [{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1]
+    return markdown(rows, TIMED if GROUPS[name].timed else UNTIMED)
 
 
 def check(args: Args) -> str:
