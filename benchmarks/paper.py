@@ -43,7 +43,7 @@ KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 SENTINELS = 3  # cells, each with as many seeds
 TIMED = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")  # that a page shows
-UNTIMED = ("task", "learner", "return", "in the reference", "steps to target")
+UNTIMED = ("task", "learner", "return", "steps to target")
 
 
 @dataclass
@@ -233,10 +233,10 @@ def table(args: Args, name: str) -> list[Row]:
     rows = read_cells(args.directory.parent / group.machine)
     for task in group.tasks:
         for learner in group.learners:
-            wanted = {str(seed) for seed in range(1, group.seeds + 1)}
-            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
-            own = [row for row in own if cells.counts(row, group.timed)]
-            if len(own) == group.seeds and len({row["trained on"] for row in own}) == 1:
+            seeds = max(each.seeds for each in Cell(group.machine, learner, task, 1).groups)  # the same in all tables
+            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
+            own = [row for row in own if int(row["seed"]) <= seeds and cells.counts(row, group.timed)]
+            if len(own) == seeds and len({row["trained on"] for row in own}) == 1:
                 lines.append(line(own))
     return lines
 
