@@ -43,7 +43,6 @@ KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 SENTINELS = 3  # cells, each with as many seeds
 TIMED = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")  # that a page shows
-UNTIMED = ("task", "learner", "return", "steps to target")
 
 
 @dataclass
@@ -211,7 +210,7 @@ def line(rows: Sequence[Cells]) -> Row:
     """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
     returns, task = numbers(rows, "return"), rows[0]["task"]
     shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"]}
-    shown["return"] = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
+    shown["return"] = f"{median(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
     shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
     shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}", "kept": middle(rows, "kept", ".3f")}
     shown |= {"in the reference": middle(rows, "in the reference", ".0f")}
@@ -248,13 +247,23 @@ def seconds(row: Row) -> str:
 
 
 def printed(args: Args, name: str) -> str:
-    """A group's table, without tasks that have a single line, which compares nothing."""
+    """A group's table: a line for each learner and task or, without seconds, for each task.
+
+    A task that has a single learner is left out: it compares nothing.
+    """
     if GROUPS[name].ratios:
         return markdown(ratios(args, name))
     rows = table(args, name)
     count = Counter(row["task"] for row in rows)
     rows = [{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1]
-    return markdown(rows, TIMED if GROUPS[name].timed else UNTIMED)
+    if GROUPS[name].timed:
+        return markdown(rows, TIMED)
+    lines = dict[object, dict[str, object]]()
+    for row in rows:
+        of_task = lines.setdefault(row["task"], {"task": row["task"]})
+        of_task[str(row["learner"])] = f"{row['return']}<br>{row['steps to target']}"
+    columns = [learner for learner in GROUPS[name].learners if any(learner in each for each in lines.values())]
+    return markdown([*lines.values()], ("task", *columns))
 
 
 def check(args: Args) -> str:
