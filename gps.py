@@ -136,7 +136,7 @@ class Search:
 
     guided = True  # whether S begins with the guides
     starts = 2  # of line 7
-    NUMBERS = "w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
+    NUMBERS = "w_r floor scale plan_return guide_return control_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
@@ -150,7 +150,7 @@ class Search:
         self.w_r = math.prod(args.regularizer_bounds) ** 0.5
         self.floor, self.scale = -math.inf, 1.0  # least reward of a step; standard deviation of rewards
         self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
-        self.control_steps = self.plan_steps = self.nonfinite = 0
+        self.control_steps = self.nonfinite = 0
         self.S = SampleSet(self.system, self.network)
 
     def prepare(self, say: Callable[[str], None]) -> dict[str, float]:
@@ -165,7 +165,6 @@ class Search:
         self.plan_return = -sum(plan.cost.item() for plan in plans) / len(plans)
         policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
         self.guides = [*map(self.guide, self.grounds, plans)]  # line 1: guides about DDP solutions
-        self.plan_steps = sum(ground.steps for ground in {*self.grounds})
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
         policy.standardise(guiding.obs, guiding.u)
@@ -251,14 +250,13 @@ class Search:
 
     def adapt(self) -> Tensor:
         """Line 9: guides of exp(reward) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
-        args, system, policy, before = self.args, self.system, self.network, self.system.steps
+        args, system, policy = self.args, self.system, self.network
         guides, theta = self.adapted or self.guides, policy.theta
         x, u = torch.stack([g.x for g in guides]), torch.stack([g.u for g in guides])
         surprisal = Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma)
         cost = Sum((self.cost, surprisal))
         plan = ilqr(system, cost, x, u, args.adaptive_iterations, mu=1e-3)
         self.adapted = maximum_entropy_controllers(system, cost, plan)
-        self.plan_steps += system.steps - before
         return self.S.append(self.follow(self.adapted, args.samples, len(self.S.generators)), *self.adapted)
 
     def estimate(self, theta: Tensor, active: Tensor) -> tuple[bool, dict[str, float]]:
@@ -278,7 +276,7 @@ class Search:
         objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
         objective["charts/episodic_return"] = self.system.reward(samples.x[:, 1:], samples.u).sum(1).mean()
         metrics = {name: value.item() for name, value in objective.items()}
-        return metrics | {"sim/nonfinite": self.nonfinite, "sim/model_steps": self.plan_steps}
+        return metrics | {"sim/nonfinite": self.nonfinite}
 
     # Trajectories -----------------------------------------------------------------------------------------------------
 

@@ -250,7 +250,7 @@ def test_rows_and_files_of_a_run(trained: Path, rows: list[dict[str, str]]) -> N
     for drawn, row in zip(np.diff(steps) // 30, rows[1:], strict=True):
         assert drawn in ((4 + 8,) if row["gps_accepted"] == "1.0" else (4 + 4, 4 + 8 + 4))
     assert [bool(row["eval_return"]) for row in rows] == [False, False, True, False, True]
-    assert all(row["return"] and row["gps_objective"] and row["sim_model_steps"] for row in rows)
+    assert all(row["return"] and row["gps_objective"] for row in rows)
     assert not list(trained.glob("*.tmp"))
 
 
