@@ -37,7 +37,7 @@ def test_each_run_of_the_page_is_a_command(group: str, monkeypatch: pytest.Monke
 
 
 def test_an_unknown_name_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    for flag, others in (("only", "hopper, walker"), ("cells", "")):
+    for flag, others in (("only", "hopper, hopper_short"), ("cells", "")):
         error = refusal(lambda flag=flag: suites.main(suites.Args(**{flag: ("figure 3",)})), capsys)
         assert f"--{flag}: there is no 'figure 3'; choose from {others}" in error
 
