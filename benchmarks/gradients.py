@@ -33,7 +33,7 @@ GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "mujoco": {"contact": "mujoco"},
     "mujoco --no-touchdown": {"contact": "mujoco", "touchdown": False},
 }
-SHOWN = *(f"{name}, {k} steps" for name in ("cosine", "clipped") for k in (4, 8, 16)), "norm 95 %, 16 steps"
+SHOWN = *(f"cosine, {k} steps" for k in (4, 8, 16)), "clipped, 16 steps", "norm 95 %, 16 steps"
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
 AGREE = 0.9  # least cosine of differences by SHIFT and by half of it, for which the page shows others
 KEY = ("task", "learner", "horizon", "ground")
