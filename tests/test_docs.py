@@ -231,8 +231,8 @@ BANNED = {
     r"what (is lost|came of it|follows|is left)": "the thing's name",
 }
 REWRITTEN_LATER = set(
-    "bptt experiments gymnasium joystick mbpo numerics pfpn pods ppo robustness "
-    "sac sapo shac tracking transfer viewing".split()
+    "bptt experiments joystick mbpo numerics pfpn pods ppo robustness "
+    "sac sapo shac tracking viewing".split()
 )
 READ = [page for page in (README, *sorted((ROOT / "docs").glob("*.md"))) if page.stem not in REWRITTEN_LATER]
 
