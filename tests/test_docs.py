@@ -232,7 +232,7 @@ BANNED = {
 }
 REWRITTEN_LATER = set(
     "bptt experiments joystick mbpo numerics pfpn pods ppo robustness "
-    "sac sapo shac tracking viewing".split()
+    "sac sapo shac tracking".split()
 )
 READ = [page for page in (README, *sorted((ROOT / "docs").glob("*.md"))) if page.stem not in REWRITTEN_LATER]
 
