@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
@@ -186,7 +186,7 @@ def train(args: Args) -> None:
         bptt.set_learning_rate(iteration)
         run.log(update())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, bptt.policy))
+            run.evaluate(bptt.policy)
 
 
 main = script(Args, train)

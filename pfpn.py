@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
@@ -456,7 +456,7 @@ def train(args: Args) -> None:
     for _ in run:
         run.log(interact() | learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, ppo.policy))
+            run.evaluate(ppo.policy)
 
 
 main = script(Args, train)

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, seeing
@@ -404,7 +404,7 @@ def train(args: Args) -> None:
     for _ in run:
         run.log(interact() | learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, sac.policy))
+            run.evaluate(sac.policy)
 
 
 main = script(Args, train)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import SymmetricFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
@@ -299,7 +299,7 @@ def train(args: Args) -> None:
     for _ in run:
         run.log(collect() | update())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, ppo.policy))
+            run.evaluate(ppo.policy)
 
 
 main = script(Args, train)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv, Integration
 from diffsim.tasks import TASKS
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, seeing
@@ -382,7 +382,7 @@ def train(args: Args) -> None:
         sapo.prepare(iteration)
         run.log(update_actor() | update_critic())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, sapo.policy))
+            run.evaluate(sapo.policy)
 
 
 main = script(Args, train)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import Chain, folded, make_even, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
@@ -278,7 +278,7 @@ def train(args: Args) -> None:
         shac.set_learning_rates(iteration)
         run.log(update_actor() | update_critic())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, shac.policy))
+            run.evaluate(shac.policy)
 
 
 main = script(Args, train)

@@ -128,6 +128,7 @@ class DiffEnv(VectorEnv):
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
         self.qpos, self.qvel, self._obs, self.memory = self._draw(1)[0]
         self._recorded = 0  # differentiable steps since the window began
+        self._pinned: State | None = None
         self._starts, self._time = self._draw(horizon), 0  # of the window: one batch of operations, not one per step
 
     @property
@@ -152,6 +153,8 @@ class DiffEnv(VectorEnv):
         if not options:
             self._cut()
         self._begin(mask, self._draw(1)[0])
+        if self._pinned is not None:
+            self.carry_over(self._pinned)
         self._starts, self._time = self._draw(self.horizon), 0
         return self._obs.clone(), {}
 
@@ -269,7 +272,8 @@ class DiffEnv(VectorEnv):
     def pin(self) -> State:
         """Copy the state into fixed buffers, from which a CUDA graph replays the window; see graph.py."""
         self._put(part.detach().clone() for part in self._state())
-        return self._state()
+        self._pinned = self._state()
+        return self._pinned
 
     def carry_over(self, start: State) -> None:
         """End a captured window: write the state back to where it started, as returned by `pin`."""

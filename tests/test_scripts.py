@@ -17,7 +17,7 @@ from learners import ROOT, SCRIPTS, SMALL, assert_same, read_progress, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from diffsim.training import graph
+from diffsim.training import Run, graph
 from diffsim.training.directory import COLUMNS, column
 
 NOT_COMPARED = {"seconds"}
@@ -83,14 +83,14 @@ def test_saving_and_evaluating_change_no_numbers(script, small, tmp_path):
 
 
 def test_the_same_seed_interrupted_and_resumed_ends_bitwise_alike(script, small, checkpoint, tmp_path, monkeypatch):
-    path, evaluate = tmp_path / "checkpoint.pt", script.evaluate
+    path, evaluate = tmp_path / "checkpoint.pt", Run.evaluate
 
     def interrupted(*arguments: Any) -> Any:
         signal.raise_signal(signal.SIGTERM)
         return evaluate(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as exit:
-        patch.setattr(script, "evaluate", interrupted)
+        patch.setattr(Run, "evaluate", interrupted)
         run(script, tmp_path, *small, "--threads", 1)
     assert exit.value.code == 128 + signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
