@@ -57,8 +57,8 @@ class Args(ParallelFlags):
     """particles, or one Gaussian"""
     particles: Several = 35
     """particles of each action"""
-    estimator: Literal["straight-through", "implicit"] = "straight-through"
-    """gradient of a sampled action in the particles' weights: the paper's, or the one without bias"""
+    estimator: Literal["implicit", "straight-through"] = "implicit"
+    """gradient of a sampled action in the particles' weights: the one without bias, or the paper's"""
     resampling_interval: Count = 20
     """iterations between resamplings"""
     resampling_noise: NonNegative = 0.1
