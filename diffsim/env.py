@@ -51,24 +51,23 @@ class DiffEnv(VectorEnv):
 
     Args:
         task: task on the simulator's device and dtype.
-        scene: its robot. On a terrain, heights that the task knows (of start, observation, reward and end) are those
-            over the ground straight below the root; `qpos` remains the world's.
+        scene: its robot. On a terrain the task measures heights (of start, observation, reward and end) from the ground
+            below the root. `qpos` stays in the world frame.
         num_envs, horizon: see Simulator.
         integration: default the task's "default".
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
-        early_termination: end episodes where the task says that the robot has fallen.
+        early_termination: end episodes where the task reports a fall.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
         adjoint_clip: after each step, gradients with respect to an environment's state are scaled down to at most this
             many times the batch's median, see sim/adjoint.py; 0: not at all.
         render_mode: with "rgb_array" `render` returns a frame of each environment.
-        **options: device, dtype, threads, factors, forces, block, division: see sim.Options. `env.sim` has the factors
-            and the forces.
+        **options: device, dtype, threads, factors, forces, block, division: see sim.Options.
 
     Attributes:
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.
         episode_step: (N,) int64 control steps since each environment's start.
-        memory: (N, num_memory) what the task keeps from step to step.
+        memory: (N, num_memory) the task's numbers that persist from step to step.
         generator: the torch.Generator of the start states.
     """
 
@@ -144,8 +143,8 @@ class DiffEnv(VectorEnv):
             obs (N, obs_dim) of all environments, and an empty info.
 
         Raises:
-            ValueError: several seeds, as one generator draws all start states; a mask of another shape or dtype;
-                unknown options.
+            ValueError: several seeds (one generator draws all start states); a mask of another shape or dtype; unknown
+                options.
         """
         mask = self._mask(options) if options else torch.ones_like(self.episode_step, dtype=torch.bool)
         if seed is not None:
@@ -169,7 +168,7 @@ class DiffEnv(VectorEnv):
             obs (N, obs_dim), reward (N,), terminated (N,), truncated (N,), info with
             "final_obs" (N, obs_dim): the observation before any reset, valid for every environment; "_final_obs" (N,)
             marks those that ended; "episode": {"r": return, "l": control steps, "t": simulated seconds} (N,) each,
-            valid under "_episode"; "nonfinite" (N,): environments that blew up, which end with reward 0.
+            valid under "_episode"; "nonfinite" (N,): environments whose simulation failed, which end with reward 0.
 
         Raises:
             ValueError: action of the wrong shape, dtype or device; an ActionError on the CPU if it is not a number.
@@ -183,7 +182,7 @@ class DiffEnv(VectorEnv):
         return self._obs.clone(), reward, terminated, truncated, info
 
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """`step` without the reset: obs is info["final_obs"], and what has ended waits for `reset`."""
+        """`step` without the reset: obs is info["final_obs"], and ended episodes wait for `reset`."""
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
@@ -325,13 +324,13 @@ class DiffEnv(VectorEnv):
         return self._obs.clone()
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """What the task observes (N, obs_dim) of states, with its memory."""
+        """The task's observation (N, obs_dim) of states, with its memory."""
         if self._elevation is not None:
             qpos = self._elevation.lower(qpos)
         return self.task.observe_with(qpos, qvel, action, self.memory)
 
     def state_dict(self) -> dict[str, Any]:
-        """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
+        """A dictionary that continues the episodes exactly, without the simulator's factors and forces."""
         names = ("qpos", "qvel", "obs", "memory", "episode_step", "episode_return")
         parts = zip(names, (*self._state(), self.episode_step, self._episode_return), strict=True)
         tensors = {name: part.detach().clone() for name, part in parts if name != "memory" or self.task.num_memory}
@@ -339,7 +338,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a state_dict of the same task, size and dtype (else ValueError); call `detach` next."""
+        """Continue from a state_dict of the same task, size and dtype, else ValueError. Call `detach` next."""
         own = self.state_dict()
         if state.keys() != own.keys():
             raise ValueError(f"the state has {', '.join(state)}; that of an environment has {', '.join(own)}")

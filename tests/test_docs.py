@@ -169,6 +169,15 @@ def test_the_page_of_the_api_is_that_of_the_docstrings() -> None:
     assert api.PAGE.read_text() == api.page(), "python tools/api.py writes it"
 
 
+def test_every_logged_metric_is_explained() -> None:
+    text = "".join((ROOT / "docs" / f"{name}.md").read_text() for name in ("running", "gps"))
+    for script in [*ROOT.glob("*.py"), *(ROOT / "diffsim" / "training").glob("*.py")]:
+        found = re.findall(r'"((?:losses|charts|eval|grad|sim|gps|pods|models|particles)/\w*[a-z])"', script.read_text())
+        for name in found:
+            names = name, name.partition("/")[2]
+            assert any(f"`{each}`" in text for each in names), f"{script.name} logs {name}"
+
+
 @each_page
 def test_no_spread_of_a_single_seed(page: Path) -> None:
     assert not re.search(r"±\s*0(?![.\d])", page.read_text()), "the spread of one run is not 0: print the seed count"
