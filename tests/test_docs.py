@@ -172,8 +172,8 @@ def test_the_page_of_the_api_is_that_of_the_docstrings() -> None:
 def test_every_logged_metric_is_explained() -> None:
     text = "".join((ROOT / "docs" / f"{name}.md").read_text() for name in ("running", "gps"))
     for script in [*ROOT.glob("*.py"), *(ROOT / "diffsim" / "training").glob("*.py")]:
-        found = re.findall(r'"((?:losses|charts|eval|grad|sim|gps|pods|models|particles)/\w*[a-z])"', script.read_text())
-        for name in found:
+        groups = "losses|charts|eval|grad|sim|gps|pods|models|particles"
+        for name in re.findall(rf'"((?:{groups})/\w*[a-z])"', script.read_text()):
             names = name, name.partition("/")[2]
             assert any(f"`{each}`" in text for each in names), f"{script.name} logs {name}"
 
