@@ -106,9 +106,9 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task and ground; no cosine with differences that do not agree."""
+    """A line for each task on MuJoCo's contact; no cosine with differences that do not agree."""
     lines = list[Row]()
-    for (task, ground), own in grouped(rows, "task", "ground").items():
+    for (task, ground), own in grouped([row for row in rows if row["ground"] != "soft"], "task", "ground").items():
         agree = [row for row in own if float(row["differences"]) > AGREE]
         cells = {f"{name}, {row['horizon']} steps": row[name] for row in agree for name in ("cosine", "clipped")}
         cells |= {f"norm 95 %, {row['horizon']} steps": row["norm 95 %"] for row in own}

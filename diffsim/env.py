@@ -137,7 +137,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Start all episodes anew, and a window; or only the episodes of options={"reset_mask": mask (N,) bool}.
+        """Restart all episodes, or those of options={"reset_mask": mask (N,) bool}, and begin a window.
 
         Returns:
             obs (N, obs_dim) of all environments, and an empty info.
@@ -258,7 +258,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def detach(self) -> Tensor:
-        """Cut the graph at the current state, start a new window there, and return its observation (N, obs_dim)."""
+        """Cut the graph at the current state, begin a window there, and return observations (N, obs_dim)."""
         self._cut()
         self._starts, self._time = self._draw(self.horizon), 0
         return self._obs.clone()
@@ -308,7 +308,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def set_state(self, qpos: Tensor, qvel: Tensor) -> Tensor:
-        """Put all environments into given states, keeping their episode clocks; returns the observation (N, obs_dim).
+        """Set the states of all environments, but not their episode clocks, and return observations (N, obs_dim).
 
         Gradients flow into qpos (N, nq) and qvel (N, nv). The last action in the observation is 0.
 

@@ -40,8 +40,8 @@ class TaskError(ValueError):
 class Task:
     """A task. Subclasses fill in the attributes and the methods `observe` and `reward`.
 
-    `bind` fits it to its robot, and finds what the subclass leaves out. An episode starts uniformly in
-    start +- spread / 2, where both list qpos, then qvel.
+    docs/own_robot.md lists the attributes and their defaults. An episode starts uniformly in start +- spread / 2, where
+    both list qpos, then qvel.
     """
 
     name: ClassVar[str] = "task"
