@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
@@ -150,7 +150,8 @@ class BPTT:
         norm = self.optimizer.step(loss)
         if args.normalize_obs:
             self.actor.normalizer.update(rollout.obs.detach())
-        return {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        found = {"losses/actor": loss.detach(), "grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        return found | {"charts/learning_rate": self.optimizer.lr}
 
 
 def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
@@ -185,7 +186,7 @@ def train(args: Args) -> None:
         bptt.set_learning_rate(iteration)
         run.log(update())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, bptt.policy))
+            run.evaluate(bptt.policy)
 
 
 main = script(Args, train)

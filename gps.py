@@ -12,7 +12,7 @@ which teaches a small network without a clock to act like the example.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -136,7 +136,7 @@ class Search:
 
     guided = True  # whether S begins with the guides
     starts = 2  # of line 7
-    NUMBERS = "w_r floor scale plan_return guide_return control_steps plan_steps nonfinite".split()
+    NUMBERS = "w_r floor scale plan_return guide_return control_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
@@ -150,7 +150,7 @@ class Search:
         self.w_r = math.prod(args.regularizer_bounds) ** 0.5
         self.floor, self.scale = -math.inf, 1.0  # least reward of a step; standard deviation of rewards
         self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
-        self.control_steps = self.plan_steps = self.nonfinite = 0
+        self.control_steps = self.nonfinite = 0
         self.S = SampleSet(self.system, self.network)
 
     def prepare(self, say: Callable[[str], None]) -> dict[str, float]:
@@ -165,7 +165,6 @@ class Search:
         self.plan_return = -sum(plan.cost.item() for plan in plans) / len(plans)
         policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
         self.guides = [*map(self.guide, self.grounds, plans)]  # line 1: guides about DDP solutions
-        self.plan_steps = sum(ground.steps for ground in {*self.grounds})
         guiding = self.sample_guides()  # line 2: sample their mixture
         mean, std = self.guide_return
         policy.standardise(guiding.obs, guiding.u)
@@ -175,7 +174,7 @@ class Search:
             self.S.append(guiding, *self.guides)
         self.S.initial = self.S.best = len(self.S.generators)
         own = self.draw(policy.theta, self.S.best)
-        self.S.append(own, policy.theta)
+        self.S.append(own, (policy.theta,))
         self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
         say(f"returns: example {self.plan_return:.1f}, guides {mean:.1f} +- {std:.1f}, policy {own.returns.mean():.1f}")
         guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
@@ -188,7 +187,7 @@ class Search:
         theta, metrics = self.optimise(S.samples.pick(active))  # line 7: theta_k <- arg max Phi
         source = len(S.generators)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
-        active = torch.cat((active, S.append(new, theta)))
+        active = torch.cat((active, S.append(new, (theta,))))
         if iteration <= args.adaptive:
             active = torch.cat((active, self.adapt()))  # line 9: generate adaptive guiding samples
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
@@ -251,14 +250,13 @@ class Search:
 
     def adapt(self) -> Tensor:
         """Line 9: guides of exp(reward) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
-        args, system, policy, before = self.args, self.system, self.network, self.system.steps
+        args, system, policy = self.args, self.system, self.network
         guides, theta = self.adapted or self.guides, policy.theta
         x, u = torch.stack([g.x for g in guides]), torch.stack([g.u for g in guides])
         surprisal = Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma)
         cost = Sum((self.cost, surprisal))
         plan = ilqr(system, cost, x, u, args.adaptive_iterations, mu=1e-3)
         self.adapted = maximum_entropy_controllers(system, cost, plan)
-        self.plan_steps += system.steps - before
         return self.S.append(self.follow(self.adapted, args.samples, len(self.S.generators)), *self.adapted)
 
     def estimate(self, theta: Tensor, active: Tensor) -> tuple[bool, dict[str, float]]:
@@ -278,7 +276,7 @@ class Search:
         objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
         objective["charts/episodic_return"] = self.system.reward(samples.x[:, 1:], samples.u).sum(1).mean()
         metrics = {name: value.item() for name, value in objective.items()}
-        return metrics | {"sim/nonfinite": self.nonfinite, "sim/model_steps": self.plan_steps}
+        return metrics | {"sim/nonfinite": self.nonfinite}
 
     # Trajectories -----------------------------------------------------------------------------------------------------
 
@@ -358,13 +356,13 @@ class Search:
 
     def state_dict(self) -> dict[str, Any]:
         state = {name: getattr(self, name) for name in self.NUMBERS} | {"rng": self.rng.get_state()}
-        return state | {"guides": packed(self.guides), "adapted": packed(self.adapted)}
+        return state | {name: [tuple(guide) for guide in getattr(self, name)] for name in ("guides", "adapted")}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         for name in self.NUMBERS:
             setattr(self, name, state[name])
         for name in ("guides", "adapted"):
-            setattr(self, name, unpacked(state[name], self.system.device))
+            setattr(self, name, [LinearGaussian(*moved(guide, self.system.device)) for guide in state[name]])
         self.grounds = [self.system] * len(self.guides)
         self.rng.set_state(state["rng"])
 
@@ -432,20 +430,20 @@ class SampleSet:
 
     def __init__(self, system: System, policy: Policy) -> None:
         self.system, self.policy = system, policy
-        self.generators: list[LinearGaussian | Tensor] = []  # guides, the initial ones first, and policies as theta
+        self.generators: list[tuple[Tensor, ...]] = []  # guides, the initial ones first, and policies as (theta,)
         self.best = -1  # theta*'s index among them
         self.initial = 0  # initial guides among them
 
-    def log_density(self, generator: LinearGaussian | Tensor, samples: Samples) -> Tensor:
+    def log_density(self, generator: tuple[Tensor, ...], samples: Samples) -> Tensor:
         """(m, T) of prefixes."""
-        if isinstance(generator, LinearGaussian):
-            return generator.log_prob(self.system, samples.x, samples.u).cumsum(1)
-        return self.policy.log_prob(generator, samples.obs, samples.u).cumsum(1)
+        if len(generator) > 1:
+            return LinearGaussian(*generator).log_prob(self.system, samples.x, samples.u).cumsum(1)
+        return self.policy.log_prob(generator[0], samples.obs, samples.u).cumsum(1)
 
-    def append(self, samples: Samples, *new: LinearGaussian | Tensor) -> Tensor:
+    def append(self, samples: Samples, *new: tuple[Tensor, ...]) -> Tensor:
         """Adds samples, and the generators that they are the first of; returns the samples' indices."""
         for generator in new:
-            self.generators.append(generator)
+            self.generators.append(tuple(generator))
             column = self.log_density(generator, self.samples).unsqueeze(1)
             self.samples = self.samples._replace(log_q=torch.cat((self.samples.log_q, column), 1))
         log_q = torch.stack([self.log_density(generator, samples) for generator in self.generators], 1)
@@ -453,16 +451,16 @@ class SampleSet:
         self.samples = Samples(*(torch.cat(tensors) for tensors in joined))
         return torch.arange(first, len(self.samples.u), device=log_q.device)
 
-    def score(self) -> Tensor:
-        """(m,) sum of a sample's weights under theta*; ties are broken by its density."""
+    def choose(self, active: int, newest: int) -> Tensor:
+        """Indices of theta*'s newest samples, of the initial guides', and of those with most weight under theta*.
+
+        Adapted guides have too many to keep them all. Density breaks ties.
+        """
         S, policy = self.samples, self.policy
         log_w = log_weights(policy.log_prob(policy.theta, S.obs, S.u), S.log_mixture)
-        return torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
-
-    def choose(self, active: int, newest: int) -> Tensor:
-        """Indices of theta*'s newest, of the initial guides' samples (adapted guides have too many), then by weight."""
-        score = torch.where(self.samples.source < self.initial, 2e9, self.score())
-        score[(self.samples.source == self.best).nonzero().flatten()[-newest:]] = 3e9
+        score = torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
+        score = torch.where(S.source < self.initial, 2e9, score)
+        score[(S.source == self.best).nonzero().flatten()[-newest:]] = 3e9
         return score.argsort(descending=True, stable=True)[:active].sort().values
 
     def prune(self, stored: int) -> None:
@@ -475,23 +473,17 @@ class SampleSet:
         self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
 
     def state_dict(self) -> dict[str, Any]:
-        numbers = {"best": self.best, "initial": self.initial}
-        return numbers | {"samples": tuple(self.samples), "generators": packed(self.generators)}
+        parts = {"samples": tuple(self.samples), "generators": self.generators}
+        return parts | {"best": self.best, "initial": self.initial}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.samples = Samples(*(tensor.to(self.system.device) for tensor in state["samples"]))
-        self.generators = unpacked(state["generators"], self.system.device)
+        self.samples = Samples(*moved(state["samples"], self.system.device))
+        self.generators = [moved(generator, self.system.device) for generator in state["generators"]]
         self.best, self.initial = state["best"], state["initial"]
 
 
-def packed(generators: Sequence[LinearGaussian | Tensor]) -> list[tuple[Tensor, ...]]:
-    """As a checkpoint holds them."""
-    return [tuple(g) if isinstance(g, LinearGaussian) else (g,) for g in generators]
-
-
-def unpacked(stored: list[tuple[Tensor, ...]], device: torch.device) -> list[Any]:
-    moved = ([tensor.to(device) for tensor in tensors] for tensors in stored)
-    return [LinearGaussian(*tensors) if len(tensors) > 1 else tensors[0] for tensors in moved]
+def moved(tensors: Iterable[Tensor], device: torch.device) -> tuple[Tensor, ...]:
+    return tuple(tensor.to(device) for tensor in tensors)
 
 
 # The policy -----------------------------------------------------------------------------------------------------------

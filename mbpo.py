@@ -25,7 +25,7 @@ from torch.func import functional_call
 from diffsim import DiffEnv
 from diffsim.planning import System
 from diffsim.tasks import find_task
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, seeing
@@ -322,6 +322,7 @@ class MBPO:
             obs, next_obs = (self.actor.normalizer(x) for x in (batch.obs, batch.next_obs))
             metrics.append(self.update_critics(batch, obs, next_obs) | self.update_actor(obs))
         found = {name: torch.stack([row[name] for row in metrics]).mean() for name in metrics[0]}
+        found["charts/learning_rate"] = self.actor_optimizer.lr
         return found | {"charts/temperature": self.temperature["log"].detach().exp()}
 
     def update_critics(self, batch: Transition, obs: Tensor, next_obs: Tensor) -> dict[str, Tensor]:
@@ -408,7 +409,7 @@ def train(args: Args) -> None:
         seeding = iteration * args.steps <= args.seed_steps
         run.log(explore() if seeding else collect() | fit() | imagine() | update())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, mbpo.policy))
+            run.evaluate(mbpo.policy)
 
 
 main = script(Args, train)

@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
@@ -388,6 +388,7 @@ class PPO:
         next_value = self.return_normalizer.inverse(next_value).masked_fill(window.terminated, 0.0)
         target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
         advantage = target - self.return_normalizer.inverse(window.value)
+        explained = 1 - advantage.var() / target.var()
         self.return_normalizer.update(target)
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
@@ -395,7 +396,7 @@ class PPO:
         for buffer, tensor in zip(self.batch, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(window.obs)
-        return {"charts/entropy": mixture.entropy().mean()}
+        return {"losses/entropy": mixture.entropy().mean(), "losses/explained_variance": explained}
 
     def learn(self) -> dict[str, Tensor]:
         """Descend the clipped loss in epochs of minibatches, then resample."""
@@ -426,7 +427,8 @@ class PPO:
         loss = policy_loss + VALUE_COEF * value_loss + BOUND_COEF * bound_loss
         if self.args.entropy_coef:
             loss = loss - self.args.entropy_coef * mixture.entropy().mean()
-        found = {"losses/policy": policy_loss.detach(), "losses/value": value_loss.detach(), "losses/kl": kl}
+        found = {"losses/policy_loss": policy_loss.detach(), "losses/value_loss": value_loss.detach()}
+        found |= {"losses/approx_kl": kl, "losses/clipfrac": ((ratio.detach() - 1).abs() > CLIP).to(kl.dtype).mean()}
         return found | {"grad/norm": self.optimizer.step(loss)}
 
 
@@ -454,7 +456,7 @@ def train(args: Args) -> None:
     for _ in run:
         run.log(interact() | learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, ppo.policy))
+            run.evaluate(ppo.policy)
 
 
 main = script(Args, train)

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, seeing
@@ -57,8 +57,8 @@ class Args(ParallelFlags):
     """particles, or one Gaussian"""
     particles: Several = 35
     """particles of each action"""
-    estimator: Literal["straight-through", "implicit"] = "straight-through"
-    """gradient of a sampled action in the particles' weights: the paper's, or the one without bias"""
+    estimator: Literal["implicit", "straight-through"] = "implicit"
+    """gradient of a sampled action in the particles' weights: the one without bias, or the paper's"""
     resampling_interval: Count = 20
     """iterations between resamplings"""
     resampling_noise: NonNegative = 0.1
@@ -355,6 +355,7 @@ class SAC:
             **{name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]},
             "grad/skipped": torch.stack([optimizer.skipped for optimizer in optimizers]).sum(),
             "charts/temperature": self.temperature["log"].detach().exp(),
+            "charts/learning_rate": self.optimizer.lr,
             **self.resampling.end_iteration(self.actor.head, self.optimizer),
         }
 
@@ -403,7 +404,7 @@ def train(args: Args) -> None:
     for _ in run:
         run.log(interact() | learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, sac.policy))
+            run.evaluate(sac.policy)
 
 
 main = script(Args, train)

@@ -23,7 +23,7 @@ from diffsim import DiffEnv
 from diffsim.planning import REAL, AfterStep, Cost, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, evaluate, fail, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import Flags
 from diffsim.training.layers import seeing
 from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
@@ -304,7 +304,8 @@ class PODS:
                 losses.append(loss.detach())
         per_epoch = torch.stack(losses).view(args.epochs, -1).mean(1)
         found = {"losses/imitation": per_epoch[-1], "losses/first_epoch": per_epoch[0]}
-        return found | {"grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        found |= {"grad/norm": norm, "grad/skipped": self.optimizer.skipped}
+        return found | {"charts/learning_rate": self.optimizer.lr}
 
 
 # The run --------------------------------------------------------------------------------------------------------------
@@ -318,7 +319,7 @@ def train(args: Args) -> None:
     for _ in run:
         run.log(improve() | imitate(), pods.control_steps)
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, pods.policy))
+            run.evaluate(pods.policy)
 
 
 main = script(Args, train)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import SymmetricFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
@@ -194,15 +194,16 @@ class PPO:
         next_value = self.return_normalizer.inverse(policy(normalizer(rollout.next_obs))[1])
         next_value = next_value.masked_fill(rollout.terminated, 0.0)
         advantage = gae(rollout.reward, value, next_value, rollout.done, args.gamma, args.gae_lambda)
-        self.return_normalizer.update(value + advantage)
-        target = self.return_normalizer(value + advantage)
+        returns = value + advantage
+        self.return_normalizer.update(returns)
+        target, explained = self.return_normalizer(returns), 1 - advantage.var() / returns.var()
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
         samples = normalizer(rollout.obs), rollout.mean, rollout.action, advantage, target
         for buffer, tensor in zip(self.batch, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
         normalizer.update(rollout.obs)
-        return {"charts/std": policy.log_std.exp().mean()}
+        return {"charts/std": policy.log_std.exp().mean(), "losses/explained_variance": explained}
 
     def update(self) -> dict[str, Tensor]:
         """Descend the clipped loss (Eq. 7) in epochs of minibatches."""
@@ -215,13 +216,16 @@ class PPO:
                 mean, value = policy(b.obs)
                 kl = kl_divergence(b.mean, old_log_std, mean.detach(), policy.log_std.detach())
                 adapt(self.optimizer.lr, distributed.average(kl), args.target_kl, args.lr_bounds)
-                policy_loss = clipped_loss(log_ratio(b, mean, policy.log_std, old_log_std), b.advantage, args.clip_coef)
+                ratio = log_ratio(b, mean, policy.log_std, old_log_std).exp()
+                policy_loss = clipped_loss(ratio, b.advantage, args.clip_coef)
                 value_loss = (value - b.target).square().mean()
                 bound_loss = (mean.abs() - 1.1).clamp(min=0).square().sum(-1).mean()
                 loss = policy_loss + args.value_coef * value_loss + args.bound_coef * bound_loss
-                norm = self.optimizer.step(loss - args.entropy_coef * entropy(policy.log_std))
-                metrics.append(torch.stack((policy_loss.detach(), value_loss.detach(), kl, norm)))
-        names = ("losses/policy", "losses/value", "losses/kl", "grad/norm")
+                bonus = entropy(policy.log_std)
+                clipped = ((ratio - 1).abs() > args.clip_coef).to(kl.dtype).mean()
+                norm = self.optimizer.step(loss - args.entropy_coef * bonus)
+                metrics.append(torch.stack((policy_loss, value_loss, bonus, kl, clipped, norm)).detach())
+        names = "losses/policy_loss losses/value_loss losses/entropy losses/approx_kl losses/clipfrac grad/norm".split()
         return dict(zip(names, torch.stack(metrics).mean(0), strict=True)) | {
             "grad/skipped": self.optimizer.skipped,
             "charts/learning_rate": self.optimizer.lr,
@@ -268,9 +272,8 @@ def kl_divergence(old_mean: Tensor, old_log_std: Tensor, mean: Tensor, log_std: 
     return (log_std - old_log_std + (ratio - 1) / 2).sum(-1).mean()
 
 
-def clipped_loss(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
-    """Minus the clipped surrogate objective (Eq. 7)."""
-    ratio = log_ratio.exp()
+def clipped_loss(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
+    """Minus the clipped surrogate objective (Eq. 7), of pi(a|s) / pi_old(a|s) (B,)."""
     return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
 
 
@@ -296,7 +299,7 @@ def train(args: Args) -> None:
     for _ in run:
         run.log(collect() | update())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, ppo.policy))
+            run.evaluate(ppo.policy)
 
 
 main = script(Args, train)

@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, seeing
@@ -200,6 +200,7 @@ class SAC:
         found = {name: torch.stack([row[name] for row in metrics]).mean() for name in (metrics[0] if learning else ())}
         optimizers = self.actor_optimizer, self.critic_optimizer, self.temperature_optimizer
         found["grad/skipped"] = torch.stack([optimizer.skipped for optimizer in optimizers]).sum()
+        found |= {"charts/actor_lr": self.actor_optimizer.lr, "charts/critic_lr": self.critic_optimizer.lr}
         return found | {"charts/temperature": self.temperature["log"].detach().exp()}
 
     @torch.no_grad()
@@ -274,7 +275,7 @@ def train(args: Args) -> None:
     for iteration in run:
         run.log(explore() if iteration * args.steps <= args.seed_steps else learn())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, sac.policy))
+            run.evaluate(sac.policy)
 
 
 main = script(Args, train)

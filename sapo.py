@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv, Integration
 from diffsim.tasks import TASKS
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import Run, distributed, evaluate, fail, script
+from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, seeing
@@ -294,6 +294,7 @@ class SAPO:
             "charts/reward": gained.mean(),
             "charts/entropy": entropy.mean(),
             "charts/temperature": self.temperature["log"].detach().exp().mean(),
+            "charts/actor_lr": self.actor_optimizer.lr,
         }
 
     def update_critic(self) -> dict[str, Tensor]:
@@ -309,7 +310,8 @@ class SAPO:
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
         skipped = torch.stack([optimizer.skipped for optimizer in self.optimizers]).sum()
-        return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        found = {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        return found | {"charts/critic_lr": self.critic_optimizer.lr}
 
     # Their parts ------------------------------------------------------------------------------------------------------
 
@@ -380,7 +382,7 @@ def train(args: Args) -> None:
         sapo.prepare(iteration)
         run.log(update_actor() | update_critic())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, sapo.policy))
+            run.evaluate(sapo.policy)
 
 
 main = script(Args, train)

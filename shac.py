@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, evaluate, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import Chain, folded, make_even, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
@@ -46,6 +46,7 @@ PER_TASK = {
 # Near the pose from which a robot learns to walk
 STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01, "adjoint_clip": 5.0}
 BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"), STANDING | {"horizon": 16})
+ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  # where environments cost little
 
 
 @dataclass
@@ -101,6 +102,8 @@ class Args(WindowFlags):
             values = {name: value for name, value in values.items() if name == "iterations"}
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
             values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
+        if self.device != "cpu":
+            values |= ON_GPU.get(self.env, {})
         return super().task_defaults() | values | BEGINNING.get(self.env, {})
 
 
@@ -205,7 +208,7 @@ class SHAC:
         self.value.copy_(value.view(-1, 1))
         self.obs.copy_(normalizer(rollout.obs).flatten(0, 1))
         normalizer.update(rollout.obs)
-        return {"losses/actor": loss.detach(), "grad/norm": norm}
+        return {"losses/actor": loss.detach(), "grad/norm": norm, "charts/actor_lr": self.actor_optimizer.lr}
 
     def update_critic(self) -> dict[str, Tensor]:
         """Fit the critic to the window's TD(lambda) returns (Eq. 6), and let the target critic follow."""
@@ -221,7 +224,8 @@ class SHAC:
         for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
             slow.lerp_(fast.detach(), 1 - args.target_alpha)
         skipped = self.actor_optimizer.skipped + self.critic_optimizer.skipped
-        return {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        found = {"losses/critic": torch.stack(losses).mean(), "grad/skipped": skipped}  # the loss of the last pass
+        return found | {"charts/critic_lr": self.critic_optimizer.lr}
 
     def next_values(self, rollout: Rollout) -> Tensor:
         """V(s_{t+1}) (H, N): of an episode's last state where it ran out of time, zero where it terminated."""
@@ -274,7 +278,7 @@ def train(args: Args) -> None:
         shac.set_learning_rates(iteration)
         run.log(update_actor() | update_critic())
         if run.evaluation_due:
-            run.log_evaluation(evaluate(run.eval_env, shac.policy))
+            run.evaluate(shac.policy)
 
 
 main = script(Args, train)

@@ -246,7 +246,7 @@ def read_cells(directory: Path) -> list[Cells]:
     rows, known = read_csv(directory / "cells.csv"), paces(directory)
     for row in rows:
         if (pace := known.get((row["learner"], row["task"]))) and not row["training (s)"]:
-            row["training (s)"] = str(pace(float(row["iterations"])))
+            row["training (s)"], row["paced"] = str(pace(float(row["iterations"]))), "*"
             each = float(row["control steps"]) / float(row["iterations"])
             for name in [name for name in row if name.startswith("control_steps to") and row[name]]:
                 row[name.replace("control_steps", "seconds")] = str(pace(float(row[name]) / each))

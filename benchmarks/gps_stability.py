@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from common import CommonFlags, run
 from gps_variants import gps
-from tables import Row, markdown
+from tables import Cells, Row, grouped, markdown
 from torch import Tensor
 
 from diffsim.planning import step_jacobian
@@ -56,13 +56,18 @@ def measure(env: str, iterations: int, args: Args) -> Iterator[Row]:
     error = ((mean.detach() - guide.u) / policy.sigma).square().mean().sqrt().item()
     for name, K in {"guide": guide.K, "policy": slopes}.items():
         rate = growth((A + B @ K)[:, 1:, 1:], system.control_dt)
-        yield {
-            "task": env,
-            "iLQR iterations": iterations,
-            "controller": name,
-            "growth (1/s)": rate,
-            "error (sigma)": error,
-        }
+        about = dict(zip(KEY, (env, iterations, name), strict=True))
+        yield about | {"growth (1/s)": rate, "error (sigma)": error}
+
+
+def table(rows: list[Cells]) -> list[Row]:
+    """A line for each example, a column for each controller's growth."""
+    return [
+        dict(zip(KEY, key, strict=False))
+        | {f"{row['controller']}, growth (1/s)": row["growth (1/s)"] for row in own}
+        | {"policy's error (sigma)": own[0]["error (sigma)"]}
+        for key, own in grouped(rows, *KEY[:2]).items()
+    ]
 
 
 def main(args: Args) -> None:
@@ -70,7 +75,7 @@ def main(args: Args) -> None:
         for iterations in args.iterations:
             for row in measure(env, iterations, args):
                 args.keep("gps_stability", row, KEY)
-    args.publish("gps stability", markdown(args.read("gps_stability")), "gps.md")
+    args.publish("gps stability", markdown(table(args.read("gps_stability"))), "gps.md")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, get_args
 
-import numpy as np
 import tables
 import tyro
 from common import TASKS, CommonFlags, Line, Panel, Part, Tasks, measured, plot, run
@@ -36,7 +35,7 @@ from diffsim.tasks import Accuracy, find_task
 from diffsim.training import Count, load_policy, parse
 from diffsim.training.checkpoint import POLICIES
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.monitor import Monitor, apart
+from diffsim.training.monitor import Monitor
 from diffsim.tune import actor, subject
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row as Measured
@@ -126,8 +125,7 @@ def measure_promise(args: Args, robot: str) -> Iterator[Row]:
     default = next(row for row in rows if row.setting == Setting(task.integration("default")))
     best, others = choice(rows, ERROR), motion_of(robot, OTHERS, seed=1)
     assert best is not None, "no setting is good enough"
-    ends = [others.replay(setting)[0][SPANS[-1]] for setting in (best.setting, finest(found))]
-    again = float(np.median(apart(others.scene.mj_model, *ends)))
+    again = others.error(others.replay(best.setting), others.replay(finest(found)), SPANS[-1])
     row: dict[str, object] = {
         "robot": Path(robot).stem,
         "chosen": f"{best.setting.kind}, {best.setting.integration.substeps}",

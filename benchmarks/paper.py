@@ -42,7 +42,7 @@ from diffsim.training.evaluation import kept
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
 SENTINELS = 3  # cells, each with as many seeds
-UNTIMED = ("task", "learner", "return", "in the reference", "target", "steps to target")
+TIMED = ("task", "learner", "return", "training (s)", "s to target", "steps to target", "falls")  # that a page shows
 
 
 @dataclass
@@ -210,14 +210,15 @@ def line(rows: Sequence[Cells]) -> Row:
     """Of all seeds of a learner on a task: medians, of the return also the range, of the falls the most."""
     returns, task = numbers(rows, "return"), rows[0]["task"]
     shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"]}
-    shown["return"] = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
+    shown["return"] = f"{median(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
     shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
     shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}", "kept": middle(rows, "kept", ".3f")}
     shown |= {"in the reference": middle(rows, "in the reference", ".0f")}
     shown |= {name: middle(rows, name, ".2f") for name in ("speed", "speed in MuJoCo")}
     target = RETURNS[task].target
-    seconds, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
-    shown |= {"target": target, "s to target": "" if math.isnan(seconds) else tell(seconds, ".0f")}
+    time, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
+    shown |= {"paced": max(row.get("paced", "") for row in rows)}
+    shown |= {"s to target": "" if math.isnan(time) else tell(time, ".0f")}
     return shown | {"steps to target": tell(steps / 1e6, ".3g") + " M" * (steps < math.inf)}
 
 
@@ -231,21 +232,38 @@ def table(args: Args, name: str) -> list[Row]:
     rows = read_cells(args.directory.parent / group.machine)
     for task in group.tasks:
         for learner in group.learners:
-            wanted = {str(seed) for seed in range(1, group.seeds + 1)}
-            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task) and row["seed"] in wanted]
-            own = [row for row in own if cells.counts(row, group.timed)]
-            if len(own) == group.seeds and len({row["trained on"] for row in own}) == 1:
+            seeds = max(each.seeds for each in Cell(group.machine, learner, task, 1).groups)  # the same in all tables
+            own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
+            own = [row for row in own if int(row["seed"]) <= seeds and cells.counts(row, group.timed)]
+            if len(own) == seeds and len({row["trained on"] for row in own}) == 1:
                 lines.append(line(own))
     return lines
 
 
+def seconds(row: Row) -> str:
+    """Of the training, marked if computed from the time of an iteration, and in all, from the command to its end."""
+    whole = f" ({row['in all (s)']})" if row["in all (s)"] else ""
+    return f"{row['training (s)']}{row['paced']}{whole}"
+
+
 def printed(args: Args, name: str) -> str:
-    """A group's table, without tasks that have a single line, which compares nothing."""
+    """A group's table: a line for each learner and task or, without seconds, for each task.
+
+    A task that has a single learner is left out: it compares nothing.
+    """
     if GROUPS[name].ratios:
         return markdown(ratios(args, name))
     rows = table(args, name)
     count = Counter(row["task"] for row in rows)
-    return markdown([row for row in rows if count[row["task"]] > 1], None if GROUPS[name].timed else UNTIMED)
+    rows = [{**row, "training (s)": seconds(row)} for row in rows if count[row["task"]] > 1]
+    if GROUPS[name].timed:
+        return markdown(rows, TIMED)
+    lines = dict[object, dict[str, object]]()
+    for row in rows:
+        of_task = lines.setdefault(row["task"], {"task": row["task"]})
+        of_task[str(row["learner"])] = f"{row['return']}<br>{row['steps to target']}"
+    columns = [learner for learner in GROUPS[name].learners if any(learner in each for each in lines.values())]
+    return markdown([*lines.values()], ("task", *columns))
 
 
 def check(args: Args) -> str:

@@ -13,7 +13,6 @@ A machine that does something else meanwhile gives wrong numbers.
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import json
 import math
@@ -43,6 +42,8 @@ from diffsim.kernels.lanes import divide
 from diffsim.sim.launcher import TooLargeError, available_cores
 from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
+from diffsim.tune.front import clock
+from diffsim.tune.motion import without
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
@@ -84,13 +85,6 @@ def random_states(name: str, num_envs: int, count: int) -> list[State]:
             states.append((env.qpos.double(), env.qvel.double(), action.double()))
         env.step(action)
     return states
-
-
-def clock(device: torch.device) -> float:
-    """Seconds, once the device has done what it was told."""
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
 
 
 def timer(sim: Simulator) -> Callable[[State], Times]:
@@ -152,8 +146,7 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
     if "muscle" in whole.features:
-        none = {name: getattr(whole, name)[:0] for name in ("segment_link", "segment_position", "segment_muscle")}
-        scenes = {"muscles": whole, "no muscles": dataclasses.replace(whole, **none)}
+        scenes = {"muscles": whole, "no muscles": without(whole, "muscle")}
     if name == "hopper":
         scenes["rough ground"] = whole.with_terrain(rough(0))
     for num_envs in args.num_envs:

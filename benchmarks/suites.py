@@ -36,6 +36,7 @@ SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",
     "each": lambda values: ", ".join(f"{value:.1f}" for value in values),
+    "each, rounded": lambda values: ", ".join(f"{value:.0f}" for value in values),
     "all": lambda values: "-".join(dict.fromkeys(f"{value:.0f}" for value in (min(values), max(values)))),
 }
 
@@ -47,6 +48,7 @@ class Suite(NamedTuple):
     table: dict[str, tuple[str, str]]  # how to SHOW which column of the csv file
     cells: dict[str, str]  # flags by the cells' names
     groups: dict[str, list[tuple[list[str], list[int], str]]]  # cells, seeds, and their script, task and other flags
+    across: bool = False  # one table of all groups
 
 
 SUITES = {
@@ -101,6 +103,25 @@ def table(suite: Suite, rows: Sequence[Cells]) -> list[Row]:
     return [*lines.values()]
 
 
+def across(suite: Suite, rows: Sequence[Cells]) -> list[Row]:
+    """A line for each cell, a column for each group. What has a title is a line of the first cell only."""
+    first, titles = next(iter(suite.cells)), [title for title in suite.table if title]
+    lines = {name: {"case": name} | dict.fromkeys(suite.groups, "") for name in (*titles, *suite.cells)}
+    for (group, cell), own in grouped(rows, "group", "cell").items():
+        for title, (how, column) in suite.table.items():
+            if cell == first or not title:
+                lines[title or cell][group] = SHOW[how](numbers(own, column))
+    return [line for line in lines.values() if any([*line.values()][1:])]
+
+
+def shown(group: str, rows: Sequence[Cells]) -> tuple[str, str]:
+    """The name of a group's table, and its text."""
+    suite = SUITES[GROUPS[group]]
+    if suite.across:
+        return GROUPS[group], markdown(across(suite, rows))
+    return group, markdown(table(suite, [row for row in rows if row["group"] == group]))
+
+
 def main(args: Args) -> None:
     check_names("--only", args.only, GROUPS)
     check_names("--cells", args.cells, {cell for suite in SUITES.values() for cell in suite.cells})
@@ -111,8 +132,7 @@ def main(args: Args) -> None:
             runner.train(case)
             if not args.train_only and (found := line(suite, case.folder)):
                 args.keep(suite.csv, {"group": group, "cell": cell, "seed": case.seed} | found, KEY)
-        rows = [row for row in args.read(suite.csv) if row["group"] == group]
-        args.publish(group, markdown(table(suite, rows)), suite.page, everywhere=True)
+        args.publish(*shown(group, args.read(suite.csv)), suite.page, everywhere=True)
 
 
 if __name__ == "__main__":

@@ -156,8 +156,18 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
+def shown(rows: list[dict[str, str]]) -> list[Row]:
+    """The lines of the page."""
+    lines = list[Row]()
+    for line in table(rows):
+        retained = f"{line['kept']} ({line['worst']})" if line["kept"] else ""
+        cells = {name: line[name] for name in ("task", "learner", "seeds", "here", "MuJoCo x1")}
+        lines.append(cells | {"retained (worst)": retained, "episodes without a fall": line["whole"]})
+    return lines
+
+
 def main(args: Args) -> None:
-    measured(args, Part("transfer", measure, (*ABOUT[:-1], "condition"), "transfer", "transfer.md", table))
+    measured(args, Part("transfer", measure, (*ABOUT[:-1], "condition"), "transfer", "transfer.md", shown))
 
 
 if __name__ == "__main__":

@@ -5,14 +5,14 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import torch
 from numpy.typing import ArrayLike
 
 from diffsim import startup
-from diffsim.env import DiffEnv, RenderMode
+from diffsim.env import DiffEnv
 from diffsim.kernels.lanes import Division
 from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
@@ -66,7 +66,7 @@ def make(
     early_termination: bool = True,
     max_episode_steps: int | None = None,
     adjoint_clip: float = 0.0,
-    render_mode: RenderMode | None = None,
+    render_mode: Literal["rgb_array"] | None = None,
     threads: int | None = None,
     factors: bool = False,
     forces: bool = False,
@@ -103,7 +103,7 @@ def make(
         early_termination: end episodes where the task reports a fall.
         max_episode_steps: control steps after which an episode is truncated. Default: the task's episode_length.
         adjoint_clip: bound of each environment's state gradients, as a multiple of the batch's median; 0: none.
-        render_mode: "rgb_array" (DiffEnv.render returns pictures) or "human" (a window).
+        render_mode: "rgb_array": DiffEnv.render returns pictures.
         threads: CPU threads of the kernels. Default: as many as have work.
         factors, forces: enable Simulator.factors (constants that differ between environments), Simulator.forces.
         block: environments per vector of a CPU thread, 1, 8 or 16. Default: the fastest.

@@ -113,7 +113,7 @@ def train(learner: Positional[str]) -> None:
 
 
 def view() -> None:
-    """Show a run as video, page, window or plot: diffsim view runs/<run> --web ant.html, and --help for its flags."""
+    """Show a run as video or page: diffsim view runs/<run> --web ant.html, and --help for its flags."""
 
 
 def check(robot: Positional[Path], contact: Contact = "mujoco", seconds: float = 20.0) -> None:
@@ -144,9 +144,7 @@ def _give_up(robot: Path, seconds: float) -> None:
     os._exit(1)
 
 
-def export(
-    checkpoint: Positional[Path], output: Positional[Path], env: str | None = None, half: bool = False
-) -> None:
+def export(checkpoint: Positional[Path], output: Positional[Path], env: str | None = None, half: bool = False) -> None:
     """Write the policy of a checkpoint alone: OUTPUT.pt for this package, or OUTPUT.onnx for other programs.
 
     Args:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Iterable, Mapping
 from numbers import Integral
 from typing import Any, Literal
@@ -28,11 +26,7 @@ from diffsim.tasks import Task
 from diffsim.terrain import Elevation
 
 State = tuple[Tensor, Tensor, Tensor, Tensor]  # qpos, qvel, observation and memory, (N, ...) each
-RenderMode = Literal["rgb_array", "human"]
 Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
-# What works here, as tools try whatever an environment declares: a window needs a display.
-DISPLAY = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-RENDER_MODES = ["rgb_array", "human"] if DISPLAY else ["rgb_array"]
 STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_statistics
 
 
@@ -57,28 +51,27 @@ class DiffEnv(VectorEnv):
 
     Args:
         task: task on the simulator's device and dtype.
-        scene: its robot. On a terrain, heights that the task knows (of start, observation, reward and end) are those
-            over the ground straight below the root; `qpos` remains the world's.
+        scene: its robot. On a terrain the task measures heights (of start, observation, reward and end) from the ground
+            below the root. `qpos` stays in the world frame.
         num_envs, horizon: see Simulator.
         integration: default the task's "default".
         seed: of the random start states.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
-        early_termination: end episodes where the task says that the robot has fallen.
+        early_termination: end episodes where the task reports a fall.
         max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
         adjoint_clip: after each step, gradients with respect to an environment's state are scaled down to at most this
             many times the batch's median, see sim/adjoint.py; 0: not at all.
-        render_mode: "rgb_array": `render` returns a frame of each environment; "human": a window follows the first.
-        **options: device, dtype, threads, factors, forces, block, division: see sim.Options. `env.sim` has the factors
-            and the forces.
+        render_mode: with "rgb_array" `render` returns a frame of each environment.
+        **options: device, dtype, threads, factors, forces, block, division: see sim.Options.
 
     Attributes:
         qpos, qvel: (N, nq), (N, nv) the current state in MuJoCo's conventions.
         episode_step: (N,) int64 control steps since each environment's start.
-        memory: (N, num_memory) what the task keeps from step to step.
+        memory: (N, num_memory) the task's numbers that persist from step to step.
         generator: the torch.Generator of the start states.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": RENDER_MODES}
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"]}
 
     @in_plain_mode
     def __init__(
@@ -94,7 +87,7 @@ class DiffEnv(VectorEnv):
         early_termination: bool = True,
         max_episode_steps: int | None = None,
         adjoint_clip: float = 0.0,
-        render_mode: RenderMode | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
         **options: Any,
     ) -> None:
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
@@ -109,11 +102,10 @@ class DiffEnv(VectorEnv):
             self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
         self.sim = Simulator(scene, num_envs, control_dt=task.control_dt, horizon=horizon, **asked._asdict())
         self.metadata = self.metadata | {"render_fps": round(1 / task.control_dt)}
-        self.render_mode, self._screen = render_mode, None
-        if render_mode:  # otherwise no picture is loaded
-            from diffsim.view.screen import Screen
-
-            self._screen = Screen(scene, render_mode, 1 / task.control_dt)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is {render_mode!r}, must be 'rgb_array'; `diffsim drive` shows a robot live")
+        self.render_mode = render_mode
+        self._renderer: Any = None  # made with the first picture
         self.stochastic_init, self.early_termination = stochastic_init, early_termination
         if not is_real(adjoint_clip) or not 0 <= adjoint_clip < math.inf:
             raise ValueError(f"adjoint_clip is {adjoint_clip!r}, must be a factor of at least 0")
@@ -135,6 +127,7 @@ class DiffEnv(VectorEnv):
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
         self.qpos, self.qvel, self._obs, self.memory = self._draw(1)[0]
         self._recorded = 0  # differentiable steps since the window began
+        self._pinned: State | None = None
         self._starts, self._time = self._draw(horizon), 0  # of the window: one batch of operations, not one per step
 
     @property
@@ -144,14 +137,14 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Start all episodes anew, and a window; or only the episodes of options={"reset_mask": mask (N,) bool}.
+        """Restart all episodes, or those of options={"reset_mask": mask (N,) bool}, and begin a window.
 
         Returns:
             obs (N, obs_dim) of all environments, and an empty info.
 
         Raises:
-            ValueError: several seeds, as one generator draws all start states; a mask of another shape or dtype;
-                unknown options.
+            ValueError: several seeds (one generator draws all start states); a mask of another shape or dtype; unknown
+                options.
         """
         mask = self._mask(options) if options else torch.ones_like(self.episode_step, dtype=torch.bool)
         if seed is not None:
@@ -159,8 +152,9 @@ class DiffEnv(VectorEnv):
         if not options:
             self._cut()
         self._begin(mask, self._draw(1)[0])
+        if self._pinned is not None:
+            self.carry_over(self._pinned)
         self._starts, self._time = self._draw(self.horizon), 0
-        self._show()
         return self._obs.clone(), {}
 
     @in_plain_mode
@@ -174,7 +168,7 @@ class DiffEnv(VectorEnv):
             obs (N, obs_dim), reward (N,), terminated (N,), truncated (N,), info with
             "final_obs" (N, obs_dim): the observation before any reset, valid for every environment; "_final_obs" (N,)
             marks those that ended; "episode": {"r": return, "l": control steps, "t": simulated seconds} (N,) each,
-            valid under "_episode"; "nonfinite" (N,): environments that blew up, which end with reward 0.
+            valid under "_episode"; "nonfinite" (N,): environments whose simulation failed, which end with reward 0.
 
         Raises:
             ValueError: action of the wrong shape, dtype or device; an ActionError on the CPU if it is not a number.
@@ -188,7 +182,7 @@ class DiffEnv(VectorEnv):
         return self._obs.clone(), reward, terminated, truncated, info
 
     def advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """`step` without the reset: obs is info["final_obs"], and what has ended waits for `reset`."""
+        """`step` without the reset: obs is info["final_obs"], and ended episodes wait for `reset`."""
         self.sim.check_tensor("action", action, self.scene.nu)
         if self.device.type == "cpu" and bool(torch.isnan(action).any()):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
@@ -223,7 +217,6 @@ class DiffEnv(VectorEnv):
             self._statistics["return"].addcmul_(done, self._episode_return)
             self._statistics["length"].addcmul_(done, length)
             self._statistics["nonfinite"] += nonfinite
-        self._show()
         info = {"final_obs": obs, "_final_obs": done, "episode": episode, "_episode": done, "nonfinite": nonfinite}
         return obs, reward, terminated, truncated, info
 
@@ -244,23 +237,28 @@ class DiffEnv(VectorEnv):
             raise ValueError(f"reset_mask must be an array or a tensor, bool ({self.num_envs},)")
         return mask.to(self.device)
 
-    def render(self) -> Frames | None:
-        """A frame (height, width, 3) of each environment in render_mode "rgb_array"; None in "human".
+    def render(self) -> Frames:
+        """A frame (height, width, 3) of each environment.
 
         Raises:
-            RuntimeError: made without render_mode; no OpenGL, or no display for a window.
+            RuntimeError: made without render_mode; no OpenGL.
         """
-        if self._screen is None:
+        if not self.render_mode:
             raise RuntimeError('there is no picture without a render_mode: make the environment with "rgb_array"')
-        return self._screen.show(self.qpos.numpy(force=True))
+        if self._renderer is None:
+            from diffsim.view import render  # here: otherwise no picture is loaded
+
+            self._renderer = render.Renderer(self.scene, *render.VIDEO_SIZE)
+        return tuple(self._renderer.draw(row, profile=k) for k, row in enumerate(self.qpos.numpy(force=True)))
 
     def close_extras(self, **_: Any) -> None:
-        if self._screen is not None:
-            self._screen.close()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     @in_plain_mode
     def detach(self) -> Tensor:
-        """Cut the graph at the current state, start a new window there, and return its observation (N, obs_dim)."""
+        """Cut the graph at the current state, begin a window there, and return observations (N, obs_dim)."""
         self._cut()
         self._starts, self._time = self._draw(self.horizon), 0
         return self._obs.clone()
@@ -273,7 +271,8 @@ class DiffEnv(VectorEnv):
     def pin(self) -> State:
         """Copy the state into fixed buffers, from which a CUDA graph replays the window; see graph.py."""
         self._put(part.detach().clone() for part in self._state())
-        return self._state()
+        self._pinned = self._state()
+        return self._pinned
 
     def carry_over(self, start: State) -> None:
         """End a captured window: write the state back to where it started, as returned by `pin`."""
@@ -309,7 +308,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def set_state(self, qpos: Tensor, qvel: Tensor) -> Tensor:
-        """Put all environments into given states, keeping their episode clocks; returns the observation (N, obs_dim).
+        """Set the states of all environments, but not their episode clocks, and return observations (N, obs_dim).
 
         Gradients flow into qpos (N, nq) and qvel (N, nv). The last action in the observation is 0.
 
@@ -325,13 +324,13 @@ class DiffEnv(VectorEnv):
         return self._obs.clone()
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        """What the task observes (N, obs_dim) of states, with its memory."""
+        """The task's observation (N, obs_dim) of states, with its memory."""
         if self._elevation is not None:
             qpos = self._elevation.lower(qpos)
         return self.task.observe_with(qpos, qvel, action, self.memory)
 
     def state_dict(self) -> dict[str, Any]:
-        """What continues the episodes exactly, as of the start of a window; not the simulator's factors and forces."""
+        """A dictionary that continues the episodes exactly, without the simulator's factors and forces."""
         names = ("qpos", "qvel", "obs", "memory", "episode_step", "episode_return")
         parts = zip(names, (*self._state(), self.episode_step, self._episode_return), strict=True)
         tensors = {name: part.detach().clone() for name, part in parts if name != "memory" or self.task.num_memory}
@@ -339,7 +338,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a state_dict of the same task, size and dtype (else ValueError); call `detach` next."""
+        """Continue from a state_dict of the same task, size and dtype, else ValueError. Call `detach` next."""
         own = self.state_dict()
         if state.keys() != own.keys():
             raise ValueError(f"the state has {', '.join(state)}; that of an environment has {', '.join(own)}")
@@ -367,7 +366,3 @@ class DiffEnv(VectorEnv):
 
     def _uniform(self, *size: int) -> Tensor:
         return torch.rand(size, generator=self.generator, dtype=self.dtype, device=self.device)
-
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self.render()

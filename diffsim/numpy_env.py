@@ -39,24 +39,23 @@ class NumpyEnv(gymnasium.Env[Array, Array]):
     @in_plain_mode
     @torch.no_grad()
     def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, Info]:
-        """One control step; as of DiffEnv.step, for action (nu,). info["nonfinite"]: the simulation blew up."""
+        """One control step with action (nu,), see DiffEnv.step. info["nonfinite"]: the simulation failed."""
         obs, reward, terminated, _, info = self.env.advance(to_action(self.env, np.reshape(action, (1, -1))))
         return to_numpy(obs)[0], reward.item(), bool(terminated), False, {"nonfinite": bool(info["nonfinite"])}
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """A frame (height, width, 3) in render_mode "rgb_array"; in "human" the window has it after every step."""
-        frames = self.env.render()
-        return frames[0] if frames else None
+    def render(self) -> NDArray[np.uint8]:
+        """A frame (height, width, 3)."""
+        return self.env.render()[0]
 
     def close(self) -> None:
         self.env.close()
 
 
 class NumpyVectorEnv(VectorWrapper):
-    """DiffEnv with arrays in place of tensors: actions, what a step returns, and all infos; no gradients.
+    """DiffEnv with NumPy arrays instead of tensors, without gradients.
 
-    gymnasium's ArrayConversion would do but for this: callers may write into what they get, and actions may be of any
-    real type.
+    It returns copies, which callers may change, and takes actions of any real type; gymnasium's ArrayConversion does
+    neither.
     """
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Array, Info]:

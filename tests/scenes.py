@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -214,6 +215,27 @@ def grounded_states(scene: Scene, count: int, rng: np.random.Generator) -> tuple
     qvel[::2] *= 0.02  # so that some contacts stick
     return raise_ground(scene, qpos), (qpos, qvel, ctrl)
 
+
+# A free box of three unlike sides, two more on hinges about unlike axes, one of them on a slide besides. It is fast in
+# its fluid, so that both parts of the law count. A planar root is the swimmer's.
+FISH = """
+<mujoco>
+  <option density="300" viscosity="2" gravity="0.3 -0.2 -9.81"/>
+  <default> <geom contype="0" conaffinity="0"/> </default>
+  <worldbody>
+    <body>
+      <freejoint/> <geom type="box" size="0.2 0.1 0.05" euler="10 20 30" pos="0.1 0.02 0.03" density="400"/>
+      <body pos="0.3 0 0.1">
+        <joint name="a" axis="0.2 1 0.1" damping="0.1"/> <geom type="box" size="0.1 0.05 0.2" density="400"/>
+        <body pos="0 0.1 0.2">
+          <joint axis="0 0 1" type="slide"/> <joint name="b" axis="1 0 0.3"/>
+          <geom type="capsule" size="0.05 0.2" euler="40 0 0" density="400"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator> <motor joint="a" gear="5"/> <motor joint="b" gear="5"/> </actuator>
+</mujoco>"""
 
 # A pendulum on a cart that is pulled from the wall.
 CRANE = """
@@ -478,3 +500,23 @@ def with_motors(path: str | Path) -> mujoco.MjSpec:
         motor.forcerange = forces
     spec.compile()
     return spec
+
+
+MUSCLE = '<muscle name="winch" tendon="rope" force="9" lengthrange=".5 3" range="0.6 1.5"/>'
+# Robots of one kind of element each, with the features that they are for
+SMALL = {
+    "ball joint on the world": (SHOULDER, "ball damping motor slide stiffness"),
+    "servos": (FREE_SERVOS, "damping hinge motor slide stiffness"),
+    "gravity compensation": (COMPENSATED, "base_damping damping floating gravcomp hinge slide"),
+    "fluid": (FISH, "damping drag floating hinge motor slide"),
+    "muscles": (leg(grounded=True), "ball contact damping floating hinge limit motor muscle stiffness"),
+    "muscle on the world": (CRANE, "hinge muscle slide"),
+    "muscle by its maximum force": (re.sub("<motor.*/>", MUSCLE, CRANE), "hinge muscle slide"),
+}
+
+
+def small_scene(name: str) -> Scene:
+    xml, features = SMALL[name]
+    scene = parse(xml)
+    assert scene.features == {*features.split()}
+    return scene

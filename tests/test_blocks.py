@@ -10,8 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import BALL, PENDULUM, acting_states, grounded_states, leg_scene, parse, task_scene
-from test_drag import FISH, states_of
+from scenes import (
+    BALL,
+    PENDULUM,
+    acting_states,
+    free_states,
+    grounded_states,
+    leg_scene,
+    parse,
+    small_scene,
+    task_scene,
+)
 from test_terrain import HILLS, everywhere, hopping, pressed
 
 from diffsim.robot.scene import FACTORS
@@ -30,8 +39,8 @@ def case(name: str, rng: np.random.Generator):
     if name == "leg":
         return grounded_states(leg_scene(grounded=True), COUNT, rng)
     if name == "fish":
-        scene = parse(FISH)
-        return scene, tuple(np.resize(x, (COUNT, x.shape[1])) for x in states_of(scene, rng))
+        scene = small_scene("fluid")
+        return scene, free_states(scene, COUNT, rng)
     if name == "ball on hills":
         scene = parse(BALL).with_terrain(HILLS)
         return scene, pressed(scene, everywhere(rng)[:COUNT], rng)

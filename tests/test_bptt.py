@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 import torch
 from learners import assert_derivatives, read_progress, run
@@ -23,7 +20,7 @@ def build(task: str, *arguments: str, dtype: torch.dtype = torch.float32) -> bpt
 
 
 @pytest.mark.parametrize("horizon", [1, 12])
-def test_loss_and_its_gradient_are_those_of_a_loop(rng: np.random.Generator, horizon: int) -> None:
+def test_loss_and_its_gradient_are_those_of_a_loop(rng, horizon):
     """Eq. 8 without a value, each environment on its own; a fifth of the steps ends an episode."""
     gamma = 0.97
     reward = torch.tensor(rng.normal(size=(horizon, 50)), requires_grad=True)
@@ -39,7 +36,7 @@ def test_loss_and_its_gradient_are_those_of_a_loop(rng: np.random.Generator, hor
     torch.testing.assert_close(torch.autograd.grad(result, reward), torch.autograd.grad(loss, reward))
 
 
-def test_gradient_is_the_finite_difference() -> None:
+def test_gradient_is_the_finite_difference():
     """Through a whole window of three ants of which one runs out of time."""
     torch.manual_seed(0)
     learner = build("ant", "--hidden", "16", "--horizon", "8", dtype=torch.float64)
@@ -58,7 +55,7 @@ def test_gradient_is_the_finite_difference() -> None:
     assert_derivatives(dict(policy.named_parameters()), loss, places, rel=1e-5)
 
 
-def test_large_gradients_are_followed() -> None:
+def test_large_gradients_are_followed():
     """An exploding gradient is what this baseline is about. An infinite one is skipped."""
     optimizer = build("cartpole").optimizer
     before, weights = optimizer.vector.clone(), optimizer.parameters
@@ -71,7 +68,7 @@ def test_large_gradients_are_followed() -> None:
     assert optimizer.max_norm == 1.0 and optimizer.betas == (0.7, 0.95)
 
 
-def test_the_learning_rate_decays_linearly() -> None:
+def test_the_learning_rate_decays_linearly():
     learner = build("cartpole", "--iterations", "10")
     for iteration in (1, 4, 10):
         learner.set_learning_rate(iteration)
@@ -79,13 +76,13 @@ def test_the_learning_rate_decays_linearly() -> None:
 
 
 @pytest.mark.parametrize("flag", ["--normalize-obs", "--no-normalize-obs"])
-def test_observations_are_normalized_on_request(flag: str, tmp_path: Path) -> None:
+def test_observations_are_normalized_on_request(flag, tmp_path):
     arguments = f"--env cartpole --num-envs 2 --horizon 8 --iterations 2 {flag} --eval-episodes 1 --quiet"
     policy = run(bptt, tmp_path, *arguments.split())["modules"]["actor"]
     assert policy["normalizer.count"] == (2 * 8 * 2 if flag == "--normalize-obs" else 0)
 
 
-def test_a_window_as_long_as_the_episode_swings_the_pole_up_in_part(tmp_path: Path) -> None:
+def test_a_window_as_long_as_the_episode_swings_the_pole_up_in_part(tmp_path):
     """From -2,375 per episode of 240 steps to -1,890; a wrong sign only gets worse."""
     arguments = "--env cartpole --num-envs 16 --horizon 240 --iterations 8 --eval-episodes 1 --quiet"
     run(bptt, tmp_path, *arguments.split())

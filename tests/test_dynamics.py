@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 
 import mujoco
 import numpy as np
@@ -13,21 +12,19 @@ import torch
 from scenes import (
     BALL,
     BOUNDED_SERVOS,
-    COMPENSATED,
-    CRANE,
     DISTINCT_CASES,
-    FREE_SERVOS,
     ROBOTS,
     SHOULDER,
+    SMALL,
     acceleration,
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
-    leg_scene,
     parse,
     pass_limits,
     raise_ground,
     run,
+    small_scene,
     task_scene,
     tree_scene,
     unit,
@@ -96,15 +93,9 @@ def test_tree_accelerations_are_mujocos(base, seed, rng):
     check_against_mujoco(tree_scene(base, seed), torch.float64, rng)
 
 
-def test_ball_joint_on_the_world_has_mujocos_accelerations(rng):
-    check_against_mujoco(parse(SHOULDER), torch.float64, rng)
-
-
-def test_servos_push_as_mujocos(rng):
-    """Springs and dampers of position, velocity and general actuators add up with each other and with the joints'."""
-    scene = parse(FREE_SERVOS)
-    assert scene.features == {"hinge", "slide", "stiffness", "damping", "motor"}
-    check_against_mujoco(scene, torch.float64, rng)
+@pytest.mark.parametrize("name", SMALL)
+def test_accelerations_of_small_robots_are_mujocos(name, rng):
+    check_against_mujoco(small_scene(name), torch.float64, rng)
 
 
 def bounded_servos(count, rng):
@@ -132,26 +123,6 @@ def test_bounds_of_actuators_are_mujocos(rng):
     check_against_mujoco(scene, torch.float32, rng)  # in blocks
     for theta in (0.0, 0.5):
         check_against_reference(scene, *(x[:8] for x in states), "implicit", 16, theta)
-
-
-def test_gravity_compensation_and_a_free_joints_inertia_are_mujocos(rng):
-    scene = parse(COMPENSATED)
-    assert scene.features == {"floating", "hinge", "slide", "gravcomp", "damping", "base_damping"}
-    check_against_mujoco(scene, torch.float64, rng)
-    check_against_reference(scene, *free_states(scene, 4, rng), "implicit", 4)
-
-
-def test_muscles_pull_as_mujocos(rng):
-    check_against_mujoco(leg_scene(grounded=True), torch.float64, rng)
-
-
-def test_muscle_on_the_world_pulls_as_mujocos(rng):
-    check_against_mujoco(parse(CRANE), torch.float64, rng)
-
-
-def test_a_muscle_pulls_with_its_maximum_force_alone(rng):
-    muscle = '<muscle name="winch" tendon="rope" force="9" lengthrange=".5 3" range="0.6 1.5"/>'
-    check_against_mujoco(parse(re.sub("<motor.*/>", muscle, CRANE)), torch.float64, rng)
 
 
 # Against the plain NumPy reference
@@ -183,15 +154,19 @@ def test_tree_steps_are_the_references(base, seed, rng):
     check_against_reference(scene, qpos, qvel, ctrl, "semi_implicit", 16)
 
 
-@pytest.mark.parametrize("theta", [0.0, 0.5])
-def test_ball_joint_takes_implicit_steps_as_the_reference(theta, rng):
-    scene = parse(SHOULDER)
-    check_against_reference(scene, *free_states(scene, 4, rng), "implicit", 4, theta)
-
-
-def test_muscle_steps_are_the_references(rng):
-    scene = leg_scene(grounded=True)
-    check_against_reference(scene, *free_states(scene, 4, rng), "semi_implicit", 16)
+@pytest.mark.parametrize(
+    "name, integrator, substeps, theta",
+    [
+        ("ball joint on the world", "implicit", 4, 0.0),
+        ("ball joint on the world", "implicit", 4, 0.5),
+        ("gravity compensation", "implicit", 4, 0.0),
+        ("fluid", "semi_implicit", 4, 0.0),
+        ("muscles", "semi_implicit", 16, 0.0),
+    ],
+)
+def test_steps_of_small_robots_are_the_references(name, integrator, substeps, theta, rng):
+    scene = small_scene(name)
+    check_against_reference(scene, *free_states(scene, 4, rng), integrator, substeps, theta)
 
 
 def test_ball_joints_know_a_quaternion_and_its_negative_as_one(rng):

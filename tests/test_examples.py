@@ -84,7 +84,7 @@ def test_system_identification(truth: dict[str, float], monkeypatch: pytest.Monk
 @pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_pictures(tmp_path: Path) -> None:
-    """Those of docs/examples.md."""
+    """Those of docs/gymnasium.md."""
     load("system_identification").main(tmp_path / "found.png")
     load("trajectory_optimisation").optimise(guesses=2, iterations=1, video=tmp_path / "swing_up.gif")
     assert (tmp_path / "found.png").read_bytes()[:4] == b"\x89PNG"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
@@ -18,12 +19,12 @@ from scenes import (
     acting_states,
     check_that_ground_and_limits_act,
     free_states,
-    leg_scene,
     parse,
     pass_limits,
     raise_ground,
     random_tree,
     run,
+    small_scene,
     task_scene,
     tree_scene,
     without_ground,
@@ -121,8 +122,9 @@ def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
     check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(integrator, theta=theta))
 
 
-def test_muscle_gradient_is_that_of_differences(rng):
-    scene = leg_scene(grounded=True)
+@pytest.mark.parametrize("name", ["muscles", "fluid"])
+def test_gradient_of_small_robots_is_that_of_differences(name, rng):
+    scene = small_scene(name)
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))
 
 
@@ -167,6 +169,21 @@ def test_limit_lets_go_of_a_joint_that_returns_fast(integrator):
         slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
         spring = -scene.stiffness[1] * h / inertia  # of 1e-300
         np.testing.assert_allclose(slopes, [spring, 1, 3 * h / inertia], rtol=1e-12)
+
+
+def test_gradient_at_rest_is_the_viscous_one(rng):
+    """|v| v has slope 0 at 0, so a body at rest feels viscosity only, and no division by zero."""
+    fish = small_scene("fluid")
+    qpos, _, ctrl = (torch.tensor(x) for x in free_states(fish, 8, rng))
+    slopes = {}
+    for density, viscosity in ((300.0, 2.0), (0.0, 2.0), (300.0, 0.0), (1e-300, 0.0)):
+        scene = dataclasses.replace(fish, density=density, viscosity=viscosity)
+        sim = Simulator(scene, 8, Integration(substeps=1), dtype=torch.float64)
+        qvel = torch.zeros(8, scene.nv, dtype=torch.float64, requires_grad=True)
+        (slopes[density, viscosity],) = torch.autograd.grad(sim.step(qpos, qvel, ctrl)[1].sin().sum(), qvel)
+    torch.testing.assert_close(slopes[300.0, 2.0], slopes[0.0, 2.0], rtol=1e-12, atol=0)
+    torch.testing.assert_close(slopes[300.0, 0.0], slopes[1e-300, 0.0], rtol=1e-12, atol=0)
+    assert not torch.allclose(slopes[0.0, 2.0], slopes[300.0, 0.0], rtol=0.1)
 
 
 def test_a_free_joint_is_three_slides_and_a_ball(rng):

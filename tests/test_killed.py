@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,14 @@ def load(directory: Path) -> dict[str, Any]:
 
 def start(script: str, *arguments: object, **options: Any) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, ROOT / f"{script}.py", *map(str, arguments)], text=True, **options)
+
+
+@pytest.fixture(autouse=True)
+def hangups() -> Iterator[None]:
+    """Reach trainings also where pytest itself runs under nohup, whose children would not hear them."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +127,10 @@ def test_a_run_that_is_signalled_leaves_a_whole_checkpoint_or_none(seed: int, tm
     for number in signals:
         process.send_signal(number)
         time.sleep(draw.uniform(0, 0.02))
-    _, error = process.communicate(timeout=120)
+    try:
+        _, error = process.communicate(timeout=120)
+    finally:
+        process.kill()
     if not (tmp_path / "run").exists():  # while Python imports, its own traceback ends it
         assert process.returncode != 0 and seed >= 50
         return

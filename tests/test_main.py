@@ -27,14 +27,14 @@ PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", 
 
 
 @pytest.fixture
-def trained(tiny_run: Path) -> Path:
+def trained(tiny_run):
     return tiny_run / "checkpoint.pt"
 
 
 # The report -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_report_names_tasks_devices_versions_and_cache(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_report_names_tasks_devices_versions_and_cache(capsys):
     command.main([])
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line for line in lines if line}
@@ -45,7 +45,7 @@ def test_the_report_names_tasks_devices_versions_and_cache(capsys: pytest.Captur
     assert max(map(len, lines)) < 160
 
 
-def test_troubles_come_with_their_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_troubles_come_with_their_remedy(monkeypatch):
     def broken(*_: object) -> None:
         raise RuntimeError("no OpenGL: install it")
 
@@ -74,9 +74,7 @@ def test_troubles_come_with_their_remedy(monkeypatch: pytest.MonkeyPatch) -> Non
 # Demonstration and export ---------------------------------------------------------------------------------------------
 
 
-def test_a_demonstration_of_an_exported_policy(
-    opengl: None, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_demonstration_of_an_exported_policy(opengl, trained, tmp_path, monkeypatch, capsys):
     policy, video = tmp_path / "policies" / "cartpole.pt", tmp_path / "new" / "demo.mp4"
     monkeypatch.setattr(command, "POLICIES", policy.parent)
     monkeypatch.setattr(command, "DEMO_SECONDS", 0.1)
@@ -89,7 +87,7 @@ def test_a_demonstration_of_an_exported_policy(
     assert "cartpole" in command.describe_tasks()[1] and command.describe_tasks()[1].endswith("yes")
 
 
-def test_a_learner_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_learner_trains(tmp_path, monkeypatch):
     """From beside the package, as a clone has it, and from within, as a wheel."""
     flags = "--env cartpole --device cpu --iterations 1 --num-envs 4 --horizon 4 --eval-episodes 2 --quiet --run-dir"
     command.main(["train", "shac", *flags.split(), str(tmp_path / "run")])
@@ -101,7 +99,7 @@ def test_a_learner_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         command.main(["train", "shac", "--env", "nothing"])
 
 
-def test_quick_kernels_are_of_their_time_alone() -> None:
+def test_quick_kernels_are_of_their_time_alone():
     before = wp.config.optimization_level, wp.config.use_precompiled_headers
     with pytest.raises(KeyError), startup.quick_kernels():
         assert (wp.config.optimization_level, wp.config.use_precompiled_headers) == (0, False)
@@ -109,7 +107,7 @@ def test_quick_kernels_are_of_their_time_alone() -> None:
     assert before == (wp.config.optimization_level, wp.config.use_precompiled_headers)
 
 
-def test_an_export_is_the_policy_alone(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
     small = tmp_path / "small.pt"
     command.main(["export", str(trained), str(small)])
     assert small.stat().st_size < 0.5 * trained.stat().st_size
@@ -134,21 +132,14 @@ def test_an_export_is_the_policy_alone(trained: Path, tmp_path: Path, capsys: py
         ("export {trained} {tmp}", "cannot write {tmp}: it is no regular file"),
     ],
 )
-def test_mistakes_are_one_line(
-    arguments: str,
-    message: str,
-    trained: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_mistakes_are_one_line(arguments, message, trained, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "POLICIES", tmp_path / "none")
     error = refusal(lambda: command.main(arguments.format(tmp=tmp_path, trained=trained).split()), capsys)
     assert error.startswith("diffsim: ") and message.format(tmp=tmp_path, trained=trained) in error
 
 
 @pytest.mark.parametrize("program", [["-m", "diffsim"], ["shac.py", "--help"]])
-def test_a_closed_pipe_is_no_error(program: list[str]) -> None:
+def test_a_closed_pipe_is_no_error(program):
     """As of `python -m diffsim | head -3`."""
     options = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | PATH, cwd=ROOT)
     with subprocess.Popen([sys.executable, *program], **options) as process:
@@ -160,7 +151,7 @@ def test_a_closed_pipe_is_no_error(program: list[str]) -> None:
 # The start ------------------------------------------------------------------------------------------------------------
 
 
-def test_only_the_warning_is_held_back(capfd: pytest.CaptureFixture[str]) -> None:
+def test_only_the_warning_is_held_back(capfd):
     with startup._without(b"noise"):
         os.write(2, b"first\nmuch noise here\nlast\n")
     assert capfd.readouterr().err == "first\nlast\n"
@@ -171,13 +162,13 @@ def test_only_the_warning_is_held_back(capfd: pytest.CaptureFixture[str]) -> Non
     assert capfd.readouterr().err == "an error, and on"
 
 
-def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", "/proc/nowhere")
     with pytest.raises(ValueError, match="cannot write to Warp's kernel cache /proc/nowhere: set WARP_CACHE_PATH"):
         diffsim.make("cartpole", 1)
 
 
-def test_an_import_changes_nothing_in_its_host() -> None:
+def test_an_import_changes_nothing_in_its_host():
     program = """
 import signal, sys, threading
 before = sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT)
@@ -188,7 +179,7 @@ assert "diffsim.view" not in sys.modules  # no training needs it
     subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | PATH)
 
 
-def test_a_full_kernel_cache_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_full_kernel_cache_is_named(monkeypatch, tmp_path):
     env = diffsim.make("cartpole", 1, substeps=1)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1e6))

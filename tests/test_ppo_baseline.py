@@ -139,7 +139,7 @@ def test_clipped_objective_and_its_gradient_case_by_case() -> None:
     ]
     for ratio, advantage, loss, slope in cases:
         log_ratio = torch.tensor([ratio], dtype=torch.float64).log().requires_grad_()
-        result = ppo.clipped_loss(log_ratio, torch.tensor([advantage], dtype=torch.float64), 0.2)
+        result = ppo.clipped_loss(log_ratio.exp(), torch.tensor([advantage], dtype=torch.float64), 0.2)
         assert result.item() == pytest.approx(loss)
         assert torch.autograd.grad(result, log_ratio)[0].item() == pytest.approx(slope), (ratio, advantage)
 

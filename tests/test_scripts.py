@@ -9,7 +9,6 @@ import signal
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -18,20 +17,23 @@ from learners import ROOT, SCRIPTS, SMALL, assert_same, read_progress, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from diffsim.training import graph
+from diffsim.training import Run, graph
 from diffsim.training.directory import COLUMNS, column
 
 NOT_COMPARED = {"seconds"}
+PPO_LOSSES = " ".join(  # by CleanRL's names
+    f"losses/{name}" for name in "policy_loss value_loss entropy approx_kl clipfrac explained_variance".split()
+)
 SCALARS = {
-    "shac": "losses/actor losses/critic time/update_actor time/update_critic",
+    "shac": "losses/actor losses/critic charts/actor_lr charts/critic_lr time/update_actor time/update_critic",
     "sapo": (
-        "losses/actor losses/critic charts/reward charts/entropy charts/temperature "
+        "losses/actor losses/critic charts/actor_lr charts/critic_lr charts/reward charts/entropy charts/temperature "
         "time/update_actor time/update_critic"
     ),
-    "bptt": "losses/actor time/update",
-    "ppo_baseline": "losses/policy losses/value losses/kl charts/learning_rate charts/std time/collect time/update",
+    "bptt": "losses/actor charts/learning_rate time/update",
+    "ppo_baseline": f"{PPO_LOSSES} charts/learning_rate charts/std time/collect time/update",
     "pfpn": (
-        "losses/policy losses/value losses/kl charts/learning_rate charts/entropy time/interact time/learn "
+        f"{PPO_LOSSES} charts/learning_rate time/interact time/learn "
         "particles/dead_mean particles/dead_max particles/moved particles/active particles/std"
     ),
 }
@@ -42,57 +44,53 @@ COMMON_SCALARS = (
 
 
 @pytest.fixture(scope="module", params=SCRIPTS)
-def script(request: pytest.FixtureRequest) -> ModuleType:
+def script(request):
     return SCRIPTS[request.param]
 
 
 @pytest.fixture(scope="module")
-def small(script: ModuleType) -> list[str]:
+def small(script):
     return SMALL[script.__name__]
 
 
 @pytest.fixture(scope="module")
-def trained(script: ModuleType, small: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(script, small, tmp_path_factory):
     directory = tmp_path_factory.mktemp("trained")
     run(script, directory, *small)
     return directory
 
 
 @pytest.fixture(scope="module")
-def checkpoint(trained: Path) -> dict[str, Any]:
+def checkpoint(trained):
     return torch.load(trained / "checkpoint.pt", weights_only=True)
 
 
 # A run ----------------------------------------------------------------------------------------------------------------
 
 
-def test_another_seed_has_other_weights(
-    script: ModuleType, small: list[str], checkpoint: dict[str, Any], tmp_path: Path
-) -> None:
+def test_another_seed_has_other_weights(script, small, checkpoint, tmp_path):
     other = run(script, tmp_path, *small, "--seed", 2, "--stop-after", 1)
     for name, weight in other["policy"]["weights"].items():
         if name.endswith("weight") and weight.ndim == 2:
             assert not torch.equal(weight, checkpoint["policy"]["weights"][name])
 
 
-def test_saving_and_evaluating_change_no_numbers(script: ModuleType, small: list[str], tmp_path: Path) -> None:
+def test_saving_and_evaluating_change_no_numbers(script, small, tmp_path):
     often = run(script, tmp_path / "often", *small, "--stop-after", 3, "--save-every", 1, "--eval-every", 1)
     never = run(script, tmp_path / "never", *small, "--stop-after", 3, "--save-every", 0, "--eval-every", 0)
     for name in ("modules", "ranks", "control_steps"):
         assert_same(often[name], never[name])
 
 
-def test_the_same_seed_interrupted_and_resumed_ends_bitwise_alike(
-    script: ModuleType, small: list[str], checkpoint: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, evaluate = tmp_path / "checkpoint.pt", script.evaluate
+def test_the_same_seed_interrupted_and_resumed_ends_bitwise_alike(script, small, checkpoint, tmp_path, monkeypatch):
+    path, evaluate = tmp_path / "checkpoint.pt", Run.evaluate
 
     def interrupted(*arguments: Any) -> Any:
         signal.raise_signal(signal.SIGTERM)
         return evaluate(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as exit:
-        patch.setattr(script, "evaluate", interrupted)
+        patch.setattr(Run, "evaluate", interrupted)
         run(script, tmp_path, *small, "--threads", 1)
     assert exit.value.code == 128 + signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
@@ -107,7 +105,7 @@ def test_the_same_seed_interrupted_and_resumed_ends_bitwise_alike(
     assert [int(row["iteration"]) for row in read_progress(tmp_path)] == list(range(1, 11))
 
 
-def test_files_of_a_run(script: ModuleType, trained: Path, checkpoint: dict[str, Any]) -> None:
+def test_files_of_a_run(script, trained, checkpoint):
     assert {path.name for path in trained.iterdir() if "tfevents" not in path.name} == {
         "args.json",
         "checkpoint.pt",
@@ -160,9 +158,7 @@ class Waits(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def test_nothing_captured_waits_for_the_device(
-    script: ModuleType, small: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_captured_waits_for_the_device(script, small, tmp_path, monkeypatch):
     captured, places = [], list[str]()
 
     def capture(function: Callable[[], Any], device: torch.device, env: Any = None) -> Callable[[], Any]:
@@ -184,7 +180,7 @@ def test_nothing_captured_waits_for_the_device(
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("eager", [[], ["--no-cuda-graph"]])
-def test_same_seed_same_weights_on_a_gpu(script: ModuleType, tmp_path: Path, eager: list[str]) -> None:
+def test_same_seed_same_weights_on_a_gpu(script, tmp_path, eager):
     checkpoints = []
     for name in ("a", "b"):
         arguments = "--env cartpole --num-envs 8 --iterations 12 --eval-every 5 --eval-episodes 2 --quiet".split()
@@ -196,7 +192,7 @@ def test_same_seed_same_weights_on_a_gpu(script: ModuleType, tmp_path: Path, eag
 # A saved policy -------------------------------------------------------------------------------------------------------
 
 
-def test_evaluate(script: ModuleType, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate(script, trained, tmp_path, capsys):
     """What the run ended with, beside the checkpoint, which stays as it is."""
     path = tmp_path / "checkpoint.pt"
     before = shutil.copy(trained / "checkpoint.pt", path).read_bytes()

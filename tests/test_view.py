@@ -1,15 +1,11 @@
-"""script.py: videos, pages and curves of a run; mistakes and full disks are one line and leave no file."""
+"""script.py: videos and pages of a run; mistakes and full disks are one line and leave no file."""
 
 from __future__ import annotations
 
 import functools
-import os
-import re
 import resource
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from learners import refusal
@@ -28,12 +24,10 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return error
 
 
-def test_video_page_and_curves_of_a_run(
-    opengl: None, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    outputs = [tmp_path / name for name in ("a.mp4", "a.html", "a.png")]
+def test_video_and_page_of_a_run(opengl, tiny_run, tmp_path, capsys):
+    outputs = [tmp_path / name for name in ("a.mp4", "a.html")]
     options = ["--seconds", "0.5", "--episodes", "3", "--size", "64", "48", "--substeps", "2"]
-    flags = [word for pair in zip(("--video", "--web", "--plot"), map(str, outputs), strict=True) for word in pair]
+    flags = [word for pair in zip(("--video", "--web"), map(str, outputs), strict=True) for word in pair]
     view.main([str(tiny_run / "checkpoint.pt"), *flags, *options])
     assert all(path.stat().st_size > 1000 for path in outputs)
     printed = capsys.readouterr().out
@@ -41,16 +35,14 @@ def test_video_page_and_curves_of_a_run(
     assert all(str(path) in printed for path in outputs)
 
 
-def test_substeps_are_those_of_the_training_unless_given(tiny_run: Path) -> None:
+def test_substeps_are_those_of_the_training_unless_given(tiny_run):
     saved = load_policy(str(tiny_run / "checkpoint.pt"))
     assert make_policy_env(saved, 1).sim.integration.substeps == saved.args["substeps"]
     assert make_policy_env(saved, 1, substeps=7).sim.integration.substeps == 7
 
 
 @pytest.mark.parametrize("words", ["view --web x.html", "drive ant --port 0 --checkpoint", "export x.onnx"])
-def test_a_checkpoint_names_no_code_to_run(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_checkpoint_names_no_code_to_run(words, tmp_path, monkeypatch, capsys):
     """A file that a policy's env names is run only where the command line names it, too."""
     monkeypatch.chdir(tmp_path)
     state = torch.load(command.shipped("ant"), weights_only=True)
@@ -73,8 +65,7 @@ def test_a_checkpoint_names_no_code_to_run(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("{run}", "nothing to show: give --video, --web, --viewer or --plot"),
-        ("--web {new}/a.html", "of what? give a checkpoint or the directory of a run"),
+        ("{run}", "nothing to show: give --video or --web"),
         ("{new}/nothing.pt --web {new}/a.html", "no such checkpoint: {new}/nothing.pt"),
         ("{run}/progress.csv --web {new}/a.html", "{run}/progress.csv is not a whole checkpoint"),
         ("{run} --web {new}/a.htm", "--web: a page ends in .html, not '.htm'"),
@@ -82,34 +73,17 @@ def test_a_checkpoint_names_no_code_to_run(
         ("{run} --video {new}/a.mp4 --size 100000 100000", "1 to 4096 pixels, not 100000 x 100000"),
         ("{run} --video {new}/a.mp4 --size 100 100", "--video: width and height of an .mp4 are multiples of 16"),
         ("{run} --web {new}/a.html --seconds 0", "--seconds, --episodes, --substeps and --size must be positive"),
-        ("{run} {run} --web {new}/a.html", "--video, --web and --viewer show one checkpoint; several are for --plot"),
-        ("{run} --viewer --web {new}/a.html", "--viewer goes without --video and --web"),
         ("{run} --episodes 3 --web {run}/progress.csv/a.html", "File exists"),
-        ("{new} --plot {new}/a.png", "no such file: {new}/progress.csv; --plot takes directories of runs"),
-        ("{run} --plot {new}/a.jpg", "--plot: a picture ends in .png, .svg or .pdf, not '.jpg'"),
-        ("{run} --plot {new}/curves", "--plot: a picture ends in .png, .svg or .pdf, not ''"),
-        ("{run} --viewer", "there is no display"),
     ],
 )
-def test_mistakes_are_one_line(
-    arguments: str,
-    message: str,
-    tiny_run: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setenv("DISPLAY", ":77")
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+def test_mistakes_are_one_line(arguments, message, tiny_run, tmp_path, capsys):
     places = {"run": tiny_run, "new": tmp_path}
     assert message.format(**places) in refused(arguments.format(**places).split(), capsys)
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
-@pytest.mark.parametrize("flags", ["--video {0}/a.mp4", "--video {0}/a.gif", "--web {0}/a.html", "--plot {0}/a.png"])
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(
-    opengl: None, flags: str, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("flags", ["--video {0}/a.mp4", "--video {0}/a.gif", "--web {0}/a.html"])
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(opengl, flags, tiny_run, tmp_path, capsys):
     path = Path(flags.format(tmp_path).split()[1])
     path.write_text("an older file")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -120,31 +94,3 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_text() == "an older file" and [*tmp_path.iterdir()] == [path]
-
-
-def test_missing_matplotlib_is_one_line(
-    tiny_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    line = refusal(lambda: view.main([str(tiny_run), "--plot", "a.png"]), capsys)
-    assert line == "script.py: --plot needs matplotlib: pip install matplotlib"
-
-
-@pytest.mark.filterwarnings("error")
-def test_curves_of_several_runs(tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Whatever their names."""
-    odd = [tmp_path / os.fsdecode(name) for name in (b"gaps", b"_hidden", rb"a$\frac$b", b"$x$", b"bad\xff")]
-    for folder in odd:
-        folder.mkdir()
-        (folder / "progress.csv").write_text(
-            "iteration,control_steps,seconds,return,eval_return\n1,10,,,\n2,20,1,3,4\n"
-        )
-    columns = view.read_progress(odd[0] / "progress.csv")
-    np.testing.assert_array_equal(columns["return"], [np.nan, 3])
-    view.main([str(tiny_run), *map(str, odd), "--plot", str(tmp_path / "new" / "a.svg")])
-    names = re.findall(r"<!-- (.*?) -->", (tmp_path / "new" / "a.svg").read_text())  # of all text
-    assert {tiny_run.name, "gaps", "_hidden", r"a$\frac$b", "$x$", "bad\ufffd"} <= {*map(str.strip, names)}
-    for broken in (b"iteration,return\n1,x\n", b"return\n\xff\n"):
-        (odd[0] / "progress.csv").write_bytes(broken)
-        error = refusal(lambda: view.main([str(odd[0]), "--plot", str(tmp_path / "b.png")]), capsys)
-        assert "gaps/progress.csv is not what a run has written: " in error

@@ -15,8 +15,10 @@ HEAD = """# API
 `python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. Errors of
 files and tasks (`SceneError`, `TaskError`) are `ValueError`s.
 """
-NAMES = "make DiffEnv NumpyEnv NumpyVectorEnv Simulator Integration Task load_scene Scene read_clip Clip".split()
-INTERNAL = {*"pin carry_over take_statistics check_tensor rewind carrier inert drag check advance bind falls".split()}
+NAMES = "make DiffEnv NumpyEnv Simulator Integration Task load_scene Scene read_clip".split()
+# Methods that few programs need
+INTERNAL = """pin carry_over take_statistics advance check_tensor rewind tangent explicit replaced check load_robot
+scene bind presets integration falls metadata over""".split()
 
 
 def signature(thing: object) -> str:
@@ -32,12 +34,11 @@ def signature(thing: object) -> str:
 
 
 def members(kind: type) -> Iterator[str]:
-    """A row for each public method or property that the class documents: its first sentence."""
+    """A row for each public method that the class documents: its first sentence."""
     for name, each in vars(kind).items():
-        each = getattr(each, "func", getattr(each, "__func__", each))
-        doc = each.__doc__ if inspect.isfunction(each) or isinstance(each, property) else None
+        doc = each.__doc__ if inspect.isfunction(each) else None
         if doc and not name.startswith("_") and name not in INTERNAL:
-            call = "" if isinstance(each, property) else re.sub(r"\s+", " ", f"({signature(each)})")
+            call = re.sub(r"\s+", " ", f"({signature(each)})")
             yield f"| `{name}{call}` | {re.split(r'(?<=[.:;]) ', ' '.join(doc.split()))[0].rstrip(':;')} |"
 
 

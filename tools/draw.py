@@ -3,6 +3,7 @@
     python tools/draw.py films                                # of all policies in diffsim/policies
     python tools/draw.py films diffsim/policies/go2.pt
     python tools/draw.py gait runs/<run>/checkpoint.pt --start 2 --every 0.1 --frames 8
+    python tools/draw.py overview
 
 A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own contact on the file of the robot, from
 the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
@@ -18,7 +19,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -239,6 +240,44 @@ def gait(
     print(path)
 
 
+def overview() -> None:
+    """The figure of the README: what a control step computes, and how gradients come back."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt
+    from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+    boxes = {
+        "policy": "torch\nnn.Module",
+        "simulator": "substeps in\nWarp kernels,\nown adjoint",
+        "task": "observation,\nreward, end\n(torch)",
+        "loss": "sum of rewards\nof a rollout\n(+ value)",
+    }
+    figure, axes = plt.subplots(figsize=(8, 2.5), dpi=200)
+    axes.set(xlim=(0, 16), ylim=(1, 5.2), aspect="equal")
+    axes.axis("off")
+    for k, (name, text) in enumerate(boxes.items()):
+        left = 0.2 + 4.25 * k
+        axes.add_patch(FancyBboxPatch((left, 1.3), 2.6, 2.4, "round,pad=0.1", fc="#e2e6ec", ec="#282e3a"))
+        axes.text(left + 1.3, 3.3, name, ha="center", va="center", weight="bold", fontsize=11)
+        axes.text(left + 1.3, 2.2, text, ha="center", va="center", fontsize=9)
+    for k, forward in enumerate(("action", "state", "reward")):
+        begin, end = 2.9 + 4.25 * k, 4.35 + 4.25 * k
+        for y, ends, colour in ((2.9, (begin, end), "#282e3a"), (2.0, (end, begin), "#d63c28")):
+            axes.add_patch(
+                FancyArrowPatch((ends[0], y), (ends[1], y), arrowstyle="-|>", mutation_scale=14, color=colour)
+            )
+        middle = (begin + end) / 2
+        axes.text(middle, 3.15, forward, ha="center", va="bottom", fontsize=9)
+        axes.text(middle, 1.8, "gradient", ha="center", va="top", fontsize=8, color="#d63c28")
+    style: Any = dict(arrowstyle="-|>", mutation_scale=14, connectionstyle="arc3,rad=0.22", color="#282e3a")
+    axes.add_patch(FancyArrowPatch((10.0, 3.85), (1.5, 3.85), **style))
+    axes.text(5.75, 4.95, "observation of the next step", ha="center", va="center", fontsize=9)
+    figure.savefig(FIGURES / "overview.png", bbox_inches="tight", pad_inches=0.05)
+    print(FIGURES / "overview.png")
+
+
 def halve(frame: Frame) -> Frame:
     """2 x 2 pixels into one: smooth edges."""
     height, width = frame.shape[0] // 2, frame.shape[1] // 2
@@ -248,7 +287,7 @@ def halve(frame: Frame) -> Frame:
 @command
 def main() -> None:
     torch.set_num_threads(1)
-    tyro.extras.subcommand_cli_from_dict({"films": films, "gait": gait}, description=__doc__)
+    tyro.extras.subcommand_cli_from_dict({"films": films, "gait": gait, "overview": overview}, description=__doc__)
 
 
 if __name__ == "__main__":

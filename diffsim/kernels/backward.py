@@ -41,17 +41,14 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
     T, vec2, vec3, vec6, quat, Model, Lane = t.T, t.vec2, t.vec3, t.vec6, t.quat, t.Model, t.Lane
     Link, Node, Adjoint, Base = t.Link, t.Node, t.Adjoint, t.Base
-    Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.array
+    Ck, Links, Nodes, Adjoints, Array = t.Checkpoint, t.Links, t.Nodes, t.Adjoints, t.Ts
     lane, solve = lane_of(spec), factor_solve(spec)
     join, load, link_of, qpos_adr = sp.join, kin.load, kin.link_of, kin.qpos_adr
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, constraint = muscle_law(spec), constraint_law(spec)
     CONSTRAINED, DAMPED, NV = spec.constrained, spec.damped, spec.nv
-    CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT = (
-        name in spec.features for name in ("contact", "motor", "clamp", "muscle", "limit")
-    )
+    CONTACT, DRIVEN, CLAMP, MUSCLE, LIMIT, BASE_DAMPED = spec.has("contact motor clamp muscle limit base_damping")
     LIMIT = LIMIT and not spec.constrained  # the penalty law
-    BASE_DAMPED = "base_damping" in spec.features
     NU, FLOATING, IMPLICIT, VARIED, FORCED = spec.nu, spec.floating, spec.implicit, spec.varied, spec.forced > 0
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
     read, write, pick = block.read, block.write, block.pick

@@ -42,19 +42,9 @@ LEAST_SINKING = 1e-3  # m in a substep: a sphere that grazes the ground has a ju
 @cache
 def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block = types(spec), spatial(spec), blocks(spec)
-    T, U, vec2, vec3, vec4, vec6, mat3, Model, Link = (
-        t.T,
-        t.U,
-        t.vec2,
-        t.vec3,
-        t.vec4,
-        t.vec6,
-        t.mat3,
-        t.Model,
-        t.Link,
-    )
+    T, U, vec2, vec3, vec4, vec6, mat3 = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
-    Load, Lane, NV, kin = t.Load, t.Lane, spec.nv, kinematics(spec)
+    Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
     @wp.func
@@ -149,13 +139,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return p, jar, vec4(D, state[1], state[2], state[3]), of
 
     @wp.func
-    def friction(m: Model, here: Lane, c: int):
-        if wp.static(VARIED):
-            return here.mu * T(m.contact_numbers[c][2])
-        return T(m.contact_numbers[c][2])
-
-    @wp.func
-    def touch(m: Model, here: Lane, links: t.Links, height: T, touches: t.Touches):
+    def touch(m: Model, here: Lane, links: t.Links, height: T, touches: t.Contacts):
         """The contacts of a lane at the start of a substep, without acceleration.
 
         They are linear about where they were in the last substep, and stick if they did not touch there.
@@ -180,7 +164,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     touches[s].H = H
 
     @wp.func
-    def add_contacts(m: Model, here: Lane, k: int, touches: t.Touches, load: Load):
+    def add_contacts(m: Model, here: Lane, k: int, touches: t.Contacts, load: Load):
         """The load of link k with its contacts, linear about the iterate."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             s = c - m.contact_begin[here.at]
@@ -213,7 +197,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return x
 
     @wp.func
-    def try_contacts(m: Model, here: Lane, k: int, step: vec6, part: T, tries: int, touches: t.Touches):
+    def try_contacts(m: Model, here: Lane, k: int, step: vec6, part: T, tries: int, touches: t.Contacts):
         """Forces and slopes after a part of a step of link k's twist; their part of what newton.measure returns."""
         found = vec6()
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
@@ -223,7 +207,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 if tries == 0:
                     touches[s].Hs = touches[s].H * by
                 jar = touches[s].jar + part * by
-                f, H = cone(touches[s].D, friction(m, here, c), T(m.contact_numbers[c][3]), jar, T(0.0))
+                f, H = cone(touches[s].D, constants(m, here, c)[2], T(m.contact_numbers[c][3]), jar, T(0.0))
                 less = touches[s].f - part * touches[s].Hs - f
                 w = T(m.contact_numbers[c][4])
                 away = makes_good(less, w, H)
@@ -241,7 +225,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return found
 
     @wp.func
-    def keep_contacts(m: Model, here: Lane, touches: t.Touches):
+    def keep_contacts(m: Model, here: Lane, touches: t.Contacts):
         """The contacts of a lane are where they were tried last."""
         first = m.contact_begin[here.at]
         for c in range(first, m.contact_begin[here.at + here.n]):
@@ -250,7 +234,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 touches[c - first].f = touches[c - first].pushes
 
     @wp.func
-    def record_contacts(m: Model, here: Lane, ck: t.Checkpoint, touches: t.Touches):
+    def record_contacts(m: Model, here: Lane, ck: t.Checkpoint, touches: t.Contacts):
         """Into the checkpoint jar of all contacts of a lane, after the accelerations.
 
         It is a small difference of large numbers, of which float32 would not find the cone's zone again, and a factor
@@ -263,17 +247,9 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_contacts_adjoint(
-        m: Model,
-        here: Lane,
-        k: int,
-        link: Link,
-        node: t.Node,
-        height: T,
-        ck: t.Checkpoint,
-        adj: t.Adjoint,
-        adj_factors: t.array,
+        m: Model, here: Lane, k: int, link: Link, node: t.Node, height: T, ck: t.Checkpoint, adj: t.Adjoint, by: t.Ts
     ):
-        """The adjoints of link k with its contacts' part of phi added."""
+        """The adjoints of link k with its contacts' part of phi added; by: those of factors."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
             centre, distance, on = place(m, c, link, height)
             if block.any_of(on):
@@ -293,9 +269,9 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 if wp.static(VARIED):
                     by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(link.V, p)) + g_jar[2] * state[2]
                     by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)
-                    adj_factors[K_N] = adj_factors[K_N] + by_k / of[0]
-                    adj_factors[K_D] = adj_factors[K_D] - wp.dot(f, w) / here.k_d
-                    adj_factors[MU] = adj_factors[MU] - T(m.contact_numbers[c][2]) * by_mu
+                    by[K_N] = by[K_N] + by_k / of[0]
+                    by[K_D] = by[K_D] - wp.dot(f, w) / here.k_d
+                    by[MU] = by[MU] - T(m.contact_numbers[c][2]) * by_mu
                 G = force_at(p, g_jar)
                 wrench = force_at(p, f)
                 g_p = wp.cross(g_jar, wp.spatial_top(node.B) + of[1] * wp.spatial_top(link.V)) - wp.cross(

@@ -32,14 +32,14 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
     t, sp, kin, sums, block = types(spec), spatial(spec), kinematics(spec), lane_sums(spec), blocks(spec)
     T, vec3, vec6, quat, lane = t.T, t.vec3, t.vec6, t.quat, lane_of(spec)
     Model, Lane, Ck, Load, Link, Motion = t.Model, t.Lane, t.Checkpoint, t.Load, t.Link, t.Motion
-    Links, Motions, Loads, Quats, Root, Touch, Newton = (
-        getattr(t, name) for name in "Links Motions Loads quats Root Touch Newton".split()
+    Links, Motions, Loads, Quats, Root, Contact, Newton = (
+        getattr(t, name) for name in "Links Motions Loads quats Root Contact Newton".split()
     )
     join, exp_quat, store, link_of, qpos_adr = sp.join, sp.exp_quat, kin.store, kin.link_of, kin.qpos_adr
     read, write, pick = block.read, block.write, block.pick
     link, force, joint = link_law(spec), external_force(spec), joint_law(spec)
     muscle, sweep, constraint, newton = muscle_law(spec), articulated(spec), constraint_law(spec), newton_method(spec)
-    CONTACT, MOTOR, CLAMP, MUSCLE = (name in spec.features for name in ("contact", "motor", "clamp", "muscle"))
+    CONTACT, MOTOR, CLAMP, MUSCLE = spec.has("contact motor clamp muscle")
     NU, FLOATING, FORCED = spec.nu, spec.floating, spec.forced > 0
     CONSTRAINED, SOLVES, DAMPED = spec.constrained, spec.solves, spec.damped
     INERT, FIRST = spec.inert, 0 if FLOATING else 1 + spec.inert  # the first link with inertia
@@ -242,7 +242,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                 motions[i].motor = motor[i]
         if wp.static(CONSTRAINED):
             free = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
-            touches = wp.zeros(shape=SPHERES, dtype=Touch)
+            touches = wp.zeros(shape=SPHERES, dtype=Contact)
             residual = T(0.0)
             count = T(0.0)
         root = state_of(m, here, batch, links, turn)

@@ -29,13 +29,12 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     T, Model, Lane = t.T, t.Model, t.Lane
     vec2, block = t.vec2, blocks(spec)
     pick = block.pick
-    STIFFNESS, DAMPING, LIMIT = (name in spec.features for name in ("stiffness", "damping", "limit"))
+    STIFFNESS, DAMPING, LIMIT, CLAMP = spec.has("stiffness damping limit clamp")
     LIMIT = LIMIT and not spec.constrained
     VARIED, NU = spec.varied, spec.nu
-    CLAMP = "clamp" in spec.features
 
     @wp.func
-    def drive(m: Model, here: Lane, ctrl: t.array2, motor: t.array):
+    def drive(m: Model, here: Lane, ctrl: t.array2, motor: t.Ts):
         """Adds the motors' forces to the links' of a lane."""
         for k in range(NU):
             i = m.motor_slot[here.lane * NU + k]

@@ -18,10 +18,8 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
     sp, read = spatial(spec), blocks(spec).read
     join, log_quat = sp.join, sp.log_quat
     NBALL, CARRIER, QADR = spec.nball, spec.carrier, spec.dof0 - 1 + int(spec.floating)
-    BALL, STIFFNESS = "ball" in spec.features, "stiffness" in spec.features
-    HINGE, SLIDE = "hinge" in spec.features, "slide" in spec.features
+    BALL, STIFFNESS, HINGE, SLIDE, TERRAIN = spec.has("ball stiffness hinge slide terrain")
     ENV_LAST, THREADS_PER_ENV = spec.env_last, spec.threads_per_env
-    TERRAIN, Place = "terrain" in spec.features, t.Place
 
     @wp.func
     def load(a: t.array3, row: int, k: int, e: int):
@@ -81,7 +79,7 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             return T(m.carrier_height) + z
 
     @wp.func
-    def place_links(m: Model, here: Lane, links: t.Links, place: Place):
+    def place_links(m: Model, here: Lane, links: t.Links, place: t.Place):
         """Where each link is (about the carrier), its joint's axis and its velocity; returns the carrier's place.
 
         R of a ball joint's first link comes with the joint's own turn.

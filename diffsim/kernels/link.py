@@ -17,11 +17,11 @@ from diffsim.kernels.spec import KernelSpec
 def link_law(spec: KernelSpec) -> SimpleNamespace:
     t, sp, contact, drag = types(spec), spatial(spec), contact_law(spec), drag_law(spec)
     T, vec3, mat3, Model, Lane, Link = t.T, t.vec3, t.mat3, t.Model, t.Lane, t.Link
-    Node, Adjoint, Array = t.Node, t.Adjoint, t.array
+    Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
     momentum, Place, Load, VARIED = sp.momentum, t.Place, t.Load, spec.varied
     # With MuJoCo's constraints contacts are added in each pass of the solve: constraint.py.
-    LIFT = "gravcomp" in spec.features
-    DRAG, CONTACT = "drag" in spec.features, "contact" in spec.features and not spec.constrained
+    LIFT, DRAG, CONTACT = spec.has("gravcomp drag contact")
+    CONTACT = CONTACT and not spec.constrained
 
     @wp.func
     def mass_of(m: Model, k: int, link: Link):
@@ -95,7 +95,7 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
         return adj
 
     @wp.func
-    def add_damping_adjoint(m: Model, here: Lane, k: int, link: Link, node: t.Node, adj: Adjoint, adj_factors: t.array):
+    def add_damping_adjoint(m: Model, here: Lane, k: int, link: Link, node: t.Node, adj: Adjoint, adj_factors: t.Ts):
         """With the adjoints of D and W1 in phi's part W1 . I D, where damping follows the constraints."""
         com, inertia = mass_of(m, k, link)
         adj.d = momentum(T(m.mass[k]), com, inertia, node.W1)

@@ -220,93 +220,77 @@ def scene_types(dtype: type) -> SimpleNamespace:
 
 @cache
 def types(spec: KernelSpec) -> SimpleNamespace:
-    """Warp's types in a kernel: U of a scene's numbers, T of those that environments have of their own (wide.py)."""
+    """Warp's types in a kernel: U of a scene's numbers, T of those that environments have of their own (wide.py).
+
+    An array of a struct has the struct's name and an s.
+    """
     U = spec.dtype
     T = wp.float64 if spec.block > 1 else U
     vec2, vec3, vec4, vec6 = (wp.types.vector(n, T) for n in (2, 3, 4, 6))
-    array3 = wp.array3d(dtype=T)
     mat3, mat6, quat = wp.types.matrix((3, 3), T), wp.types.matrix((6, 6), T), wp.types.quaternion(T)
-    Link = struct("Link", {"R": mat3, "x": vec3, "S": vec6, "V": vec6, "q": T, "qd": T})
-    Load = struct("Load", {"a": mat3, "b": mat3, "d": mat3, "f": vec6})
-    Node = dict.fromkeys(("A", "W"), vec6) | dict.fromkeys("gq gqd gtau g u lam".split(), T)
-    Adjoint = dict.fromkeys(("a", "v", "w", "p"), vec6)
-    if "clamp" in spec.features:
-        Node |= {"driven": T, "free": T}
-    if spec.constrained:
-        Node, Adjoint = Node | {"B": vec6, "rate": T}, Adjoint | {"b": vec6}
-    if spec.damped:
-        Node, Adjoint = Node | {"D": vec6, "W1": vec6}, Adjoint | {"d": vec6, "w1": vec6}
-    Node, Adjoint = struct("Node", Node), struct("Adjoint", Adjoint)
-    Motion = dict.fromkeys("CAU", vec6) | dict.fromkeys(("dinv", "u", "motor", "rest"), T)
-    if spec.constrained:
-        Motion |= {"iterate": vec6, "stop": vec3} | dict.fromkeys("rate force held firm holds given".split(), T)
-    Motion = struct("Motion", Motion)
-    root = {"pos": vec3, "rot": quat} | dict.fromkeys("v w rest speeding_up turning_up vdot wdot".split(), vec3)
-    Touch = struct("Touch", dict.fromkeys("p jar f tried pushes Hs".split(), vec3) | {"H": mat3, "D": T, "on": T})
-    constants = dict.fromkeys("h theta k_n k_d k_t mu k_limit d_limit mass motor".split(), T)
-    return SimpleNamespace(
-        T=T,
-        U=U,
-        vec2=vec2,
-        vec3=vec3,
-        vec4=vec4,
-        vec6=vec6,
-        mat3=mat3,
-        mat6=mat6,
-        quat=quat,
-        Place=vec2 if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
-        array=wp.array(dtype=T),
-        array2=wp.array2d(dtype=U),  # a row for each environment
-        array3=array3,
-        # what a step takes and gives, or its gradients, a row for each environment; forces and factors have no columns
-        # unless they vary
-        Batch=struct(
-            "Batch", dict.fromkeys("qpos qvel ctrl factors forces qpos_out qvel_out".split(), wp.array2d(dtype=U))
-        ),
+
+    kinds = {"T": T, "vec3": vec3, "vec6": vec6, "mat3": mat3, "quat": quat}
+
+    def of(**rows: str) -> dict[str, Any]:
+        return {name: kinds[kind] for kind, names in rows.items() for name in names.split()}
+
+    array2, array3 = wp.array2d(dtype=U), wp.array3d(dtype=T)  # array2: a row for each environment
+    structs: dict[str, dict[str, Any]] = {
+        # what a step takes and gives, or its gradients; forces and factors have no columns unless they vary
+        "Batch": dict.fromkeys("qpos qvel ctrl factors forces qpos_out qvel_out".split(), array2),
         # what backward needs of each substep: qpos, qvel, qacc and the factor of the mass matrix
-        Checkpoint=struct("Checkpoint", dict.fromkeys("qvaf", array3)),
-        scene=scene_types(U),
-        Model=scene_types(U).Model,
+        "Checkpoint": dict.fromkeys("qvaf", array3),
         # a lane of an environment, or of a block of them, e; its n links are entries at, at + 1, ... of Model's arrays;
         # rows of checkpoints: the substep's, and the factor's, which is kept if keep is 1; touchdown: 1 if gradients
-        # count that contacts begin with a jump; h: s, of a substep; theta: how implicit it is; constants of laws, or
-        # factors of those that each link has its own of (k_limit to motor, read where they vary)
-        Lane=struct("Lane", constants | dict.fromkeys("e lane at n row factor keep touchdown".split(), int)),
+        # count that contacts begin with a jump; h: s, of a substep; theta: how implicit it is; constants of the laws,
+        # or factors of those that each link has its own of (k_limit to motor, read where they vary)
+        "Lane": dict.fromkeys("e lane at n row factor keep touchdown".split(), int)
+        | of(T="h theta k_n k_d k_t mu k_limit d_limit mass motor"),
         # where a link is (about the carrier, in world axes), its joint's axis, its velocity, and its joint's state
-        Link=Link,
-        Links=wp.array(dtype=Link),
+        "Link": of(mat3="R", vec3="x", vec6="S V", T="q qd"),
         # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force
-        Load=Load,
-        Loads=wp.array(dtype=Load),
+        "Load": of(mat3="a b d", vec6="f"),
         # what backward keeps of a link and its joint: the link's acceleration A and twist W under lambda; the gradients
         # of the joint's position, rate and force; right-hand side, intermediate and solution of the solve; the motors'
         # force, and 1 where it is within its bounds; with constraints the twist B of constraint.py and the acceleration
         # before damping, which adds D to B and has a twist W1 of its own
-        Node=Node,
-        Nodes=wp.array(dtype=Node),
+        "Node": of(vec6="A W", T="gq gqd gtau g u lam"),
         # the adjoints of a link's acceleration, velocity, W and pose, of B, D and W1
-        Adjoint=Adjoint,
-        Adjoints=wp.array(dtype=Adjoint),
+        "Adjoint": of(vec6="a v w p"),
         # gradients of a floating base's position, turn and velocities, its linear velocity and acceleration
-        Base=struct("Base", dict.fromkeys("gp gr gv gw v vdot".split(), vec3)),
+        "Base": of(vec3="gp gr gv gw v vdot"),
         # what the forward kernel keeps of a link and its joint: the link's velocity product C and acceleration A, with
         # constraints that of a step; the factor U and 1/d, the right-hand side u and then the acceleration, the motors'
         # force, what rounding the position lost. In Newton's method the link's acceleration so far (iterate), the
         # joint's (rate), the force on it without constraints, theirs (held; firm: minus its slope), theirs where a part
         # of the step is tried (holds; given: the slope's share), and the limit's stop
-        Motion=Motion,
-        Motions=wp.array(dtype=Motion),
+        "Motion": of(vec6="C A U", T="dinv u motor rest"),
         # a floating base's state, accelerations or steps of a solve, and the iterate
-        Root=struct("Root", root),
+        "Root": of(vec3="pos", quat="rot") | of(vec3="v w rest speeding_up turning_up vdot wdot"),
         # where Newton's method is: 1 for environments that have not converged, else 0; squares of the residual and of
         # the acceleration (plus 1); passes so far
-        Newton=struct("Newton", dict.fromkeys("tolerance going off size".split(), T) | {"passes": int}),
+        "Newton": of(T="tolerance going off size") | {"passes": int},
         # where a contact is, jar and force of the iterate and where a part of the step is tried, H step, the cone's H
         # there, D, and whether it touches
-        Touch=Touch,
-        Touches=wp.array(dtype=Touch),
-        vec6s=wp.array(dtype=vec6),
-        quats=wp.array(dtype=quat),
+        "Contact": of(vec3="p jar f tried pushes Hs", mat3="H", T="D on"),
+    }
+    if "clamp" in spec.features:
+        structs["Node"] |= of(T="driven free")
+    if spec.constrained:
+        structs["Node"] |= of(vec6="B", T="rate")
+        structs["Adjoint"] |= of(vec6="b")
+        structs["Motion"] |= of(vec6="iterate", vec3="stop", T="rate force held firm holds given")
+    if spec.damped:
+        structs["Node"] |= of(vec6="D W1")
+        structs["Adjoint"] |= of(vec6="d w1")
+    kinds |= {name: struct(name, members) for name, members in structs.items()}
+    return SimpleNamespace(
+        **kinds,
+        **{f"{name}s": wp.array(dtype=kind) for name, kind in kinds.items()},
+        **{"U": U, "vec2": vec2, "vec4": vec4, "mat6": mat6, "array2": array2, "array3": array3},
+        scene=scene_types(U),
+        Model=scene_types(U).Model,
+        Place=vec2 if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
     )
 
 

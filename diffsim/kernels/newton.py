@@ -39,9 +39,8 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, vec4, vec6, Model, Lane, pick = t.T, t.vec3, t.vec4, t.vec6, t.Model, t.Lane, block.pick
     Links, Motions, Loads, Root, Newton = t.Links, t.Motions, t.Loads, t.Root, t.Newton
     joint, join, FLOATING = joint_law(spec), spatial(spec).join, spec.floating
-    CONTACT, SHARED = "contact" in spec.features, spec.threads_per_env > 1
-    LIMIT, HELD = "limit" in spec.features, bool(spec.features & {"limit", "frictionloss"})
-    PATIENT = PATIENCE["frictionloss" in spec.features]
+    CONTACT, LIMIT, LOSS = spec.has("contact limit frictionloss")
+    HELD, SHARED, PATIENT = LIMIT or LOSS, spec.threads_per_env > 1, PATIENCE[LOSS]
     ROUNDING = ROUND_OFF * (6e-8 if t.U == wp.float32 else 1.1e-16)
     FIRST = 0 if spec.floating else 1 + spec.inert  # the first link with inertia
 
@@ -67,7 +66,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                     motions[i].firm = held[1]
 
     @wp.func
-    def linearize(m: Model, here: Lane, motions: Motions, touches: t.Touches, free: Loads, loads: Loads):
+    def linearize(m: Model, here: Lane, motions: Motions, touches: t.Contacts, free: Loads, loads: Loads):
         """Loads of the iterate, contacts included: what they and the joints' forces lack gives the next step."""
         for i in range(here.n):
             load = free[i]
@@ -80,7 +79,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
             loads[i] = load
 
     @wp.func
-    def measure(m: Model, here: Lane, links: Links, motions: Motions, touches: t.Touches, part: T, tries: int):
+    def measure(m: Model, here: Lane, links: Links, motions: Motions, touches: t.Contacts, part: T, tries: int):
         """Constraints after a part of the step s, the first try being all of it.
 
         Returns (s.(f - part H s - f(part)), s.H s, s.H(part) s, the square of that difference of forces as
@@ -159,7 +158,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def far_enough(
-        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Touches, free: Loads, moved: T, by: Newton
+        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Contacts, free: Loads, moved: T, by: Newton
     ):
         """The part of a step (moved: its square) after which the cost is least, or all of it if that is good enough."""
         square = by.tolerance * by.tolerance
@@ -192,7 +191,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def step_on(
-        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Touches, free: Loads, root: Root, by: Newton
+        m: Model, here: Lane, links: Links, motions: Motions, touches: t.Contacts, free: Loads, root: Root, by: Newton
     ):
         """A step of the iterate in its direction, u and twists, where it goes on."""
         by.size = T(0.0)

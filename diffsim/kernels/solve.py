@@ -110,9 +110,9 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, vec6, store, link_of, join = t.T, t.vec3, t.vec6, kin.store, kin.link_of, spatial(spec).join
     Model, Lane, Ck, Link, Load, Motion, Root = t.Model, t.Lane, t.Checkpoint, t.Link, t.Load, t.Motion, t.Root
     Links, Motions, Loads = t.Links, t.Motions, t.Loads
-    FLOATING, IMPLICIT, CONSTRAINED, CLAMP = spec.floating, spec.implicit, spec.constrained, "clamp" in spec.features
+    FLOATING, IMPLICIT, CONSTRAINED = spec.floating, spec.implicit, spec.constrained
     THREADS_PER_ENV, SHARERS, TRUNK, SLOTS = spec.threads_per_env, spec.sharers, spec.trunk, spec.slots
-    BASE_DAMPED = "base_damping" in spec.features
+    BASE_DAMPED, CLAMP = spec.has("base_damping clamp")
 
     @wp.func
     def joint_force(m: Model, here: Lane, k: int, phase: int, link: Link, motion: Motion, d: T):
@@ -226,7 +226,7 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
     T, vec6, load, link_of, join = t.T, t.vec6, kin.load, kin.link_of, spatial(spec).join
     Model, Lane, Ck, Links, Nodes, Base = t.Model, t.Lane, t.Checkpoint, t.Links, t.Nodes, t.Base
     FLOATING, SLOTS, SOLVES, DAMPED = spec.floating, spec.slots, spec.solves, spec.damped
-    BASE_DAMPED, CLAMP = "base_damping" in spec.features, "clamp" in spec.features
+    BASE_DAMPED, CLAMP = spec.has("base_damping clamp")
     THREADS_PER_ENV, SHARERS, TRUNK = spec.threads_per_env, spec.sharers, spec.trunk
 
     @wp.func

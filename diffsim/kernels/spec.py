@@ -35,6 +35,10 @@ class KernelSpec:
     constrained: bool = False  # MuJoCo's constraints (constraint.py) in place of the laws of springs and dampers
     spheres: int = 0  # with constraints, the most contact spheres of a lane
 
+    def has(self, names: str) -> list[bool]:
+        """Whether the scene has each of these features."""
+        return [name in self.features for name in names.split()]
+
     @property
     def floating(self) -> bool:
         return "floating" in self.features

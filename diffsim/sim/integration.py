@@ -15,15 +15,13 @@ class Integration(NamedTuple):
 
     Attributes:
         integrator: "semi_implicit" (Euler), "implicit" (linearly implicit in damping, friction and, scaled by theta,
-            stiffness), "extrapolated" (from two semi-implicit steps, one of half the substeps; second order at 1.5
-            times the cost) or "mujoco" (MuJoCo's Euler, with its own laws of contact, limits and dry friction in place
-            of springs and dampers).
-        substeps: integration steps in one control step; even if extrapolated.
+            stiffness), "extrapolated" (Richardson's, from two semi-implicit steps: second order at 1.5 times the cost)
+            or "mujoco" (MuJoCo's Euler and its own constraints for contact, limits and dry friction).
+        substeps: integration steps per control step; an even number for "extrapolated".
         theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); 0 unless implicit.
-        passes: of Newton's method on MuJoCo's constraints in each substep, at most; not read by the other integrators.
-        tolerance: of the residual that ends them, see Simulator.residual; not read by the other integrators.
-        touchdown: whether gradients count that such a contact begins with a jump, sooner or later as the state changes:
-            docs/physics.md; not read by the other integrators.
+        passes: only "mujoco": most passes of Newton's method per substep.
+        tolerance: only "mujoco": residual that ends them, see Simulator.residual.
+        touchdown: only "mujoco": gradients include the jumps with which contacts begin, see docs/adjoint.md.
     """
 
     integrator: str = "semi_implicit"
@@ -40,7 +38,7 @@ class Integration(NamedTuple):
 
     @property
     def constrained(self) -> bool:
-        """Whether contact and limits are MuJoCo's constraints, and no springs and dampers."""
+        """Whether contact and limits are MuJoCo's constraints instead of springs and dampers."""
         return self.integrator == "mujoco"
 
     def replaced(self, integrator: str | None = None, **others: Any) -> Integration:

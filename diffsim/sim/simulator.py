@@ -30,11 +30,11 @@ State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 class Simulator:
     """A batch of independent copies of one scene, stepped by control steps of equal length.
 
-    Holds the checkpoints of up to `horizon` differentiable control steps in a ring: a backward pass must come before
-    its steps are overwritten (asserted). Steps that need no gradient store nothing.
+    It stores up to `horizon` differentiable control steps in a ring. A backward pass must run before its steps are
+    overwritten, otherwise it raises RuntimeError. Steps without gradients store nothing.
 
     Args:
-        scene: what is simulated; a terrain of one profile for all copies, or of one for each.
+        scene: the robot and its ground; a terrain has one profile for all copies, or one for each.
         num_envs: number of copies N.
         integration: integrator, substeps and theta.
         control_dt: seconds of one control step.
@@ -45,24 +45,21 @@ class Simulator:
         ValueError: an argument out of range, with what is allowed.
 
     Attributes:
-        factors: (N, 8) multipliers of the scene's constants, at first ones, columns in the order of scene.FACTORS:
-            constants of contact and of all limits, mass and inertia of all links (not armature), force of all motors
-            and muscles. Change it in place or assign another tensor; a
-            step uses those of its call and is differentiable in them. (N, 0) without the argument.
-        forces: (N, nbody, 6) external force (N) and torque (N m) on each body, in world axes at its centre of mass, at
-            first zero: MuJoCo's xfrc_applied, with the rows of scene.mj_model's bodies. What acts on the world or on a
-            body that is fixed to it has no effect. Constant over a control step; to be changed like factors, and a
-            step is differentiable in them too. (N, 0, 6) without the argument.
-        nonfinite: (N,) bool, whose last step left the finite numbers, or passed 1e5 m, rad, m/s or rad/s, or
-            started from a quaternion shorter than 1e-15 or longer than 1e15. Their state is returned as it was before
-            that step, its gradient is zero; other environments are not touched.
-        residual: (N,) with the integrator mujoco, by how much the constraints' forces differ after the last pass of
-            Newton's method from those that it counted on, as the accelerations that the next pass would add, and what
-            rounding and a line search leave of the pass, relative to sqrt(1 + |qacc|^2), in that substep of the last
-            step where it is largest; else zeros.
-        passes: (N,) how many Newton's method took in the last step, mean over its substeps.
-        unconverged: (N,) int32, how many control steps ended with a residual above the tolerance.
-        nonfinite_gradients: (N,) int32, how many adjoints of control steps were not finite, and were set to zero.
+        factors: (N, 8) multipliers of the scene's constants, initially ones. Columns as in scene.FACTORS: constants of
+            contact and of limits; mass and inertia of all links, without armature; force of motors and muscles. Change
+            it in place or assign another tensor. A step uses the values at its call and is differentiable in them.
+            (N, 0) without factors=True.
+        forces: (N, nbody, 6) external force [N] and torque [N m] on each body in world axes at its centre of mass,
+            initially zero, constant over a control step: MuJoCo's xfrc_applied, with rows as in scene.mj_model. Used
+            like factors. Forces on the world and on bodies fixed to it have no effect. (N, 0, 6) without forces=True.
+        nonfinite: (N,) bool, environments whose last step was not finite, passed 1e5 m, rad, m/s or rad/s, or started
+            from a quaternion shorter than 1e-15 or longer than 1e15. They keep the state from before the step, with
+            zero gradient. Other environments do not change.
+        residual: (N,) on MuJoCo's contact, the acceleration that Newton's method still misses after its last pass,
+            relative to sqrt(1 + |qacc|^2), in the substep of the last step where it is largest. Zeros on soft contact.
+        passes: (N,) passes of Newton's method in the last step, mean over substeps. Zeros on soft contact.
+        unconverged: (N,) int32, number of control steps so far that ended with a residual above the tolerance.
+        nonfinite_gradients: (N,) int32, number of control steps so far whose adjoint was not finite and was set to 0.
     """
 
     @in_plain_mode
@@ -166,7 +163,7 @@ class Simulator:
         """Advance all environments by one control step, differentiable in its arguments, `factors` and `forces`.
 
         Args:
-            qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, normalised here.
+            qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, which need not have unit length.
             qvel: (N, nv) MuJoCo's generalised velocities; of a free joint the linear one in the world's frame, the
                 angular one in the body's.
             ctrl: (N, nu) one number per motor, [-1, 1] over its control range, constant over the step, not clipped.
@@ -183,7 +180,7 @@ class Simulator:
         return self.advance(qpos, qvel, ctrl)
 
     def advance(self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor) -> State:
-        """`step`, of arguments that are known to be of the right shape, dtype and device."""
+        """`step` without checks of shape, dtype and device."""
         if self.device.type == "cpu":  # a GPU's would have to be waited for
             for name, given in (("factors", self._factors), ("forces", self._forces)):
                 if given.shape[1]:
@@ -222,10 +219,9 @@ class Simulator:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """A (N, 2 nv, 2 nv) and B (N, 2 nv, nu) of one control step: dx' = A dx + B dctrl, by 2 nv backward passes.
 
-        x is qpos, then qvel, and differences of qpos are those of MuJoCo's mjd_transitionFD: a free joint's rotation,
-        and a ball joint's, changes by a rotation vector in the body's frame. Arguments, factors and forces are those of
-        a step; in a full window of differentiable steps it takes the oldest one's checkpoint. `nonfinite` environments
-        have zeros.
+        x is qpos, then qvel, and differences of qpos are those of MuJoCo's mjd_transitionFD: a rotation changes by a
+        rotation vector in the body's frame. Arguments, factors and forces are as for `step`. If `horizon` steps are
+        stored already, it overwrites the oldest one. Rows of `nonfinite` environments are zero.
         """
         leaves, slot = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._slot
         with torch.enable_grad():

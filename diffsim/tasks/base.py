@@ -40,8 +40,8 @@ class TaskError(ValueError):
 class Task:
     """A task. Subclasses fill in the attributes and the methods `observe` and `reward`.
 
-    `bind` fits it to its robot, and finds what the subclass leaves out. An episode starts uniformly in
-    start +- spread / 2, where both list qpos, then qvel.
+    docs/own_robot.md lists the attributes and their defaults. An episode starts uniformly in start +- spread / 2, where
+    both list qpos, then qvel.
     """
 
     name: ClassVar[str] = "task"
@@ -162,7 +162,7 @@ class Task:
     def presets(cls, contact: str | None = None) -> dict[str, Integration]:
         """The presets "fast", "default" (the paper's) and "accurate" that it has on a contact model, its own if None.
 
-        None is "fast" on MuJoCo's contact: what is much faster there errs too much (docs/numerics.md).
+        There is no "fast" on MuJoCo's contact: what saves much time there errs too much (docs/numerics.md).
 
         Raises:
             ValueError: another contact model.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import dataclasses
 import json
@@ -21,7 +22,7 @@ import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
-from diffsim.training import checkpoint, gait
+from diffsim.training import checkpoint, gait, graph
 from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
@@ -33,6 +34,7 @@ VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
 ENOUGH = 0.97  # of the return, kept there
+LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
 OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination clip control_dt".split()}
 SETTINGS = OPTIONS | {"env", "penalty", "device", "eval_episodes"}
@@ -134,32 +136,67 @@ def kept(own: float, finer: float) -> float:
     return own / finer if finer < 0 else 1.0
 
 
-@torch.no_grad()
+class Player:
+    """Plays the first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu), again and again.
+
+    Args:
+        graphs: on a GPU a control step is one CUDA graph; the environments must then be the player's alone.
+    """
+
+    def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], graphs: bool = False) -> None:
+        self.env, self.captured = env, graphs and env.device.type == "cuda"
+        self.policy = copy.deepcopy(policy) if self.captured else policy  # a graph knows the addresses of its weights
+        self.obs = torch.zeros(env.num_envs, env.task.obs_dim, dtype=env.dtype, device=env.device)
+        self.returns, self.lengths = torch.zeros_like(self.obs[:, 0]), torch.zeros_like(env.episode_step)
+        self.alive = torch.ones_like(self.lengths, dtype=torch.bool)
+        self.step = graph.capture(self._step, env.device, env) if self.captured else self._step
+        self.patience = LOOK_EVERY if env.device.type == "cuda" else 1
+
+    def take(self, policy: nn.Module) -> None:
+        """Play another policy of the same architecture from now on."""
+        if self.captured and isinstance(self.policy, nn.Module):
+            self.policy.load_state_dict(policy.state_dict())
+        else:
+            self.policy = policy
+
+    def _step(self) -> Tensor:
+        action = self.policy(self.obs)
+        obs, reward, terminated, truncated, _ = self.env.step(action)
+        self.obs.copy_(obs)
+        self.returns += torch.where(self.alive, reward, torch.zeros_like(reward))
+        self.lengths += self.alive
+        self.alive &= ~(terminated | truncated)
+        return action
+
+    @torch.no_grad()
+    def evaluate(self, seed: int = SEED) -> Evaluation:
+        """From the start states of a seed. Control steps after the last episode's end are not part of the result."""
+        env, path, actions, ghosts = self.env, list[Tensor](), list[Tensor](), list[Tensor]()
+        env.sim.unconverged.zero_()
+        self.obs.copy_(env.reset(seed=seed)[0])
+        self.returns.zero_()
+        self.lengths.zero_()
+        self.alive.fill_(True)
+        while len(path) % self.patience or self.alive.any():
+            path.append(env.qpos.clone())
+            if (ghost := env.task.ghost(env.memory)) is not None:
+                ghosts.append(ghost)
+            actions.append(self.step().clone())
+        returns, lengths = self.returns.clone(), self.lengths.clone()
+        qpos, action = (torch.stack(rows[: int(lengths.max())]) for rows in (path, actions))
+        speed, forward = None, env.task.forward_column
+        if forward is not None:
+            distance = qpos[..., forward].gather(0, lengths.unsqueeze(0) - 1)[0] - qpos[0, :, forward]
+            speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
+        missed = env.sim.unconverged.sum().item()
+        others = {"unconverged": missed} if missed else {}  # control steps, of Newton's method
+        followed = torch.stack(ghosts[: len(qpos)]) if ghosts else None
+        return Evaluation(returns, lengths, speed, qpos, action, env.scene, env.control_dt, others, followed)
+
+
 def evaluate(env: DiffEnv, policy: Callable[[Tensor], Tensor], seed: int = SEED) -> Evaluation:
-    """The first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu)."""
-    env.sim.unconverged.zero_()
-    obs, _ = env.reset(seed=seed)
-    alive = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    returns, lengths = torch.zeros_like(obs[:, 0]), torch.zeros_like(alive, dtype=torch.long)
-    qpos, actions, ghosts = [], [], []
-    while alive.any():
-        qpos.append(env.qpos)
-        if (ghost := env.task.ghost(env.memory)) is not None:
-            ghosts.append(ghost)
-        actions.append(policy(obs))
-        obs, reward, terminated, truncated, _ = env.step(actions[-1])
-        returns += torch.where(alive, reward, torch.zeros_like(reward))
-        lengths += alive
-        alive &= ~(terminated | truncated)
-    path = torch.stack(qpos)
-    speed, forward = None, env.task.forward_column
-    if forward is not None:
-        distance = path[..., forward].gather(0, lengths.unsqueeze(0) - 1)[0] - path[0, :, forward]
-        speed = (distance.sum() / ((lengths - 1).sum().clamp(min=1) * env.control_dt)).item()
-    missed = env.sim.unconverged.sum().item()
-    others = {"unconverged": missed} if missed else {}  # control steps, of Newton's method
-    about, followed = (env.scene, env.control_dt, others), torch.stack(ghosts) if ghosts else None
-    return Evaluation(returns, lengths, speed, path, torch.stack(actions), *about, followed)
+    """The first episode of each environment under a policy."""
+    return Player(env, policy).evaluate(seed)
 
 
 def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:

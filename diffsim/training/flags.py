@@ -44,7 +44,7 @@ class RunFlags:
     """torch device of simulation and learning, e.g. cpu or cuda:0 (auto: the GPU if there is one)"""
     run_dir: Path | None = None
     """directory of the run (default: a new runs/{env}__{script}__{seed}__{time}, or the resumed checkpoint's)"""
-    eval_every: Natural = 100
+    eval_every: Natural = 200
     """evaluate the deterministic policy every this many iterations (0: only at the end)"""
     eval_episodes: Count = 64
     """episodes of an evaluation, one in each of as many fresh environments"""

@@ -26,7 +26,7 @@ from diffsim.training import checkpoint, distributed, graph
 from diffsim.training.checkpoint import Learner
 from diffsim.training.directory import EpisodeStatistics, ProgressLog, check_writable, make_unused, say
 from diffsim.training.errors import fail
-from diffsim.training.evaluation import FINER, Evaluation, make_env, write_evaluation
+from diffsim.training.evaluation import FINER, Evaluation, Player, make_env, write_evaluation
 from diffsim.training.flags import Flags, ParallelFlags
 from diffsim.training.graph import Mark
 from diffsim.training.layers import ObsNormalizer
@@ -101,6 +101,7 @@ class Run:
         self._times: dict[str, tuple[Mark, Mark]] = {}
         self._mark = Mark(self.device)
         self._evaluation: tuple[int, Evaluation] | None = None
+        self._player: Player | None = None
         self._scalars: dict[str, float] = {}  # that were written last
         self._monitor: Monitor | None = None
         self._told = dict.fromkeys(TOLD, 0.0)  # by messages
@@ -163,8 +164,7 @@ class Run:
 
     def capture(self, function: Callable[[], Metrics], env: DiffEnv | None = None) -> Callable[[], Metrics]:
         """Half an iteration, timed as time/{name}; on a GPU its calls replay one CUDA graph. See graph.capture."""
-        graphs = isinstance(self.args, ParallelFlags) and self.args.cuda_graph
-        call = graph.capture(function, self.device, env) if graphs else function
+        call = graph.capture(function, self.device, env) if getattr(self.args, "cuda_graph", False) else function
 
         def timed() -> Metrics:
             begin = Mark(self.device)
@@ -248,6 +248,12 @@ class Run:
                 f"{STEPS} steps: the policy learns the integrator's errors; give more --substeps"
             )
         return found
+
+    def evaluate(self, policy: nn.Module) -> None:
+        """Evaluate the deterministic policy, always of one architecture, in the iteration that was logged last."""
+        self._player = self._player or Player(self.eval_env, policy, getattr(self.args, "cuda_graph", False))
+        self._player.take(policy)
+        self.log_evaluation(self._player.evaluate())
 
     def log_evaluation(self, evaluation: Evaluation) -> None:
         """Take the evaluation of the iteration that was logged last."""

@@ -56,11 +56,12 @@ def first_failure(motion: Motion, sweep: str, how: Integration) -> str:
             if value >= how.substeps or how.integrator == "extrapolated" and value % 2:
                 continue
             own = how._replace(substeps=int(value))
-        energy, finite = case.energies(Setting(own))
-        if not finite:
+        trail = case.replay(Setting(own))
+        if trail.contained:
             return f"{value:g} (not finite)"
-        finest = Setting(how._replace(substeps=FINER * how.substeps), torch.float64)
-        if energy[..., 0].max() > 2 * case.energies(finest)[0][..., 0].max():
+        finest = case.replay(Setting(how._replace(substeps=FINER * how.substeps), torch.float64))
+        most, allowed = (case.energies(each)[..., 0].max() for each in (trail, finest))
+        if most > 2 * allowed:
             return f"{value:g} (energy)"
     return "-"
 

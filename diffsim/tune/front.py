@@ -14,7 +14,6 @@ from tqdm import tqdm
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
-from diffsim.training.monitor import apart
 from diffsim.tune.motion import HORIZONS, SPANS, Motion, Setting, without
 
 FINER = 8  # the reference's substeps, in multiples of the most measured
@@ -65,20 +64,19 @@ class Reference:
     """What a setting makes of a motion, to be compared with what others make of it."""
 
     def __init__(self, motion: Motion, setting: Setting) -> None:
-        self.motion, self.setting = motion, setting
-        self.states, self.residual, self.contained = motion.replay(setting)
-        self.gradients = motion.gradients(setting)
-        self.energies = motion.fall(setting)[0]
+        falling = motion.falling()
+        self.motion, self.trail, self.gradients = motion, motion.replay(setting), motion.gradients(setting)
+        self.energies = falling.energies(falling.replay(setting))
 
     def errors(self, truth: Reference) -> dict[str, float]:
-        model, gained = self.motion.scene.mj_model, truth.energies[..., 0].max(0)
-        pairs = [(h, found, truth.gradients[h]) for h, found in self.gradients.items()]
-        drift = abs(self.energies - truth.energies)[..., 1].max(0) / gained
+        motion, pairs = self.motion, [(h, a, truth.gradients[h]) for h, a in self.gradients.items()]
+        drift = abs(self.energies - truth.energies)[..., 1].max(0) / truth.energies[..., 0].max(0)
         return (
-            {f"state {t:g} s": float(np.median(apart(model, q, truth.states[t]))) for t, q in self.states.items()}
+            {f"state {t:g} s": motion.error(self.trail, truth.trail, t) for t in SPANS}
             | {f"gradient {h}": ((a - b).norm(dim=1) / b.norm(dim=1)).median().item() for h, a, b in pairs}
             | {f"cosine {h}": F.cosine_similarity(a, b, dim=1).median().item() for h, a, b in pairs}
-            | {"residual": self.residual, "energy drift": float(np.median(drift)), "contained": self.contained}
+            | {"residual": self.trail.residual, "energy drift": float(np.median(drift))}
+            | {"contained": self.trail.contained}
         )
 
 
@@ -90,22 +88,18 @@ def timed(sims: Sequence[Simulator], motion: Motion, rounds: int = ROUNDS) -> li
         order = [*zip(best, sims, strict=True)]
         for row, sim in order if turn % 2 else reversed(order):  # so that no one always follows the slowest
             copies = torch.arange(sim.num_envs) % len(motion.qpos)
-            q0, v0, actions = (
-                x.to(sim.device, sim.dtype)
-                for x in (motion.qpos[copies], motion.qvel[copies], motion.actions[:8, copies])
-            )
-            spent = []
-            for grad in (False, True):
+            states = motion.qpos[copies], motion.qvel[copies], *motion.actions[:8, copies]
+            for k, grad in enumerate((False, True)):
                 sim.rewind()
-                q, v, leaves = q0, v0, [a.clone().requires_grad_(grad) for a in actions]
-                start = clock(sim)
+                q, v, *leaves = (x.to(sim.device, sim.dtype) for x in states)
+                leaves = [leaf.requires_grad_(grad) for leaf in leaves]
+                start = clock(sim.device)
                 for leaf in leaves:
                     q, v = sim.step(q, v, leaf)
                 if grad:
                     v.sum().backward()
-                spent.append((clock(sim) - start) / len(leaves) / sim.num_envs * 1e6)
-            if turn:
-                row[:] = np.minimum(row, spent)
+                if turn:
+                    row[k] = min(row[k], (clock(sim.device) - start) / len(leaves) / sim.num_envs * 1e6)
     return best.tolist()
 
 
@@ -132,9 +126,10 @@ def measure(motion: Motion, found: list[Setting], rows: list[Row], **options: An
         rows.append(Row(setting, numbers | Reference(motion, setting).errors(truth)))
 
 
-def clock(sim: Simulator) -> float:
-    if sim.device.type == "cuda":
-        torch.cuda.synchronize(sim.device)
+def clock(device: torch.device) -> float:
+    """Seconds, once the device has done what it was told."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
     return time.perf_counter()
 
 

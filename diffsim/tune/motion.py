@@ -17,8 +17,8 @@ from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene, Spheres
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
+from diffsim.training.monitor import apart
 
-Array = NDArray[np.float64]
 HORIZONS = (8, 32)  # control steps of the gradients
 SPANS = (0.1, 0.5)  # s after which states are compared
 SPREAD = (0.25, 0.5, 1.0, 2.0)  # s after the start, where a quarter of the start states each is taken
@@ -46,13 +46,20 @@ class Setting(NamedTuple):
     def flags(self) -> str:
         """What a script is given to use it."""
         how = self.integration
+        theta = f" --theta {how.theta:g}" if how.integrator == "implicit" else ""
+        words = f"--contact soft --integrator {how.integrator}{theta} --substeps {how.substeps}"
         if how.constrained:
-            words = f"--contact mujoco --substeps {how.substeps}"
-            words += f" --passes {how.passes} --tolerance {how.tolerance:g}"
-        else:
-            theta = f" --theta {how.theta:g}" if how.integrator == "implicit" else ""
-            words = f"--contact soft --integrator {how.integrator}{theta} --substeps {how.substeps}"
+            words = f"--contact mujoco --substeps {how.substeps} --passes {how.passes} --tolerance {how.tolerance:g}"
         return words + (" (float64: dtype=torch.float64 in diffsim.make)" if self.dtype == torch.float64 else "")
+
+
+class Trail(NamedTuple):
+    """What a setting makes of a motion."""
+
+    qpos: Tensor  # (T, N, nq), (T, N, nv) after each control step, in float64
+    qvel: Tensor
+    residual: float  # the largest one of MuJoCo's constraints, median over environments
+    contained: float  # share of environments
 
 
 class Motion:
@@ -61,103 +68,97 @@ class Motion:
     @torch.no_grad()
     def __init__(self, env: DiffEnv, policy: torch.nn.Module | None, seed: int = 0) -> None:
         dt, n, nu = env.control_dt, env.num_envs, env.scene.nu
-        self.steps = max(*HORIZONS, round(SPANS[-1] / dt))
+        self.scene, self.dt, self.half_second = env.scene, dt, round(SPANS[-1] / dt)
+        steps = max(*HORIZONS, self.half_second)
         starts = [round(SPREAD[k % len(SPREAD)] / dt) for k in range(n)]
-        length = max(starts) + self.steps
+        length = max(starts) + steps
         obs, _ = env.reset(seed=seed)
         knots = torch.randn(nu, n, 2 + int(length * dt / 0.2), generator=torch.Generator().manual_seed(seed))
         smooth = F.interpolate(knots, size=length, mode="linear").permute(2, 1, 0)  # a new goal each 0.2 s
-        states, actions = [], []
+        rows = []
         for k in range(length):
             action = (0.5 * smooth[k].to(obs) if policy is None else policy(obs)).clamp(-1, 1)
-            states.append((env.qpos.double().cpu(), env.qvel.double().cpu()))
-            actions.append(action.double().cpu())
+            rows.append([x.double().cpu() for x in (env.qpos, env.qvel, action)])
             obs = env.step(action)[0]
-        self.scene, self.dt = env.scene, dt
-        self.qpos = torch.stack([states[first][0][k] for k, first in enumerate(starts)])
-        self.qvel = torch.stack([states[first][1][k] for k, first in enumerate(starts)])
-        rows = [torch.stack([a[k] for a in actions[first : first + self.steps]]) for k, first in enumerate(starts)]
-        self.actions = torch.stack(rows, 1)
+        qpos, qvel, actions = map(torch.stack, zip(*rows, strict=True))
+        self.qpos, self.qvel = qpos[starts, range(n)], qvel[starts, range(n)]
+        self.actions = torch.stack([actions[first : first + steps, k] for k, first in enumerate(starts)], 1)
 
     def simulator(self, setting: Setting, num_envs: int, scene: Scene | None = None, **options: object) -> Simulator:
         how, dtype = setting
         return Simulator(scene or self.scene, num_envs, how, self.dt, max(HORIZONS), dtype=dtype, **options)
 
     @torch.no_grad()
-    def replay(self, setting: Setting) -> tuple[dict[float, Tensor], float, float]:
-        """qpos (N, nq) after SPANS, the largest residual (median over environments) and the share contained."""
+    def replay(self, setting: Setting) -> Trail:
         sim = self.simulator(setting, len(self.qpos))
-        q, v, found = self.qpos.to(sim.dtype), self.qvel.to(sim.dtype), dict[float, Tensor]()
-        bad, residual = torch.zeros(len(q), dtype=torch.bool), torch.zeros(len(q), dtype=sim.dtype)
-        for k, action in enumerate(self.actions.to(sim.dtype), start=1):
+        q, v, states = self.qpos.to(sim.dtype), self.qvel.to(sim.dtype), []
+        bad, residual = torch.zeros_like(sim.nonfinite), torch.zeros_like(sim.residual)
+        for action in self.actions.to(sim.dtype):
             q, v = sim.step(q, v, action)
+            states.append((q.double(), v.double()))
             bad, residual = bad | sim.nonfinite, residual.maximum(sim.residual)
-            found |= {span: q.double() for span in SPANS if k == max(1, round(span / self.dt))}
-        return found, residual.median().item(), bad.double().mean().item()
+        qpos, qvel = map(torch.stack, zip(*states, strict=True))
+        return Trail(qpos, qvel, residual.median().item(), bad.double().mean().item())
 
     def gradients(self, setting: Setting) -> dict[int, Tensor]:
         """Over HORIZONS: (N, steps * nu), of the sum of the velocities, weighted 0.5 to 1.5 along dofs, in actions."""
-        found: dict[int, list[Tensor]] = {h: [] for h in HORIZONS}
-        sims = {n: self.simulator(setting, n) for n in {min(CHUNK, len(self.qpos)), len(self.qpos) % CHUNK} if n}
-        for rows in torch.arange(len(self.qpos)).split(CHUNK):
-            sim = sims[len(rows)]
-            weights = torch.linspace(0.5, 1.5, self.scene.nv, dtype=sim.dtype)
-            for horizon, gradients in found.items():
+        n, sim = len(self.qpos), self.simulator(setting, CHUNK)
+        weights = torch.linspace(0.5, 1.5, self.scene.nv, dtype=sim.dtype)
+        found = {h: torch.empty(0, h * self.scene.nu, dtype=torch.float64) for h in HORIZONS}
+        for first in range(0, n, CHUNK):
+            rows = torch.arange(first, first + CHUNK) % n
+            for horizon in HORIZONS:
                 sim.rewind()
                 leaves = [a.to(sim.dtype).requires_grad_() for a in self.actions[:horizon, rows]]
                 q, v, total = self.qpos[rows].to(sim.dtype), self.qvel[rows].to(sim.dtype), torch.zeros(())
                 for leaf in leaves:
                     q, v = sim.step(q, v, leaf)
                     total = total + (v * weights).sum()
-                gradients.append(torch.stack(torch.autograd.grad(total, leaves), 1).flatten(1).double())
-        return {h: torch.cat(gradients) for h, gradients in found.items()}
+                gradients = torch.stack(torch.autograd.grad(total, leaves), 1).flatten(1).double()
+                found[horizon] = torch.cat((found[horizon], gradients))[:n]
+        return found
 
-    def fall(self, setting: Setting) -> tuple[Array, bool]:
-        """Energies of a fall of 0.5 s without ground and without actuators' forces, see energies."""
-        muscle = torch.tensor(self.scene.motor_link) == 0
-        passive = copy.copy(self)
-        passive.scene, passive.actions = (
-            without(self.scene, "contact"),
-            torch.where(muscle, -1.0, 0.0).expand_as(self.actions),
-        )
-        return passive.energies(setting)
+    def error(self, found: Trail, truth: Trail, span: float) -> float:
+        """Root mean square over dofs [m, rad] after a span [s], median over environments."""
+        step = max(1, round(span / self.dt)) - 1
+        return float(np.median(apart(self.scene.mj_model, found.qpos[step], truth.qpos[step])))
 
-    @torch.no_grad()
-    def energies(self, setting: Setting) -> tuple[Array, bool]:
-        """Kinetic energy and energy (T, N, 2) [J] over 0.5 s, and whether all environments stay finite."""
-        sim = self.simulator(setting, len(self.qpos))
+    def falling(self) -> Motion:
+        """The same without ground and without actuators' forces."""
+        passive, muscle = copy.copy(self), torch.tensor(self.scene.motor_link) == 0
+        passive.scene = without(self.scene, "contact")
+        passive.actions = torch.where(muscle, -1.0, 0.0).expand_as(self.actions)
+        return passive
+
+    def energies(self, trail: Trail) -> NDArray[np.float64]:
+        """Kinetic energy and energy (T, N, 2) [J] over 0.5 s."""
         model = copy.deepcopy(self.scene.mj_model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-        data, rows, finite = mujoco.MjData(model), list[tuple[float, float]](), True
-        q, v = self.qpos.to(sim.dtype), self.qvel.to(sim.dtype)
-        for action in self.actions[: round(SPANS[-1] / self.dt)].to(sim.dtype):
-            q, v = sim.step(q, v, action)
-            finite &= not bool(sim.nonfinite.any())
-            for data.qpos[:], data.qvel[:] in zip(q.numpy(), v.numpy(), strict=True):
-                mujoco.mj_forward(model, data)
-                mujoco.mj_energyPos(model, data)
-                mujoco.mj_energyVel(model, data)
-                rows.append((data.energy[1], data.energy.sum()))
-        return np.array(rows).reshape(-1, len(self.qpos), 2), finite
+        model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+        data, rows = mujoco.MjData(model), []
+        states = (x[: self.half_second].flatten(0, 1).numpy() for x in (trail.qpos, trail.qvel))
+        for data.qpos[:], data.qvel[:] in zip(*states, strict=True):
+            mujoco.mj_forward(model, data)
+            rows.append((data.energy[1], data.energy.sum()))
+        return np.array(rows).reshape(-1, len(self.qpos), 2)
 
 
 def without(scene: Scene, part: str) -> Scene:
     """The scene without its contact, limits, dry friction, muscles, terrain or fluid."""
-    n = scene.nlink
-    nothing = {name: getattr(scene, name)[:0] for name in ("contact_link", "contact_position", "contact_radius")}
+    model = copy.deepcopy(scene.mj_model)
+    model.dof_frictionloss[:] = 0.0
+
+    def empty(names: str) -> dict[str, Any]:
+        return {name: getattr(scene, name)[:0] for name in names.split()}
+
     spheres: Any = (values[:0] for values in scene.spheres)
     changes: dict[str, Any] = {
-        "contact": nothing | {"spheres": Spheres(*spheres), "terrain": None},
-        "limit": {"lower": np.full(n, -np.inf), "upper": np.full(n, np.inf)},
-        "muscle": {name: getattr(scene, name)[:0] for name in ("segment_link", "segment_position", "segment_muscle")},
+        "contact": empty("contact_link contact_position contact_radius")
+        | {"spheres": Spheres(*spheres), "terrain": None},
+        "limit": {"lower": np.full(scene.nlink, -np.inf), "upper": np.full(scene.nlink, np.inf)},
+        "muscle": empty("segment_link segment_position segment_muscle"),
         "terrain": {"terrain": None},
         "drag": {"density": 0.0, "viscosity": 0.0},
-        "frictionloss": {"mj_model": frictionless(scene.mj_model)},
-    }[part]
-    return dataclasses.replace(scene, **changes)
-
-
-def frictionless(model: mujoco.MjModel) -> mujoco.MjModel:
-    model = copy.deepcopy(model)
-    model.dof_frictionloss[:] = 0.0
-    return model
+        "frictionloss": {"mj_model": model},
+    }
+    return dataclasses.replace(scene, **changes[part])

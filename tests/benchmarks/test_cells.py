@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import time
-from pathlib import Path
 
 import cells
 import numpy as np
 import paper
-import pytest
 import tables
 
 from diffsim.training import checkpoint
@@ -22,9 +20,7 @@ def points(learner: str, seed: int, slope: float, count: int, task: str = "ant")
     return [about | line for line in lines]
 
 
-def test_policies_are_compared_within_the_control_steps_that_all_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_policies_are_compared_within_the_control_steps_that_all_made(tmp_path, monkeypatch):
     """At 3,000 steps, where a Gaussian run ends: 30 and 60 of the first learner, 15 and 30 of the second."""
     group = cells.Group("h200", ("a", "b"), ("ant", "hopper"), 2, timed=False, ratios=True)
     monkeypatch.setitem(paper.GROUPS, "both", group)
@@ -37,14 +33,14 @@ def test_policies_are_compared_within_the_control_steps_that_all_made(
     assert row == {"task": "ant", "control steps": "0.003 M", "a": "45 ± 15", "b": "22 ± 8", "ratio": "2.00"}
 
 
-def test_curves_begin_with_the_first_episode_and_tell_where_they_pass() -> None:
+def test_curves_begin_with_the_first_episode_and_tell_where_they_pass():
     rows = [{"iteration": f"{k}", "control_steps": f"{8 * k}", "seconds": f"{k}", "return": f"{k}"} for k in range(9)]
     one = cells.curve([rows[0] | {"return": ""}, *rows[1:]])
     assert len(one["return"]) == 8 and cells.passing(one, 5.0, "control_steps") == 40.0
     assert cells.passing(one, 50.0, "seconds") == np.inf
 
 
-def test_a_picture_has_steps_for_all_and_seconds_for_those_alone() -> None:
+def test_a_picture_has_steps_for_all_and_seconds_for_those_alone():
     rows = [{"control_steps": f"{8 * k}", "seconds": f"{k}", "return": f"{k}"} for k in range(1, 9)]
     found = {("shac", "hopper"): [cells.curve(rows)] * 2}
     found["sapo", "hopper"] = [cells.curve([row | {"seconds": ""} for row in rows])]
@@ -54,7 +50,7 @@ def test_a_picture_has_steps_for_all_and_seconds_for_those_alone() -> None:
     assert [line.label for line in seconds.lines] == ["", "", "shac", "shac, published"]
 
 
-def test_a_stopped_call_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_call_goes_on_where_it_was(tmp_path, monkeypatch):
     flags = "--num-envs", "2", "--horizon", "8", "--eval-every", "0", "--eval-episodes", "1", "--iterations"
     folder = tmp_path / "bptt" / "cartpole__1"
     case = cells.Case(folder, "cartpole", 1, "bptt")

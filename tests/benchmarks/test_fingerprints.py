@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable
-from pathlib import Path
 
 import common
 import fingerprints
@@ -20,7 +18,7 @@ NAMES = [*CASES]
 
 
 @pytest.fixture
-def chain(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, str]]]:
+def chain(monkeypatch):
     """Links a-b-c-d, all equal; what trainings depend on is another in each revision but the equal pairs given."""
 
     def make(**equal: str) -> list[dict[str, str]]:
@@ -38,7 +36,7 @@ def link(parent: str, revision: str, differ: str = "", reason: str = "", sentine
     return dict(zip(fingerprints.COLUMNS, values, strict=True))
 
 
-def test_a_training_depends_on_its_learner_its_task_and_its_flags() -> None:
+def test_a_training_depends_on_its_learner_its_task_and_its_flags():
     for command, names in {
         "shac --env hopper": {"shac"},
         "shac --env ant": {"shac", "ant"},
@@ -53,9 +51,7 @@ def test_a_training_depends_on_its_learner_its_task_and_its_flags() -> None:
         assert script in names and (cell.task == "hopper" or cell.task in names)
 
 
-def test_a_result_counts_while_each_link_keeps_what_it_depends_on(
-    chain: Callable[..., list[dict[str, str]]],
-) -> None:
+def test_a_result_counts_while_each_link_keeps_what_it_depends_on(chain):
     made = chain(x="b", HEAD="d")
     assert all(counts(revision, "shac --env ant") for revision in "abcdx") and not counts("y", "shac --env ant")
     assert not fingerprints.open_end()
@@ -75,9 +71,7 @@ def test_a_result_counts_while_each_link_keeps_what_it_depends_on(
     assert [counts(revision, "shac --env ant") for revision in "abzcd"] == [False, False, True, True, True]
 
 
-def test_a_result_counts_while_its_preset_is_the_same(
-    chain: Callable[..., list[dict[str, str]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_result_counts_while_its_preset_is_the_same(chain, monkeypatch):
     chain()
     text = "class Ant:\n    fast = 8\n    accurate = {}\n"
     files = {f"{at}:diffsim/tasks/ant.py": text.format(n) for at, n in (("a", 16), ("b", 32), ("HEAD", 32))}
@@ -92,9 +86,7 @@ def test_a_result_counts_while_its_preset_is_the_same(
     fingerprints.preset.cache_clear()
 
 
-def test_head_is_the_newest_revision_or_the_command_is_told(
-    chain: Callable[..., list[dict[str, str]]],
-) -> None:
+def test_head_is_the_newest_revision_or_the_command_is_told(chain):
     made = chain()
     told = fingerprints.open_end()
     assert "changed since d" in told and told.endswith(": python benchmarks/paper.py --same d --update-results")
@@ -104,7 +96,7 @@ def test_head_is_the_newest_revision_or_the_command_is_told(
     assert "6 of 6 cells are missing" in paper.check(paper.Args(only=("alpha",)))
 
 
-def test_the_chain_of_the_results_is_whole() -> None:
+def test_the_chain_of_the_results_is_whole():
     links = fingerprints.links()
     assert links, "no result counts"
     if not fingerprints.same_files(links[0]["parent"], links[0]["parent"]):
@@ -116,11 +108,7 @@ def test_the_chain_of_the_results_is_whole() -> None:
         assert not each["differ"] or each["reason"]
 
 
-def test_a_link_is_recorded_where_the_chain_ends_and_with_its_reason(
-    chain: Callable[..., list[dict[str, str]]],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_link_is_recorded_where_the_chain_ends_and_with_its_reason(chain, monkeypatch, capsys):
     chain()
     args, found = paper.Args(update_results=True, device="cpu"), dict.fromkeys(CASES, True)
     written = list[dict[str, str]]()
@@ -138,9 +126,7 @@ def test_a_link_is_recorded_where_the_chain_ends_and_with_its_reason(
     assert (written[-1]["differ"], written[-1]["reason"]) == ("ant", "a better ant")
 
 
-def test_a_sentinel_beyond_the_published_range_breaks_the_chain(
-    chain: Callable[..., list[dict[str, str]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sentinel_beyond_the_published_range_breaks_the_chain(chain, monkeypatch):
     made, returns, written = chain(HEAD="d"), {"ant": 5.0, "humanoid": 5.0}, list[dict[str, str]]()
     made[-1] |= {"equal": "shac", "differ": "ant humanoid", "reason": "a better ant"}
     steps = {"ant": "9", "humanoid": "8", "hopper": "1"}
@@ -164,7 +150,7 @@ def test_a_sentinel_beyond_the_published_range_breaks_the_chain(
         assert counts("a", "shac --env ant") == kept and counts("a", "shac --env humanoid")
 
 
-def test_fingerprints_notice_changed_numbers_and_no_changed_words(tmp_path: Path) -> None:
+def test_fingerprints_notice_changed_numbers_and_no_changed_words(tmp_path):
     """Of the task and of a kernel; each copy of the package is trained on its own."""
     ignored = shutil.ignore_patterns("__pycache__", "policies")
     shutil.copytree(common.ROOT / "diffsim", tmp_path / "diffsim", ignore=ignored)

@@ -63,7 +63,7 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
 def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> None:
     (line,) = paper.table(paper.Args(), "headline")
     assert (line["task"], line["learner"]) == ("hopper", "sapo")
-    assert line["return"] == "5100 (4800 to 5300)" and line["training (s)"] == "63" and line["falls"] == "0.05"
+    assert line["return"] == "5100 [4800, 5300]" and line["training (s)"] == "63" and line["falls"] == "0.05"
     assert (line["s to target"], line["steps to target"], line["in all (s)"]) == ("9", "3 M", "")
     for column, other in {"revision": "bbbbbbb", "trained on": "NVIDIA H100", "training (s)": ""}.items():
         before, known[4][column] = known[4][column], other

@@ -48,7 +48,9 @@ def test_the_commands(tmp_path: Path) -> None:
     flags = ["--device", "cpu", "--env", "hopper", "--output", str(tmp_path)]
     peer.main(parse(peer.Args, None, [*flags, "--num-envs", "2", "--repeats", "1"]))
     (row,) = read_csv(tmp_path / "peer_speed.csv")
-    assert row["lost"] == "0" and all(float(row[name]) > 0 for name in ("mujoco_warp", "here", "forward and backward"))
+    assert row["lost"] == "0" and all(
+        float(row[name]) > 0 for name in ("mj_step", "mujoco_warp", "here", "forward and backward")
+    )
     own = "--num-envs 2 --minibatch-size 8 --horizon 4 --eval-episodes 2 --quiet".split()
     training = ["--parts", "train", "--seconds", "0.1", "--runs", str(tmp_path), "--", *own]
     peer.main(parse(peer.Args, None, [*flags, *training]))

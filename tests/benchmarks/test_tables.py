@@ -6,14 +6,11 @@ import sys
 from pathlib import Path
 
 import common
-import pytest
 import tables
 from learners import refusal
 
 
-def test_rows_replace_those_of_their_key_and_origins_those_of_their_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_replace_those_of_their_key_and_origins_those_of_their_command(tmp_path, monkeypatch):
     path = tmp_path / "a.csv"
     for flags, rows in (
         (["--first"], [{"task": "ant", "us": 1.0, "error": 0.5}, {"task": "hopper", "us": 2.0, "error": 0.25}]),
@@ -40,7 +37,7 @@ def test_rows_replace_those_of_their_key_and_origins_those_of_their_command(
     assert tables.origins(path) == [first, second]
 
 
-def test_only_its_own_part_of_a_page_is_filled(tmp_path: Path) -> None:
+def test_only_its_own_part_of_a_page_is_filled(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- a -->\nold\n<!-- /a -->\nbetween\n<!-- b -->\n<!-- /b -->\nafter\n")
     for name, text in (("a", "new\n"), ("b", "b\n"), ("a", "newer\n"), ("c", "c\n")):
@@ -49,7 +46,7 @@ def test_only_its_own_part_of_a_page_is_filled(tmp_path: Path) -> None:
     assert page.read_text() == parts + "<!-- c -->\nc\n<!-- /c -->\n"
 
 
-def test_results_of_a_gpu_have_places_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_of_a_gpu_have_places_of_their_own(monkeypatch):
     monkeypatch.setattr("torch.cuda.get_device_name", lambda _: "NVIDIA H100 80GB HBM3")
     gpu, cpu, elsewhere = (
         common.CommonFlags(device="cuda:0", update_results=True),
@@ -62,9 +59,7 @@ def test_results_of_a_gpu_have_places_of_their_own(monkeypatch: pytest.MonkeyPat
     assert elsewhere.picture("speed") == Path("/elsewhere/speed.png")
 
 
-def test_the_repository_is_changed_on_demand_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_repository_is_changed_on_demand_alone(tmp_path, monkeypatch, capsys):
     for name in ("RESULTS", "DOCS", "OUTPUT"):
         monkeypatch.setattr(common, name, tmp_path / name)
     monkeypatch.setattr(tables, "unknown", lambda _: "")
@@ -85,9 +80,7 @@ def test_the_repository_is_changed_on_demand_alone(
     assert error.endswith("--output and --update-results exclude each other")
 
 
-def test_results_of_unknown_origin_are_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_of_unknown_origin_are_refused(monkeypatch, capsys):
     known = "# 2 cores of a CPU; python 3.11, torch 2.13; revision 1dd159e; python speed.py --runs unknown-dirty\n"
     assert tables.unknown(known) == ""
     for old, new, found in (
@@ -103,15 +96,13 @@ def test_results_of_unknown_origin_are_refused(
         common.parse(common.CommonFlags, None, [])  # elsewhere any will do
 
 
-def test_every_result_says_where_it_comes_from() -> None:
+def test_every_result_says_where_it_comes_from():
     paths = list(common.RESULTS.glob("*/*.csv"))
     assert paths and all(len(line.split("; ")) == 4 for path in paths for line in tables.origins(path))
     assert all(tables.origins(path) and tables.read_csv(path) for path in paths)
 
 
-def test_without_matplotlib_one_line_says_what_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_matplotlib_one_line_says_what_is_missing(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     common.can_draw.cache_clear()

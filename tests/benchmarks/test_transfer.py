@@ -48,7 +48,7 @@ def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.
     transfer.main(parse(transfer.Args, None, [*map(str, paths), *flags, str(tmp_path)]))
     rows = read_csv(tmp_path / "transfer.csv")
     lines = {line["learner"]: line for line in transfer.table(rows)}
-    assert markdown([*lines.values()]) in capsys.readouterr().out
+    assert markdown(transfer.shown(rows)) in capsys.readouterr().out
     worlds = ["here", "finer", "MuJoCo x1", "MuJoCo x0.5"]
     for learner, names, judge in (
         ("policies/hopper", worlds, "MuJoCo x1"),

@@ -42,7 +42,7 @@ class Tiny:
         self.layer = nn.Linear(2, 1)
 
 
-def test_a_crash_while_saving_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crash_while_saving_leaves_the_old_one(tmp_path, monkeypatch):
     path = tmp_path / "checkpoint.pt"
     save(path, "shac", Tiny(), STATE)
     whole = path.read_bytes()
@@ -62,7 +62,7 @@ def test_a_crash_while_saving_leaves_the_old_one(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_anything_else_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_anything_else_is_refused_in_one_line(tmp_path, capsys):
     path = tmp_path / "checkpoint.pt"
     assert refusal(lambda: load(path), capsys).endswith(f": no such checkpoint: {path}")
     assert refusal(lambda: load(tmp_path), capsys).endswith(f": no such checkpoint: {tmp_path}")
@@ -84,7 +84,7 @@ def test_anything_else_is_refused_in_one_line(tmp_path: Path, capsys: pytest.Cap
         assert f": {path} is not a whole checkpoint" in refusal(lambda: load(path), capsys)
 
 
-def test_weights_are_compared_before_layers_are_built(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_are_compared_before_layers_are_built(tmp_path, capsys):
     path = tmp_path / "checkpoint.pt"
     save(path, "shac", Tiny(), STATE)
     state = torch.load(path)
@@ -113,9 +113,7 @@ def test_weights_are_compared_before_layers_are_built(tmp_path: Path, capsys: py
         ("modules critic_optimizer", None),
     ],
 )
-def test_what_a_run_cannot_resume_is_one_line(
-    places: str, value: Any, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_run_cannot_resume_is_one_line(places, value, tiny_run, tmp_path, capsys):
     state = torch.load(tiny_run / "checkpoint.pt")
     *path, last = (int(place) if place.isdigit() else place for place in places.split())
     functools.reduce(operator.getitem, path, state)[last] = value
@@ -123,9 +121,7 @@ def test_what_a_run_cannot_resume_is_one_line(
     refusal(lambda: shac.main(["--resume", str(damaged), "--iterations", "3", "--quiet"]), capsys)
 
 
-def test_the_policy_of_another_robot_is_one_line(
-    tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_policy_of_another_robot_is_one_line(tiny_run, tmp_path, capsys):
     state, path = torch.load(tiny_run / "checkpoint.pt"), tmp_path / "checkpoint.pt"
     torch.save(state | {"args": state["args"] | {"env": "hopper"}}, path)
     for call in (lambda: load_policy(path), lambda: shac.main(["--evaluate", str(path)])):
@@ -133,7 +129,7 @@ def test_the_policy_of_another_robot_is_one_line(
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> None:
+def test_a_loaded_policy_acts_as_the_saved_one(name, tmp_path):
     """Without the script, whatever its name, and with the statistics of the observations."""
     torch.manual_seed(0)
     args = parse(SCRIPTS[name].Args, "--env cartpole --device cpu --num-envs 2 --horizon 4".split())
@@ -158,7 +154,7 @@ def test_a_loaded_policy_acts_as_the_saved_one(name: str, tmp_path: Path) -> Non
     torch.testing.assert_close(loaded.network(obs), learner.policy(obs), rtol=0, atol=0)
 
 
-def test_a_layer_that_cannot_be_saved_is_named(tmp_path: Path) -> None:
+def test_a_layer_that_cannot_be_saved_is_named(tmp_path):
     learner = Tiny()
     learner.policy.append(nn.Dropout())
     with pytest.raises(TypeError, match="layer Dropout; .* has Both, ELU, First, Fold, LayerNorm, Likeliest"):
@@ -166,7 +162,7 @@ def test_a_layer_that_cannot_be_saved_is_named(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_weights_of_other_sizes_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_of_other_sizes_are_one_line(capsys):
     learner = Tiny()
     for other in ({"layer": nn.Linear(3, 1).state_dict()}, {}, {"layer": 3}):
         error = refusal(lambda other=other: restore(learner, {"modules": other}), capsys)  # type: ignore[misc]
@@ -213,7 +209,7 @@ def assert_acts_alike(model: Any, network: nn.Module, obs: torch.Tensor, columns
 
 
 @pytest.mark.slow
-def test_the_shipped_ant_as_onnx(tmp_path: Path) -> None:
+def test_the_shipped_ant_as_onnx(tmp_path):
     path = Path(str(command.POLICIES / "ant.pt"))
     model, told = export(path, tmp_path / "policy.onnx")
     saved = load_policy(path)
@@ -280,7 +276,7 @@ def test_an_exported_policy_names_a_shipped_clip_and_may_have_16_bits(name: str,
 
 
 @pytest.mark.parametrize("symmetric", [False, True])
-def test_onnx_takes_only_what_the_actor_sees(symmetric: bool, tmp_path: Path) -> None:
+def test_onnx_takes_only_what_the_actor_sees(symmetric, tmp_path):
     torch.manual_seed(0)
     seen, whole = Go1.actor_dim, Go1.obs_dim
     args = parse(shac.Args, "--env go1 --device cpu --actor-hidden 16".split())
@@ -315,7 +311,7 @@ def test_onnx_takes_only_what_the_actor_sees(symmetric: bool, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_every_layer_as_onnx(shared: bool, tmp_path: Path) -> None:
+def test_every_layer_as_onnx(shared, tmp_path):
     torch.manual_seed(1)
     smooth = nn.ELU(), nn.LayerNorm(16), nn.SiLU(), nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 16), nn.Softplus()
     last = nn.Linear(16, 3 if shared else 6), Likeliest(1, 3, shared), nn.Tanh()
@@ -326,9 +322,7 @@ def test_every_layer_as_onnx(shared: bool, tmp_path: Path) -> None:
     assert told["actuators"] == "slider[-1:1]" and "joint_stiffness" not in told  # a motor
 
 
-def test_what_cannot_be_onnx_is_one_line(
-    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_onnx_is_one_line(tiny_run, tmp_path, monkeypatch, capsys):
     def refused(name: str) -> str:
         return refusal(lambda: command.main(["export", str(tiny_run / "checkpoint.pt"), str(tmp_path / name)]), capsys)
 
@@ -342,7 +336,7 @@ def test_what_cannot_be_onnx_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_names_of_observations_add_up() -> None:
+def test_names_of_observations_add_up():
     for task in diffsim.TASKS.values():
         if task.obs_parts:
             sizes = [size for _, size in task.obs_parts]

@@ -28,7 +28,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def directory(tmp_path_factory):
     """Of the runs of two ranks."""
     directory = tmp_path_factory.mktemp("ranks")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", ranks.__file__]
@@ -37,9 +37,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_two_ranks_of_half_the_environments_are_one_of_all(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_ranks_of_half_the_environments_are_one_of_all(directory, tmp_path, monkeypatch):
     monkeypatch.setattr(shac.Actor, "sample_noise", ranks.sample_noise)
     monkeypatch.setattr(DiffEnv, "_uniform", ranks.uniform)
     one, two = run(shac, tmp_path, *SETTING), load(directory / "shac" / "checkpoint.pt")
@@ -52,7 +50,7 @@ def test_two_ranks_of_half_the_environments_are_one_of_all(
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_ranks_share_weights_and_statistics_and_have_states_of_their_own(directory: Path, name: str) -> None:
+def test_ranks_share_weights_and_statistics_and_have_states_of_their_own(directory, name):
     first, second = (load(directory / f"{name}.{rank}.pt") for rank in range(2))
     checkpoint = load(directory / name / "checkpoint.pt")
     assert_same(first, second)
@@ -65,9 +63,7 @@ def test_ranks_share_weights_and_statistics_and_have_states_of_their_own(directo
     assert checkpoint["control_steps"] == actor["normalizer.count"] == samples or name == "bptt"
 
 
-def test_as_many_processes_resume_as_were_saved(
-    directory: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_as_many_processes_resume_as_were_saved(directory, capsys, monkeypatch):
     path = directory / "shac" / "checkpoint.pt"
     line = refusal(lambda: shac.main(["--resume", str(path), "--iterations", "9"]), capsys)
     assert line == f"script.py: {path} was trained by 2 processes, not 1"

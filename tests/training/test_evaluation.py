@@ -57,6 +57,18 @@ def test_first_episodes_only_are_counted(result: Evaluation, ants: diffsim.DiffE
     assert result.speed == pytest.approx(distance / ((sum(length) - 4) / 60), rel=1e-4)
 
 
+def test_evaluations_are_alike_whatever_was_before() -> None:
+    """As of environments whose state a graph keeps in place, which a reset has to write there."""
+    env, policy = diffsim.make("ant", num_envs=4, seed=0), torch.nn.Linear(37, 8)
+    player, expected = evaluation.Player(env, policy), evaluate(diffsim.make("ant", num_envs=4), policy)
+    player.evaluate(seed=5)
+    pinned = env.pin()
+    again = player.evaluate()
+    assert torch.equal(again.returns, expected.returns) and torch.equal(again.qpos, expected.qpos)
+    env.reset(seed=evaluation.SEED)
+    assert env.qpos is pinned[0] and torch.equal(env.qpos, expected.qpos[0])
+
+
 def test_a_robot_without_ground_has_no_speed() -> None:
     result = evaluate(diffsim.make("cartpole", num_envs=2, horizon=1), lambda obs: obs[:, :1])
     assert result.speed is None and result.lengths.tolist() == [240, 240]

@@ -28,7 +28,7 @@ from diffsim.training.evaluation import make_env
 
 
 @pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
@@ -72,9 +72,7 @@ def save(args: flags.Flags, **further: object) -> Path:
         (ppo_baseline, "--lr-bounds 0.01 1e-06", "are the wrong way round"),
     ],
 )
-def test_a_number_out_of_range_is_named_before_anything_is_written(
-    script: ModuleType, arguments: str, allowed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_number_out_of_range_is_named_before_anything_is_written(script, arguments, allowed, tmp_path, capsys):
     name, *values = arguments.split()
     complaint = f"{arguments} {allowed}" if "way" in allowed else f"{name} must be {allowed}, not {values[-1]}"
     words = [word for word in arguments.split() if word != "()"]
@@ -106,9 +104,7 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(
         ("--resume {file} --evaluate {file}", "--resume and --evaluate exclude each other"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(
-    arguments: str, message: str, tiny_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp_path, capsys):
     assert_refuses(shac, arguments, message, tiny_run, tmp_path, capsys)
 
 
@@ -122,12 +118,12 @@ def test_bad_input_is_one_line_and_exit_code_2(
         "--actor-hidden --critic-hidden 1 2 3 4",
     ],
 )
-def test_ends_of_ranges_are_within(arguments: str) -> None:
+def test_ends_of_ranges_are_within(arguments):
     parse(shac.Args, ["--env", "cartpole", *arguments.split()])
 
 
 @pytest.mark.parametrize("script", [*SCRIPTS.values(), gps, mbpo, pfpn_sac, pods, sac_baseline])
-def test_every_number_has_a_range(script: ModuleType) -> None:
+def test_every_number_has_a_range(script):
     """But the seed, and pods.py's order, of which there are two."""
     for name, hint in get_type_hints(script.Args, include_extras=True).items():
         value = getattr(script.Args, name)
@@ -142,7 +138,7 @@ def test_every_number_has_a_range(script: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
-def test_defaults_are_the_tables(script: ModuleType) -> None:
+def test_defaults_are_the_tables(script):
     for env in diffsim.TASKS:
         args = parse(script.Args, ["--env", env, "--device", "cpu"])
         expected = dict(zip(script.COLUMNS, script.PER_TASK[env], strict=True)) if env in script.PER_TASK else {}
@@ -157,7 +153,7 @@ def test_defaults_are_the_tables(script: ModuleType) -> None:
         assert {name: getattr(args, name) for name in expected} == expected
 
 
-def test_the_command_line_is_before_the_task_is_before_the_class() -> None:
+def test_the_command_line_is_before_the_task_is_before_the_class():
     args = parse(shac.Args, "--env-id cartpole --actor-lr 3e-3 --substeps 7".split())
     assert (args.env, args.actor_lr, args.critic_lr, args.gamma) == ("cartpole", 3e-3, 1e-3, 0.99)
     assert (args.integrator, args.substeps) == ("semi_implicit", 7)
@@ -168,7 +164,7 @@ def test_the_command_line_is_before_the_task_is_before_the_class() -> None:
     assert (args.iterations, args.num_envs, args.actor_hidden, args.target_alpha) == (500, 3, (256, 128), 0.995)
 
 
-def test_the_command_line_is_before_the_checkpoint_is_before_the_task() -> None:
+def test_the_command_line_is_before_the_checkpoint_is_before_the_task():
     arguments = "--env cartpole --device cpu --num-envs 5 --gamma 0.9 --stop-after 5 --run-dir there --accuracy fast"
     path = save(parse(shac.Args, arguments.split()))
     args = parse(shac.Args, ["--resume", str(path), "--td-lambda", "0.5", "--stop-after", "7"])
@@ -179,7 +175,7 @@ def test_the_command_line_is_before_the_checkpoint_is_before_the_task() -> None:
     assert parse(shac.Args, ["--resume", str(path), "--device", "auto", "--stop-after", "6"]).device == "cpu"
 
 
-def test_accuracy_and_penalty_are_stored_and_can_be_replaced() -> None:
+def test_accuracy_and_penalty_are_stored_and_can_be_replaced():
     fast, accurate = (diffsim.TASKS["cartpole"].integration(name) for name in ("fast", "accurate"))
     path = save(parse(shac.Args, "--env cartpole --accuracy fast --penalty k_limit=50 mu=0.5".split()))
 
@@ -198,9 +194,7 @@ def test_accuracy_and_penalty_are_stored_and_can_be_replaced() -> None:
     assert (set(sim.scene.k_limit), sim.scene.mu) == ({100.0}, diffsim.make("cartpole", 1).scene.mu)
 
 
-def test_a_preset_that_a_task_lacks_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_preset_that_a_task_lacks_is_named(monkeypatch, capsys):
     class Bare(Task):
         name, substeps, contact = "bare", 8, "soft"
 
@@ -210,7 +204,7 @@ def test_a_preset_that_a_task_lacks_is_named(
     assert "'bare' has no preset 'fast'" in line
 
 
-def test_what_a_checkpoint_decides(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_checkpoint_decides(capsys):
     path = save(parse(shac.Args, "--env cartpole --num-envs 3 --device cpu".split()))
     for argument, saved in (
         ("--env ant", "--env cartpole, not ant"),
@@ -227,7 +221,7 @@ def test_what_a_checkpoint_decides(capsys: pytest.CaptureFixture[str]) -> None:
             assert "--horizon" in line and "--num-envs 3, not 4" not in line.partition(";")[2]
 
 
-def test_a_checkpoint_of_flags_that_the_script_lacks_is_only_evaluated(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_checkpoint_of_flags_that_the_script_lacks_is_only_evaluated(capsys):
     """And of choices that it lacks; what does not count is told."""
     path = save(parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"]), old_flag=3, accuracy="exact")
     line = refusal(lambda: parse(shac.Args, ["--resume", str(path)]), capsys)
@@ -238,7 +232,7 @@ def test_a_checkpoint_of_flags_that_the_script_lacks_is_only_evaluated(capsys: p
     assert capsys.readouterr().err == f"{expected}; they do not count here\n"
 
 
-def test_a_checkpoint_older_than_a_flag_has_its_default() -> None:
+def test_a_checkpoint_older_than_a_flag_has_its_default():
     args = parse(shac.Args, ["--env", "cartpole", "--gamma", "0.9"])
     path = save(args)
     state = torch.load(path)
@@ -267,7 +261,7 @@ def default(text: str, name: str) -> str:
     return match.group(1)
 
 
-def test_help_shows_the_defaults_of_the_task_and_the_preset(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_the_defaults_of_the_task_and_the_preset(capsys):
     text = help_of(shac, capsys, "--env", "humanoid")
     assert (default(text, "--substeps"), default(text, "--target-alpha")) == ("48", "0.995")
     assert (default(text, "--actor-hidden"), default(text, "--critic-hidden")) == ("256 128", "128 128")

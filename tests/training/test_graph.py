@@ -7,6 +7,7 @@ import torch
 
 import diffsim
 from diffsim.training import graph
+from diffsim.training.evaluation import Player
 
 
 def test_on_a_cpu_there_is_nothing_to_capture() -> None:
@@ -52,6 +53,29 @@ def test_graph_and_eager_agree(name: str, adjoint_clip: float) -> None:
     assert all(torch.equal(a, b) for a, b in zip(captured, eager, strict=True))
     rewards = captured[0]
     assert not torch.equal(rewards[4], rewards[5])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["ant", "go2"])
+def test_evaluations_by_a_graph_are_those_of_eager_steps(name: str) -> None:
+    """Also the second one, when all is captured, of a policy that has changed since; not all episodes end at once."""
+    torch.manual_seed(0)
+    found = []
+    for graphs in (True, False):
+        env = diffsim.make(name, num_envs=16, seed=0, device="cuda")
+        torch.manual_seed(0)
+        policy = torch.nn.Sequential(torch.nn.Linear(env.task.obs_dim, env.scene.nu), torch.nn.Tanh()).cuda()
+        player = Player(env, policy, graphs)
+        first = player.evaluate()
+        torch.nn.init.zeros_(policy[0].weight)
+        player.take(policy)
+        found += [first, player.evaluate()]
+    for captured, eager in zip(found[:2], found[2:], strict=True):
+        assert torch.equal(captured.returns, eager.returns) and torch.equal(captured.lengths, eager.lengths)
+        shown = torch.arange(len(eager.qpos), device="cuda").unsqueeze(1) < eager.lengths
+        assert torch.equal(captured.qpos[shown], eager.qpos[shown])
+        assert torch.equal(captured.action[shown], eager.action[shown])
+    assert not torch.equal(found[0].returns, found[1].returns)
 
 
 @pytest.mark.gpu

@@ -46,14 +46,7 @@ TINY = "--env cartpole --num-envs 2 --horizon 8 --eval-episodes 1 --device cpu".
         ("--iterations 5 --eval-every 0 --save-every 2 --stop-after 9", [5], [2, 4, 5]),
     ],
 )
-def test_schedule(
-    arguments: str,
-    evaluated: list[int],
-    saved: list[int],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_schedule(arguments, evaluated, saved, tmp_path, monkeypatch, capsys):
     iterations, save = list[int](), checkpoint.save
 
     def record(path: Path, script: str, learner: checkpoint.Learner, state: Mapping[str, Any]) -> None:
@@ -72,9 +65,7 @@ def test_schedule(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
-def test_signals(
-    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_signals(number, tmp_path, monkeypatch, capsys):
     """The first one lets the iteration end, saved; the same a second time ends it at once. nohup's ignores SIGHUP."""
     before, raised = signal.getsignal(number), []
 
@@ -112,9 +103,7 @@ def test_signals(
     ("value", "arguments"),
     [(math.nan, "--save-every 1"), (math.inf, "--save-every 1"), (math.nan, "--save-every 2 --eval-every 3")],
 )
-def test_weights_that_are_not_finite_are_named_and_not_saved(
-    value: float, arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_that_are_not_finite_are_named_and_not_saved(value, arguments, tmp_path, monkeypatch, capsys):
     step, calls = ClippedAdam.step, []
 
     def diverge(optimizer: ClippedAdam, loss: Tensor) -> Tensor:
@@ -132,9 +121,7 @@ def test_weights_that_are_not_finite_are_named_and_not_saved(
     assert checkpoint.load(path)["iteration"] == 2 and not list(tmp_path.glob("*.tmp"))
 
 
-def test_weights_that_make_actions_nan_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_that_make_actions_nan_are_named(tmp_path, monkeypatch, capsys):
     """On a CPU the environment refuses them, an iteration after the weights went wrong."""
     monkeypatch.setattr(ClippedAdam, "step", lambda optimizer, _: optimizer.vector.fill_(math.nan)[0])
     argv = [*TINY, "--iterations", "5", "--quiet", "--run-dir", str(tmp_path)]
@@ -155,9 +142,7 @@ class Gone:
 
 
 @pytest.mark.parametrize("stdout", [None, Gone()], ids=["closed", "broken"])
-def test_a_training_goes_on_without_its_reader(
-    stdout: Gone | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_goes_on_without_its_reader(stdout, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", stdout)
         train = shac.script(bptt.Args, bptt.train).__wrapped__  # type: ignore[attr-defined]
@@ -166,7 +151,7 @@ def test_a_training_goes_on_without_its_reader(
     assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["iteration"] == 3
 
 
-def test_a_directory_that_is_moved_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_directory_that_is_moved_is_made_again(tmp_path, monkeypatch):
     def moved(*arguments: Any) -> Any:
         if not (tmp_path / "moved").exists() and read_progress(tmp_path / "run"):
             (tmp_path / "run").rename(tmp_path / "moved")
@@ -178,9 +163,7 @@ def test_a_directory_that_is_moved_is_made_again(tmp_path: Path, monkeypatch: py
     assert len(read_progress(tmp_path / "moved")) == 3
 
 
-def test_what_a_rank_has_is_saved_when_another_is_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_rank_has_is_saved_when_another_is_lost(tmp_path, monkeypatch, capsys):
     """In the third iteration. A rank whose state is not there begins new episodes."""
     calls, path, average = [], tmp_path / "checkpoint.pt", distributed.average
 
@@ -211,9 +194,7 @@ def test_what_a_rank_has_is_saved_when_another_is_lost(
 
 
 @pytest.mark.parametrize("part", ["reward", "observation 2"])
-def test_the_first_number_of_a_task_that_is_none_is_named(
-    part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_first_number_of_a_task_that_is_none_is_named(part, tmp_path, monkeypatch, capsys):
     class Faulty(CartPole):
         """Its numbers are NaN where the cart is fast."""
 
@@ -235,7 +216,7 @@ def test_the_first_number_of_a_task_that_is_none_is_named(
     assert error == f"script.py: iteration {first}: {name} of faulty is not finite; no checkpoint was saved"
 
 
-def test_another_default_dtype_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_default_dtype_is_refused(tmp_path, capsys):
     torch.set_default_dtype(torch.bfloat16)
     try:
         error = refusal(lambda: bptt.main([*TINY, "--run-dir", str(tmp_path)]), capsys)
@@ -246,9 +227,7 @@ def test_another_default_dtype_is_refused(tmp_path: Path, capsys: pytest.Capture
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no limit")
 @pytest.mark.parametrize(("limit", "arguments"), [(30_000, "--save-every 1"), (1_000, "--save-every 0")])
-def test_a_full_disk_leaves_the_last_checkpoint(
-    limit: int, arguments: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_leaves_the_last_checkpoint(limit, arguments, tmp_path, capsys):
     """What does not fit is the checkpoint, or the progress."""
     import resource
 
@@ -271,9 +250,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(
 # What it counts -------------------------------------------------------------------------------------------------------
 
 
-def test_bad_gradients_and_states_are_counted_across_a_resume(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_gradients_and_states_are_counted_across_a_resume(tmp_path, monkeypatch, capsys):
     """In the second iteration the loss is too large and an environment leaves the finite numbers; adjoints in each."""
     loss, collect, calls = shac.actor_loss, shac.collect, []
 
@@ -303,7 +280,7 @@ def test_bad_gradients_and_states_are_counted_across_a_resume(
     assert [float(row["sim_nonfinite_gradients"]) for row in read_progress(tmp_path)] == [2, 6, 12, 20, 30]
 
 
-def test_other_hyperparameters_hold_from_a_resume_on(tmp_path: Path) -> None:
+def test_other_hyperparameters_hold_from_a_resume_on(tmp_path):
     ends = []
     run(bptt, tmp_path / "start", *TINY, "--iterations", 4, "--stop-after", 2, "--quiet")
     for arguments in ([], ["--betas", "0.9", "0.999"], ["--max-grad-norm", "1e-6"], ["--gamma", "0.5"]):
@@ -316,7 +293,7 @@ def test_other_hyperparameters_hold_from_a_resume_on(tmp_path: Path) -> None:
 # What it shows --------------------------------------------------------------------------------------------------------
 
 
-def test_progress_and_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_and_messages(tmp_path, capsys):
     arguments = *TINY, "--iterations", 3, "--eval-every", 2
     run(bptt, tmp_path / "loud", *arguments)
     out = capsys.readouterr().out
@@ -329,9 +306,7 @@ def test_progress_and_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert out.startswith("cartpole: 3 iterations, ") and "it/s" not in out
 
 
-def test_skipped_updates_are_told_when_they_have_doubled(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_skipped_updates_are_told_when_they_have_doubled(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bptt, "ClippedAdam", lambda *given, **named: ClippedAdam(*given, **named | {"skip_norm": 0.0}))
     run(bptt, tmp_path, *TINY, "--iterations", 8)
     words = "updates skipped so far for their gradients"
@@ -342,9 +317,7 @@ def test_skipped_updates_are_told_when_they_have_doubled(
     ]
 
 
-def test_steps_that_do_not_converge_are_told_when_they_have_doubled(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_steps_that_do_not_converge_are_told_when_they_have_doubled(tmp_path, monkeypatch, capsys):
     """The simulator counts them; a line tells the sum over all environments and iterations."""
     collect = bptt.collect
 
@@ -361,7 +334,7 @@ def test_steps_that_do_not_converge_are_told_when_they_have_doubled(
     assert [float(row["sim_unconverged"]) for row in read_progress(tmp_path)] == [2, 4, 6, 8, 10, 12, 14]
 
 
-def test_runs_without_a_directory_have_one_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_without_a_directory_have_one_of_their_own(tmp_path, monkeypatch):
     """Also those that begin in the same second."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("time.time", lambda: 1700000000.5)
@@ -372,7 +345,7 @@ def test_runs_without_a_directory_have_one_of_their_own(tmp_path: Path, monkeypa
     assert all(json.loads((path / "args.json").read_text())["run_dir"] == str(path) for path in Path("runs").iterdir())
 
 
-def test_track(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_track(tmp_path, monkeypatch, capsys):
     calls = []
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **arguments: calls.append(arguments)))
     run(bptt, tmp_path / "there", *TINY, "--iterations", 1, "--quiet", "--track")
@@ -387,7 +360,7 @@ def test_track(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert not missing.exists()
 
 
-def test_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_video(tmp_path, monkeypatch, capsys):
     """Of the last evaluation; what is missing to draw it is named, after everything else is written."""
     films = []
 
@@ -413,7 +386,7 @@ def test_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["iteration"] == 2
 
 
-def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path, monkeypatch):
     """What users do, under a name that is no identifier; the first time as a process of its own."""
     copy = tmp_path / "my-bptt.py"
     copy.write_text((ROOT / "bptt.py").read_text())
@@ -466,7 +439,7 @@ def count(args: bptt.Args) -> Counter:
     return counter
 
 
-def test_a_learner_without_training_environments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_learner_without_training_environments(tmp_path, capsys):
     arguments = [*TINY, "--iterations", "4", "--eval-every", "3", "--run-dir", str(tmp_path)]
     count(parse(bptt.Args, [*arguments, "--stop-after", "2", "--quiet"]))
     drawn = torch.rand(1)
@@ -490,7 +463,7 @@ def test_a_learner_without_training_environments(tmp_path: Path, capsys: pytest.
     assert "skipped" not in capsys.readouterr().out
 
 
-def test_control_steps_accumulate_when_a_resume_changes_the_window(tmp_path: Path) -> None:
+def test_control_steps_accumulate_when_a_resume_changes_the_window(tmp_path):
     run(bptt, tmp_path, *TINY, "--iterations", 4, "--stop-after", 2, "--quiet")
     bptt.main(["--resume", str(tmp_path / "checkpoint.pt"), "--horizon", "3"])
     rows = read_progress(tmp_path)

@@ -14,14 +14,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from browser import Browser
 from learners import refusal
 
 import diffsim
@@ -41,7 +39,7 @@ PAGE = b"<p>the page</p><script>act()</script>"
 
 
 @pytest.fixture
-def stage() -> Iterator[tuple[Stage, int]]:
+def stage():
     shared = Stage()
     with Server(("127.0.0.1", 0), functools.partial(Handler, shared, PAGE, 3, "robot.lan")) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
@@ -76,9 +74,7 @@ def request(port: int, *words: str, **more: Any) -> http.client.HTTPResponse:
     return connection.getresponse()
 
 
-def test_two_clients_see_all_and_one_that_leaves_takes_its_wish_along(
-    stage: tuple[Stage, int], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_two_clients_see_all_and_one_that_leaves_takes_its_wish_along(stage, capfd):
     shared, port = stage
     (first, one, a), (_, two, b) = connect(port), connect(port)
     assert a != b
@@ -110,14 +106,14 @@ GOOD = {"move": [0, 0, 1], "pull": None, "restarts": 0}
         *(GOOD | {"restarts": math.inf}, GOOD | {"restarts": None}),
     ],
 )
-def test_nonsense_changes_nothing(stage: tuple[Stage, int], said: object) -> None:
+def test_nonsense_changes_nothing(stage, said):
     shared, port = stage
     _, _, client = connect(port)
     assert ask(port, {"client": client} | said if isinstance(said, dict) and said != {"client": 1} else said) == 400
     assert shared.wishes == {client: Wish()}
 
 
-def test_only_the_page_itself_asks(stage: tuple[Stage, int]) -> None:
+def test_only_the_page_itself_asks(stage):
     shared, port = stage
     _, _, client = connect(port)
     wish, own = GOOD | {"client": client}, f"127.0.0.1:{port}"
@@ -144,12 +140,12 @@ def test_only_the_page_itself_asks(stage: tuple[Stage, int]) -> None:
 
 
 @pytest.mark.parametrize("length", [-1, -(10**30), 1001, 10**9, "", "many"])
-def test_a_length_that_is_none_is_not_waited_for(stage: tuple[Stage, int], length: object) -> None:
+def test_a_length_that_is_none_is_not_waited_for(stage, length):
     """Content-Length: -1 was read without end."""
     assert ask(stage[1], GOOD | {"client": 1}, Content_Length=str(length)) == 400
 
 
-def test_the_page_runs_its_own_script_alone(stage: tuple[Stage, int]) -> None:
+def test_the_page_runs_its_own_script_alone(stage):
     answer = request(stage[1], "GET", "/")
     policy = dict(rule.split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split("; "))
     digest = base64.b64encode(hashlib.sha256(b"act()").digest()).decode()
@@ -160,7 +156,7 @@ def test_the_page_runs_its_own_script_alone(stage: tuple[Stage, int]) -> None:
 # The robot's side -----------------------------------------------------------------------------------------------------
 
 
-def test_a_turned_robot_looks_the_same_to_itself(rng: np.random.Generator) -> None:
+def test_a_turned_robot_looks_the_same_to_itself(rng):
     """What the ant's task observes does not depend on where its way leads, if state and way turn alike."""
     task = Ant(dtype=torch.float64)
     task._target = torch.tensor([1e12, 0.0], dtype=torch.float64)  # else the way turns a little as the robot moves
@@ -190,7 +186,7 @@ def fly(pilot: Pilot, seconds: float, wish: Wish) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_each_command_moves_the_robot_its_way() -> None:
+def test_each_command_moves_the_robot_its_way():
     saved = load_policy(command.shipped("go2"))
     with startup.quick_kernels():
         pilot = Pilot(make_policy_env(saved, 1, forces=True), saved.network)
@@ -219,7 +215,7 @@ def test_a_clip_is_played_from_its_beginning_beside_its_ghost_and_again_after_it
 
 
 @pytest.mark.slow
-def test_the_ant_turns_to_where_it_is_sent() -> None:
+def test_the_ant_turns_to_where_it_is_sent():
     saved, ends = load_policy(command.shipped("ant")), []
     with startup.quick_kernels():
         pilot = Pilot(make_policy_env(saved, 1, forces=True), saved.network)
@@ -251,15 +247,13 @@ def test_the_ant_turns_to_where_it_is_sent() -> None:
         ("drive go2 --host nowhere.invalid", "cannot listen on nowhere.invalid:8080: "),
     ],
 )
-def test_mistakes_are_one_line(
-    arguments: str, message: str, stage: tuple[Stage, int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line(arguments, message, stage, capsys):
     names = {"go2": str(ROOT / "diffsim" / "policies" / "go2.pt"), "taken": stage[1]}
     assert message.format(**names) in refusal(lambda: command.main(arguments.format(**names).split()), capsys)
 
 
 @pytest.mark.slow
-def test_a_browser_drives(browser: Browser) -> None:
+def test_a_browser_drives(browser):
     path = os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
     words = [sys.executable, "-m", "diffsim", "drive", "go2", "--port", "0"]
     options = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path})

@@ -1,29 +1,19 @@
-"""Pictures and videos: what is drawn follows qpos and stands upright, videos play at true speed, mistakes are named.
-
-The window of render_mode "human" and of view.py is tested without a display.
-"""
+"""Pictures and videos: what is drawn follows qpos and stands upright, videos play at true speed, mistakes are named."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
 from itertools import repeat
 from pathlib import Path
-from typing import Any
 
-import gymnasium
-import mujoco
 import numpy as np
 import pytest
 import scenes
-import torch
 from learners import refusal
 from numpy.typing import NDArray
 
 import diffsim.tasks
 import shac
-import view
 from diffsim import Scene, load_scene
 from diffsim.view import render
 from diffsim.view.render import Renderer, film, save_video
@@ -111,7 +101,7 @@ def test_muscles_are_coloured_by_activation(opengl: None) -> None:
     assert (blue[0] - blue[1] > 60).sum() > 100
 
 
-# OpenGL or a display that is not there --------------------------------------------------------------------------------
+# OpenGL that is not there ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("wanted", ["", "off"])
@@ -128,63 +118,6 @@ def test_missing_opengl_is_named_with_its_remedy(
     flags = ["--env", "cartpole", "--capture-video", "--run-dir", str(tmp_path / "run")]
     assert f"--capture-video: no OpenGL to draw with: {remedy}" in refusal(lambda: shac.main(flags), capsys)
     assert not (tmp_path / "run").exists()
-
-
-def test_human_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("glfw.init", lambda: False)
-    with pytest.raises(RuntimeError, match="there is no display; take 'rgb_array'"):
-        gymnasium.make("diffsim/Hopper-v0", render_mode="human").reset()
-
-
-class Viewer:
-    """What mujoco.viewer.launch_passive returns."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> None:
-        self.data, self.open, self.shown = data, True, list[np.ndarray]()
-        self.cam, self.user_scn = mujoco.MjvCamera(), mujoco.MjvScene(model, 1000)
-
-    def lock(self) -> AbstractContextManager[None]:
-        return nullcontext()
-
-    def sync(self) -> None:
-        self.shown.append(self.data.qpos.copy())
-
-    def is_running(self) -> bool:
-        return self.open and len(self.shown) < 20
-
-    def close(self) -> None:
-        self.open = False
-
-
-@pytest.fixture
-def viewers(monkeypatch: pytest.MonkeyPatch) -> list[Viewer]:
-    """All windows that were opened."""
-    opened = list[Viewer]()
-    monkeypatch.setattr("glfw.init", lambda: True)
-    launch = lambda *arguments, **options: opened.append(Viewer(*arguments, **options)) or opened[-1]  # noqa: E731
-    monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
-    return opened
-
-
-def test_human_follows_the_first_environment(viewers: list[Viewer]) -> None:
-    env = gymnasium.make_vec("diffsim/Hopper-v0", num_envs=2, render_mode="human")
-    assert not viewers
-    env.reset(seed=0)
-    started = time.perf_counter()
-    for _ in range(6):
-        env.step(torch.zeros(2, 3))
-    assert time.perf_counter() - started > 3 / 60  # at true speed
-    (viewer,) = viewers
-    assert len(viewer.shown) == 7 and env.render() is None and viewer.cam.trackbodyid == 1
-    np.testing.assert_allclose(viewer.shown[6], env.qpos[0])
-    env.close()
-    assert not viewer.open
-
-
-def test_the_policy_acts_until_the_window_is_closed(viewers: list[Viewer]) -> None:
-    env = diffsim.make("hopper", 1, early_termination=False)
-    view.play(env, torch.nn.Linear(env.task.obs_dim, 3), seed=1)
-    assert env.episode_step.item() == len(viewers[0].shown) == 20 and not viewers[0].open
 
 
 # Videos ---------------------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from browser import Browser
 
 import diffsim
 from diffsim import terrain
@@ -59,9 +58,7 @@ HOSTILE = '</title><script>fail("$motion")</script>'
 
 
 @pytest.mark.parametrize("task", ["cartpole", "humanoid", "humanoid_mtu"])
-def test_the_page_holds_the_motion_and_nothing_from_elsewhere(
-    task: str, tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_the_page_holds_the_motion_and_nothing_from_elsewhere(task, tmp_path, rng):
     scene, qpos, dt, ctrl = motion_of(task, 600, rng)
     page = web.write_page(tmp_path / "new" / "page.html", scene, qpos, dt, ctrl, title=HOSTILE, caption="return $title")
     text = page.read_text()
@@ -84,7 +81,7 @@ def test_the_page_holds_the_motion_and_nothing_from_elsewhere(
     np.testing.assert_allclose(activation, (ctrl[:, :muscles] + 1) / 2, atol=0.002)
 
 
-def test_muscles_pass_where_mujoco_has_them(rng: np.random.Generator) -> None:
+def test_muscles_pass_where_mujoco_has_them(rng):
     scene, qpos, dt, _ = motion_of("humanoid_mtu", 1, rng)
     motion, model = web.describe(scene, qpos, dt), scene.mj_model
     data = mujoco.MjData(model)
@@ -97,7 +94,7 @@ def test_muscles_pass_where_mujoco_has_them(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(path, expected, atol=2e-5)
 
 
-def test_the_orbit_is_the_camera_of_the_file() -> None:
+def test_the_orbit_is_the_camera_of_the_file():
     for task in ("ant", "hopper", "humanoid"):
         model = load_scene(ASSETS / f"{task}.xml").mj_model
         orbit, data = render.orbit(model), mujoco.MjData(model)
@@ -109,7 +106,7 @@ def test_the_orbit_is_the_camera_of_the_file() -> None:
         np.testing.assert_allclose(back, data.cam_xmat[0].reshape(3, 3)[:, 2], atol=1e-6)
 
 
-def test_a_long_motion_keeps_fewer_frames() -> None:
+def test_a_long_motion_keeps_fewer_frames():
     scene = load_scene(ASSETS / "humanoid.xml")
     motion = web.describe(scene, np.zeros((4000, scene.nq)), 1 / 60)
     assert 1000 < motion["frames"] < 4000 and motion["frames"] * motion["dt"] == pytest.approx(4000 / 60, abs=0.1)
@@ -143,7 +140,7 @@ def mesh_of(motion: dict[str, Any], number: int) -> tuple[np.ndarray, np.ndarray
     return mesh["origin"] + mesh["step"] * places, faces
 
 
-def test_meshes_and_height_fields_lie_where_the_file_has_them() -> None:
+def test_meshes_and_height_fields_lie_where_the_file_has_them():
     """MuJoCo moves a mesh's frame to its centre of mass; the file's numbers are the ones of before."""
     model = mujoco.MjModel.from_xml_string(MESHES)
     motion = motion_of_model(model)
@@ -168,7 +165,7 @@ def test_meshes_and_height_fields_lie_where_the_file_has_them() -> None:
     assert areas.min() > 0 and areas.sum() == pytest.approx(8, rel=1e-3)
 
 
-def test_fine_meshes_keep_their_shape_and_a_page_its_size() -> None:
+def test_fine_meshes_keep_their_shape_and_a_page_its_size():
     polar, round_ = np.meshgrid(np.linspace(0, np.pi, 300), np.linspace(0, 2 * np.pi, 700), indexing="ij")
     ball = np.stack([np.sin(polar) * np.cos(round_), np.sin(polar) * np.sin(round_), np.cos(polar)], -1).reshape(-1, 3)
     corner = np.arange(len(ball)).reshape(300, 700)
@@ -200,7 +197,7 @@ setTimeout(() => {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["ant", "humanoid_mtu", "meshes on hills"])
-def test_a_browser_draws_the_page(task: str, browser: Browser, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_browser_draws_the_page(task, browser, tmp_path, rng):
     from PIL import Image
 
     if task in ("ant", "humanoid_mtu"):
