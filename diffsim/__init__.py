@@ -88,7 +88,8 @@ def make(
         seed: of the random start states, commands and noise; by default another one for each environment that is made.
         horizon: most differentiable steps between two calls of DiffEnv.detach.
         substeps, integrator, theta, passes, tolerance, touchdown: replace parts of the preset, see Integration.
-        accuracy: preset of the integration, "fast", "default" (the papers') or "accurate", see docs/numerics.md.
+        accuracy: preset of the integration, "fast" (soft contact only), "default" (the papers') or "accurate", see
+            docs/numerics.md.
         contact: "soft" (penalty law) or "mujoco" (MuJoCo's constraints). Default: the task's, "mujoco" for go1, go2,
             g1, g1_track and tasks of your own, "soft" for the others.
         penalty: constants of the penalty law that replace the MJCF's, e.g. {"k_n": 1e5}, see docs/physics.md.

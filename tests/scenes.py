@@ -502,7 +502,7 @@ def with_motors(path: str | Path) -> mujoco.MjSpec:
     return spec
 
 
-MUSCLE = '<muscle name="winch" tendon="rope" force="9" lengthrange=".5 3" range="0.6 1.5"/>'
+WINCH = '<muscle name="winch" tendon="rope" force="9" lengthrange=".5 3" range="0.6 1.5"/>'
 # Robots of one kind of element each, with the features that they are for
 SMALL = {
     "ball joint on the world": (SHOULDER, "ball damping motor slide stiffness"),
@@ -511,7 +511,7 @@ SMALL = {
     "fluid": (FISH, "damping drag floating hinge motor slide"),
     "muscles": (leg(grounded=True), "ball contact damping floating hinge limit motor muscle stiffness"),
     "muscle on the world": (CRANE, "hinge muscle slide"),
-    "muscle by its maximum force": (re.sub("<motor.*/>", MUSCLE, CRANE), "hinge muscle slide"),
+    "muscle by its maximum force": (re.sub("<motor.*/>", WINCH, CRANE), "hinge muscle slide"),
 }
 
 

@@ -56,6 +56,8 @@ def test_gradient_of_the_soft_loss_is_its_finite_difference() -> None:
     losses: list[Tensor] = []
 
     class Recorder:
+        lr = torch.zeros(())
+
         def step(self, loss: Tensor) -> Tensor:
             losses.append(loss)
             return loss.detach()
