@@ -129,8 +129,6 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
             state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         form = state["format"]
         whole = whole and (form != FORMAT or state.keys() >= POLICY)
-        if whole and isinstance(name := state["args"].get("clip"), str):
-            state["args"]["clip"] = read_clip(shipped()[name])
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         whole = False
     if not whole:
@@ -139,6 +137,8 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
         fail(f"{path} is a checkpoint of format {form!r}, and this version reads format {FORMAT}")
     if script not in (None, state["script"]):
         fail(f"{path} is a checkpoint of {state['script']!r}, not of {script}.py")
+    if isinstance(name := state["args"].get("clip"), str):
+        state["args"]["clip"] = read_clip(shipped().get(name, name))
     return state
 
 
