@@ -10,7 +10,7 @@ the same start: of several episodes the one of median return here. It ends where
 that it plays in a loop; a robot that falls or does not travel is shown from its start. Robots that follow commands go
 forward, above a diagram of the time in which each foot is on the ground (Hildebrand 1965). Muscles, which are not
 simulated in MuJoCo, are coloured by activation, as in the SHAC paper's Figure 5. What a robot tracks is drawn as a
-ghost behind it. The gait is that of the first of a few
+ghost. The gait is that of the first of a few
 random episodes that lasts long enough.
 """
 
@@ -55,7 +55,6 @@ CLOSER = {
 }
 FLOOR, AROUND = 2.0, 2.8  # m after which the floor repeats; s that a robot with a clock takes for it, in whole cycles
 DANCE = 12.6, 5.0  # s of the clip that a film of tracking begins with, and how many it shows
-ASIDE = -0.9, 0.4  # m, where a film draws a ghost, from where it is
 LEAST_FPS, QUALITY = 30.0, 45  # of a film; WebP's, of 100
 ROW, LABELS = 16, 56  # pixels of a foot's line in the diagram, and of its name
 INK, PAPER, PALE = (40, 46, 58), (255, 255, 255), (226, 230, 236)
@@ -159,7 +158,7 @@ def motions(case: Case, steps: int, every: int, beside: bool) -> dict[str, Motio
             episode = int(returns.median(0).indices)
         qpos, action = (torch.stack([getattr(x, part)[episode] for x in states]).numpy() for part in ("qpos", "action"))
         tracked = task.ghost(torch.stack([x.memory[episode] for x in states]))
-        ghost = None if tracked is None else tracked.numpy() + np.pad(ASIDE, (0, tracked.shape[1] - 2))
+        ghost = None if tracked is None else tracked.numpy()
         found[name] = Motion(qpos, action, bool(fallen[-1, episode]), ghost)
     return found
 
