@@ -4,6 +4,7 @@
     python tools/draw.py films diffsim/policies/go2.pt
     python tools/draw.py gait runs/<run>/checkpoint.pt --start 2 --every 0.1 --frames 8
     python tools/draw.py overview
+    python tools/draw.py bars
 
 A film, an animated WebP, shows the policy here and in MuJoCo, with MuJoCo's own contact on the file of the robot, from
 the same start: of several episodes the one of median return here. It ends where it resembles its first frame most, so
@@ -16,6 +17,7 @@ random episodes that lasts long enough.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -241,10 +243,7 @@ def gait(
 
 def overview() -> None:
     """The figure of the README: what a control step computes, and how gradients come back."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot as plt
+    from matplotlib.figure import Figure
     from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
     boxes = {
@@ -253,7 +252,8 @@ def overview() -> None:
         "task": "observation,\nreward, end\n(torch)",
         "loss": "sum of rewards\nof a rollout\n(+ value)",
     }
-    figure, axes = plt.subplots(figsize=(8, 2.5), dpi=200)
+    figure = Figure(figsize=(8, 2.5), dpi=200)
+    axes = figure.subplots()
     axes.set(xlim=(0, 16), ylim=(1, 5.2), aspect="equal")
     axes.axis("off")
     for k, (name, text) in enumerate(boxes.items()):
@@ -277,6 +277,37 @@ def overview() -> None:
     print(FIGURES / "overview.png")
 
 
+def bars() -> None:
+    """Return and seconds of training of three learners on one H200, as in the table of docs/experiments.md."""
+    import paper
+    from matplotlib.figure import Figure
+
+    lines = [
+        line
+        for line in paper.table(paper.Args(output=paper.ROOT / "results" / "cpu"), "headline")
+        if line["task"] != "cartpole"
+    ]  # whose return is < 0
+    learners, tasks = (list(dict.fromkeys(str(line[key]) for line in lines)) for key in ("learner", "task"))
+    figure = Figure(figsize=(8, 2.9), dpi=200)
+    panels = figure.subplots(1, 2)
+    for k, learner in enumerate(learners):
+        own = [line for line in lines if line["learner"] == learner]
+        middle, low, high = np.array([[float(x) for x in re.findall(r"-?\d+", str(line["return"]))] for line in own]).T
+        at = np.arange(len(own)) + 0.27 * (k - 1)
+        how: Any = dict(width=0.25, color=f"C{k}", label=learner.replace("ppo_4096", "ppo, 4096 environments"))
+        panels[0].bar(at, middle, yerr=(middle - low, high - middle), capsize=2, **how)
+        panels[1].bar(at, [float(str(line["training (s)"]).rstrip("*")) for line in own], **how)
+    for panel, text in zip(panels, ("return, median and range of 5 seeds", "training on one H200 (s)"), strict=True):
+        panel.set_ylabel(text, fontsize=9)
+        panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8)
+        panel.tick_params(axis="y", labelsize=9)
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[1].legend(fontsize=9, frameon=False)
+    figure.tight_layout()
+    figure.savefig(FIGURES / "h200" / "bars.png")
+    print(FIGURES / "h200" / "bars.png")
+
+
 def halve(frame: Frame) -> Frame:
     """2 x 2 pixels into one: smooth edges."""
     height, width = frame.shape[0] // 2, frame.shape[1] // 2
@@ -286,7 +317,9 @@ def halve(frame: Frame) -> Frame:
 @command
 def main() -> None:
     torch.set_num_threads(1)
-    tyro.extras.subcommand_cli_from_dict({"films": films, "gait": gait, "overview": overview}, description=__doc__)
+    tyro.extras.subcommand_cli_from_dict(
+        {"films": films, "gait": gait, "overview": overview, "bars": bars}, description=__doc__
+    )
 
 
 if __name__ == "__main__":
