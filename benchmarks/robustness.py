@@ -6,7 +6,7 @@
 Robots walk for 2 to 4 s, each for a time of its own, so that they are in any phase of their gait. Then each is pushed
 at its trunk, as in Table 1 of the PFPN paper (Xu and Karamouzas 2021). To fall is to end an episode of the task.
 
-Writes robustness.csv, a row for each policy, and with --update-results the table of docs/robustness.md.
+Writes robustness.csv, a row for each policy, and with --update-results the table of docs/pfpn.md.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def main(args: Args) -> None:
     for case, body in [load(path, args) for path in args.measured]:
         print(f"{case.label}: {case.env.task.name}, {case.saved.script}.py", flush=True)
         args.keep("robustness", measure(case, body, args), ABOUT[:-1])
-    args.publish("robustness", markdown(table(args.read("robustness"))), "robustness.md")
+    args.publish("robustness", markdown(table(args.read("robustness")), ("task", "learner", *EACH)), "pfpn.md")
 
 
 if __name__ == "__main__":

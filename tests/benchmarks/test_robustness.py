@@ -114,7 +114,7 @@ def test_the_command_writes_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert row["body"] == "torso" and row["robots"] == "7" and row["unpushed"] == "0"
     force = float(row["forward N"])
     assert "sideways N" not in row and float(row["forward m/s"]) == pytest.approx(force * 0.1 / 15.8, rel=0.01)
-    line = f"| hopper | shac | soft | 15.8 | 1 | {row['forward N']} |  | {row['forward m/s']} |  |"
+    line = f"| hopper | shac | 1 | {row['forward N']} |  | {row['forward m/s']} |  |"
     assert line in capsys.readouterr().out
     other = row | {"checkpoint": "policies/hopper__2", "seed": "2", "forward N": "7", "learner": "shac"}
     (joined,) = robustness.table([other, row])
