@@ -35,6 +35,7 @@ SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "tenth": lambda values: f"{mean(values):.1f}",
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",
+    "counts": lambda values: ", ".join(f"{value:.0f}" for value in values),
     "each": lambda values: ", ".join(f"{value:.1f}" for value in values),
     "each, rounded": lambda values: ", ".join(f"{value:.0f}" for value in values),
     "all": lambda values: "-".join(dict.fromkeys(f"{value:.0f}" for value in (min(values), max(values)))),
@@ -44,7 +45,7 @@ SHOW: dict[str, Callable[[Sequence[float]], str]] = {
 class Suite(NamedTuple):
     csv: str
     page: str
-    columns: dict[str, tuple[str, str]]  # of the csv file: how to READ which column of progress.csv, or a flag ("args")
+    columns: dict[str, tuple[str, str]]  # of the csv file: how to READ which column of progress.csv; flags, feet
     table: dict[str, tuple[str, str]]  # how to SHOW which column of the csv file
     cells: dict[str, str]  # flags by the cells' names
     groups: dict[str, list[tuple[list[str], list[int], str]]]  # cells, seeds, and their script, task and other flags
@@ -87,9 +88,17 @@ def line(suite: Suite, folder: Path) -> dict[str, object]:
         return {}
     args, found = json.loads((folder / "args.json").read_text()), dict[str, object]()
     for name, (how, column) in suite.columns.items():
-        values = [args[column]] if how == "args" else numbers(rows, column)
+        values = numbers(rows, column)
+        if how in ("args", "gait"):
+            values = [args[column] if how == "args" else float(feet(folder))]
         found[name] = f"{READ.get(how, mean)(values):.6g}" if values else ""
     return found
+
+
+def feet(folder: Path) -> int:
+    """On how many feet a run's policy moves: their duty factors are at least half of the largest."""
+    duty = [float(row["value"]) for row in read_csv(folder / "gait.csv") if row["number"] == "duty"]
+    return sum(value >= max(duty) / 2 for value in duty)
 
 
 def table(suite: Suite, rows: Sequence[Cells]) -> list[Row]:

@@ -14,10 +14,17 @@ from tables import read_csv
 
 import pfpn
 import pfpn_sac
+import sapo
 import shac
 from diffsim.training import parse
 
-SCRIPTS = {"benchmarks/gps_variants": VariantArgs, "pfpn": pfpn.Args, "pfpn_sac": pfpn_sac.Args, "shac": shac.Args}
+SCRIPTS = {
+    "benchmarks/gps_variants": VariantArgs,
+    "pfpn": pfpn.Args,
+    "pfpn_sac": pfpn_sac.Args,
+    "shac": shac.Args,
+    "sapo": sapo.Args,
+}
 
 
 @pytest.mark.parametrize("group", suites.GROUPS)
@@ -40,6 +47,12 @@ def test_an_unknown_name_is_one_line(capsys: pytest.CaptureFixture[str]) -> None
     for flag, others in (("only", "hopper, hopper_short"), ("cells", "")):
         error = refusal(lambda flag=flag: suites.main(suites.Args(**{flag: ("figure 3",)})), capsys)
         assert f"--{flag}: there is no 'figure 3'; choose from {others}" in error
+
+
+def test_a_foot_counts_that_carries_half_as_long_as_another(tmp_path: Path) -> None:
+    lines = "left,duty,0.4", "left,slip (m/s),9", "right,duty,0.2", "hand,duty,0.19", "robot,left-right,0.9"
+    (tmp_path / "gait.csv").write_text("\n".join(("part,number,value", *lines)))
+    assert suites.feet(tmp_path) == 2
 
 
 def write(folder: Path, returns: list[float], dead: float | None) -> None:
