@@ -302,5 +302,5 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
-    alive, smooth, randomise = 2.5, 1.0, ()
+    alive, smooth = 2.5, 1.0
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise
