@@ -40,14 +40,14 @@ PER_TASK = {
 
 @dataclass
 class Args(ParallelFlags):
-    """The algorithm. Defaults: of a task that is not in the table."""
+    """The algorithm. Defaults are those of a task that is not in the table."""
 
     MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "final_lr", "betas", "max_grad_norm", "gamma")
 
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""
     horizon: Count = 128
-    """control steps H of a window (1/60 s each) (per task)"""
+    """control steps H of a rollout, of 1/60 s each (per task)"""
     deterministic_policy: bool = False
     """train a policy without noise"""
     hidden: Widths = (256, 128)

@@ -60,13 +60,13 @@ class Args(WindowFlags):
     )
 
     horizon: Count = 32
-    """control steps h of a window (1/60 s each)"""
+    """control steps h of a rollout (1/60 s each)"""
     general_hyperparameters: bool = False
     """one setting for all tasks (Table 5) instead of the per-task ones"""
     deterministic_policy: bool = False
     """train a policy without noise (A.4.4)"""
     critic: bool = True
-    """a value stands for what comes after the window; without it, the ablation of section 4.3"""
+    """add a learned value at the end of the rollout; --no-critic is the ablation of section 4.3"""
     actor_hidden: Widths = (256, 128)
     """units of the actor's hidden layers (per task)"""
     critic_hidden: Widths = (128, 128)
@@ -88,13 +88,13 @@ class Args(WindowFlags):
     target_alpha: Fraction = 0.995
     """target critic <- alpha target critic + (1 - alpha) critic, each iteration (per task)"""
     critic_iterations: Repeats = 16
-    """passes over a window's samples to fit the critic"""
+    """passes over the samples of a rollout to fit the critic"""
     critic_minibatches: Repeats = 4
     """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh (per task)"""
     initial_gain: Positive = 1.0
-    """factor of the actor's last layer at the start: a small one begins with actions near zero (per task)"""
+    """initial factor of the actor's last layer; a small one begins with actions near zero (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}

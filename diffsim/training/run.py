@@ -38,7 +38,7 @@ Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
 TOLD = {  # totals, and how a message tells that they have doubled
-    "grad/skipped": "updates skipped so far for their gradients",
+    "grad/skipped": "updates skipped so far because of their gradients",
     "sim/unconverged": "control steps so far in which Newton's method did not converge",
 }
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
