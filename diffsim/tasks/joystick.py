@@ -18,11 +18,10 @@ from torch import Tensor
 
 from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.feet import Feet
-from diffsim.tasks.locomotion import rotate, score
+from diffsim.tasks.locomotion import push, rotate, score
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, partners, reflections
 
 FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
-FREQUENCY_OF_PUSHES = 0.25  # 1/s
 NEAR, SLIP = 0.01, 0.05  # m over the ground, within which a foot's speed counts as slip; (m/s)^2, the score's scale
 STANDING = 0.1  # share of commands that are zero; each of the three numbers of others is with the same probability
 # Noise of the sensors, uniform to both sides: joints [rad], rates [rad/s], angular and linear velocity, gravity
@@ -193,12 +192,10 @@ class Joystick(Task):
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
         command, clock, last, _, late, _ = self._recall(memory)
-        drawn, when, sensors, due, size, way = noise.split((7, 1, 9 + 2 * self._n, 1, 1, 1), dim=-1)
+        drawn, when, sensors, due = noise.split((7, 1, 9 + 2 * self._n, 3), dim=-1)
         command = torch.where(when < self.control_dt * FREQUENCY_OF_COMMANDS, self._draw(drawn), command)
         clock = (clock + self.control_dt * self.robot.cycle).remainder(1.0)
-        (least, most), way = self.disturbances["push"], 2.0 * math.pi * way
-        size = (least + (most - least) * size) * (due < self.control_dt * FREQUENCY_OF_PUSHES)
-        kick = size * torch.cat((way.cos(), way.sin()), dim=-1)
+        kick = push(due, self.disturbances["push"], self.control_dt)
         return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise, late, kick), dim=-1)
 
     def _recall(self, memory: Tensor) -> tuple[Tensor, ...]:

@@ -130,7 +130,7 @@ class ParallelFlags(Flags):
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
     randomise: tuple[str, ...] = ()
-    """ranges drawn for each environment: friction=0.7:1.3 stiffness mass motor, of joysticks latency push (per task)"""
+    """ranges drawn for each environment: friction=0.7:1.3 stiffness mass motor, some tasks: latency push (per task)"""
     redraw: Count = 10
     """iterations between drawings of the factors"""
     monitor: Natural = 50

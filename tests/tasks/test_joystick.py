@@ -11,8 +11,8 @@ from scenes import task_scene
 import diffsim
 from diffsim.env import DiffEnv
 from diffsim.tasks import TASKS
-from diffsim.tasks.joystick import FREQUENCY_OF_PUSHES, NEAR, SLIP, Joystick
-from diffsim.tasks.locomotion import score
+from diffsim.tasks.joystick import NEAR, SLIP, Joystick
+from diffsim.tasks.locomotion import FREQUENCY_OF_PUSHES, score
 
 NAMES = "go1", "go2", "g1"
 REAL = torch.float64

@@ -7,6 +7,7 @@ data: a subclass with its file, the names of its sides and the number of its joi
 from __future__ import annotations
 
 from functools import cached_property
+from types import MappingProxyType
 from typing import ClassVar
 
 import torch
@@ -18,7 +19,7 @@ from diffsim.tasks.base import Contact
 from diffsim.tasks.imitation.clip import FASTEST, Clip
 from diffsim.tasks.imitation.kinematics import Kinematics, difference
 from diffsim.tasks.imitation.task import STRAY, Imitation, draw
-from diffsim.tasks.locomotion import rotate, score
+from diffsim.tasks.locomotion import push, rotate, score
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
 
 SMOOTH = 5  # frames of 1/60 s whose mean a frame of the reference is
@@ -32,7 +33,7 @@ TURNED = 1.0  # rad; the episode ends when the root is turned from the reference
 class Tracking(Imitation):
     """qpos = (position, quaternion wxyz, joints), qvel = (world linear, body angular velocity, joint rates).
 
-    A clip is played once; its last frame is held. Memory: the frame, the last two actions.
+    A clip is played once; its last frame is held. Memory: the frame, the last two actions, a push that is due.
 
     Attributes:
         motions: the first frame of each motion, and how many control steps it lasts, int64 on the CPU.
@@ -46,6 +47,7 @@ class Tracking(Imitation):
     control_dt = 0.02
     episode_length = 500  # 10 s
     forward_column = None  # what counts is the reference
+    disturbances = MappingProxyType({"push": (0.0, 0.0)})  # m/s, how large those are that come at random
 
     def __init_subclass__(cls) -> None:
         """Its sizes: those of what `begin` and `observe_with` say, in their order."""
@@ -55,7 +57,7 @@ class Tracking(Imitation):
         each = "joints_off rates_off_x0.1 joints joint_rates_x0.1 last_action action_change joints_ahead".split()
         cls.obs_parts = *((name, 3) for name in root), *((name, cls.joints) for name in each)
         cls.obs_dim = sum(size for _, size in cls.obs_parts)
-        cls.num_memory = 1 + 2 * cls.joints
+        cls.num_memory, cls.num_noise = 3 + 2 * cls.joints, 3
 
     def __init__(
         self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, clip: Clip | None = None
@@ -76,6 +78,9 @@ class Tracking(Imitation):
         self._qvel = qvel.to(device, dtype)
         self._down = torch.tensor((0.0, 0.0, -1.0), device=device, dtype=dtype)
         self._scene = self._within_reach(scene)
+        self._low, self._high = (
+            torch.tensor(bound, device=device, dtype=dtype) for bound in self._scene.mj_model.actuator_ctrlrange.T
+        )
 
     def _prepare(self, motion: Clip, scene: Scene, kinematics: Kinematics) -> Clip:
         """A motion at the rate of control, smoothed, from above the origin on, with its feet on the ground."""
@@ -119,11 +124,19 @@ class Tracking(Imitation):
 
     def begin(self, rand: Tensor) -> Tensor:
         step = self.first_step(rand).to(rand.dtype).unsqueeze(-1)
-        return torch.cat((step, torch.zeros_like(step).expand(*step.shape[:-1], 2 * self.joints)), dim=-1)
+        return torch.cat((step, torch.zeros_like(step).expand(*step.shape[:-1], self.num_memory - 1)), dim=-1)
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
-        step, last, _ = memory.split((1, self.joints, self.joints), dim=-1)
-        return torch.cat((torch.minimum(step + 1.0, self._ends[step.long()].to(step.dtype)), action, last), dim=-1)
+        step, last, _, _ = memory.split((1, self.joints, self.joints, 2), dim=-1)
+        step = torch.minimum(step + 1.0, self._ends[step.long()].to(step.dtype))
+        return torch.cat((step, action, last, push(noise, self.disturbances["push"], self.control_dt)), dim=-1)
+
+    def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Pushes, and the servos' targets: the joints of the reference's next frame, and up to REACH more or less."""
+        target = self.reference(memory, 1)[0][..., 7:] + REACH * action
+        middle, half = (self._high + self._low) / 2, (self._high - self._low) / 2
+        qvel = torch.cat((qvel[..., :2] + memory[..., -2:], qvel[..., 2:]), dim=-1)
+        return qvel, ((target - middle) / half).clamp(-1.0, 1.0)
 
     def reference(self, memory: Tensor, ahead: int | Tensor = 0) -> tuple[Tensor, Tensor]:
         """qpos (..., nq) and qvel (..., nv) of the clip, now or so many frames later, be it (...) int64."""
@@ -137,7 +150,7 @@ class Tracking(Imitation):
         joint rates, first from the reference's, the last action, its change, and the reference's joints until AHEAD."""
         position, quat, joints = qpos.split((3, 4, self.joints), dim=-1)
         velocity, angular, rates = qvel.split((3, 3, self.joints), dim=-1)
-        _, last, before = memory.split((1, self.joints, self.joints), dim=-1)
+        _, last, before, _ = memory.split((1, self.joints, self.joints, 2), dim=-1)
         (target, speed), (later, _) = self.reference(memory), self.reference(memory, AHEAD)
         seen = velocity, self._down, target[..., :3] - position, speed[..., :3], later[..., :3] - target[..., :3]
         inverse = torch.cat((quat[..., :1], -quat[..., 1:]), dim=-1).unsqueeze(-2)
