@@ -231,7 +231,7 @@ def straight_through(mixture: Mixture) -> Tensor:
 def implicit(mixture: Mixture) -> Tensor:
     """A sample whose gradient has no bias: its cumulative probability F(u) stays, so du = -dF / p(u).
 
-    Figurnov et al. 2018, https://arxiv.org/abs/1805.08498. Where hardly any action is drawn p has a floor.
+    Figurnov et al. 2018, https://arxiv.org/abs/1805.08498. Where few actions are drawn, p has a floor.
     """
     u = mixture.sample().detach()
     z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()

@@ -195,7 +195,7 @@ def gauss_newton(
 
     Args:
         cost: what they minimise: minus the reward, with a cost of actions.
-        reward: minus the reward alone, which decides.
+        reward: minus the reward, which decides.
         mu: initial regularization.
 
     Returns:

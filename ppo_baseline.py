@@ -136,7 +136,7 @@ class ActorCritic(nn.Module):
         return self.mean(features), self.value(features if self.own is None else self.own(obs)).squeeze(-1)
 
     def deterministic(self) -> nn.Sequential:
-        """The mean alone, of observations as they come, with the same weights."""
+        """The mean of raw observations, with the same weights."""
         return nn.Sequential(self.normalizer, *self.features, *self.mean)
 
 

@@ -351,7 +351,7 @@ class SAPO:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """SHAC's Eq. 5 of (H, N) steps: windows are cut at their dones, and the discount starts anew after them."""
+    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
     t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
     starts, ends = done.roll(1, 0), done.clone()
     starts[0] = ends[-1] = True

@@ -126,7 +126,7 @@ def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Seque
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state; or of its mean alone."""
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
     def __init__(
         self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
@@ -146,7 +146,7 @@ class Actor(nn.Module):
         make_even(self, "log_std", mirror)
 
     def sample_noise(self, *shape: int) -> Tensor:
-        """(*shape, action_dim) reparameterised noise of a whole window, differentiable in log_std (A.1)."""
+        """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
@@ -247,7 +247,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 5 of (H, N) steps: each environment's window is cut at its dones, and the discount starts anew after them."""
+    """Eq. 5 of (H, N) steps: each environment's rollout is cut at its dones, and the discount restarts after them."""
     t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
     starts, ends = done.roll(1, 0), done.clone()
     starts[0] = ends[-1] = True

@@ -75,8 +75,8 @@ class SavedPolicy:
 
 
 def parts(learner: Learner) -> dict[str, Any]:
-    """What the next iteration depends on, beside environments and random numbers, by name: the learner's attributes
-    that have a state_dict, but for its policy, which consists of others; and the learner itself, if it has one."""
+    """What the next iteration depends on, besides environments and random numbers, by name: the learner's attributes
+    that have a state_dict, except its policy, which consists of others; and the learner itself, if it has one."""
     found = {
         name: value
         for name, value in vars(learner).items()

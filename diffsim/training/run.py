@@ -389,7 +389,7 @@ class Run:
         return torch.default_generator
 
     def _own_state(self) -> dict[str, Any]:
-        """What this rank alone has."""
+        """The state of this rank."""
         env = self._env.state_dict() if self._env is not None else None
         return {"env": env, "rng": self._random_numbers().get_state()}
 
@@ -399,7 +399,7 @@ class Run:
         try:
             yield
         except distributed.LostRankError as error:
-            self.iteration -= 1  # which is not whole
+            self.iteration -= 1  # which is incomplete
             self._save([self._own_state() if k == distributed.rank() else None for k in range(distributed.size())])
             fail(f"{error}; {self._kept()}")
 

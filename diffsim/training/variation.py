@@ -48,7 +48,7 @@ def parse_ranges(items: Sequence[str], task: type[Task] = Task) -> dict[str, tup
 
 
 class Variation:
-    """Sets the factors of an environment's constants, before each iteration, as the iteration alone decides.
+    """Sets the factors of an environment's constants, before each iteration, by the number of the iteration.
 
     Args:
         env: made with factors.

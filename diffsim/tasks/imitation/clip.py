@@ -35,7 +35,7 @@ def tangent(a: Tensor, b: Tensor) -> Tensor:
 class Clip:
     """A motion at the rate of control, or several.
 
-    The last frame of a loop is the first one of the next round: equal but for x and y.
+    The last frame of a loop is the first one of the next round: equal except for x and y.
 
     Attributes:
         name: of the file, without its suffix, or of the folder.
