@@ -40,14 +40,14 @@ PER_TASK = {
 
 @dataclass
 class Args(ParallelFlags):
-    """The algorithm. Defaults: of a task that is not in the table."""
+    """The algorithm. Defaults are those of a task that is not in the table."""
 
     MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "final_lr", "betas", "max_grad_norm", "gamma")
 
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""
     horizon: Count = 128
-    """control steps H of a window (1/60 s each) (per task)"""
+    """control steps H of a rollout, of 1/60 s each (per task)"""
     deterministic_policy: bool = False
     """train a policy without noise"""
     hidden: Widths = (256, 128)
@@ -90,7 +90,7 @@ def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Seque
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state; or of its mean alone."""
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)
 
     def sample_noise(self, *shape: int) -> Tensor:
-        """(*shape, action_dim) reparameterised noise of a whole window, differentiable in log_std (A.1)."""
+        """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
@@ -166,7 +166,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def bptt_loss(reward: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 8 without its value, of (H, N) steps: the discount starts anew after each done."""
+    """Eq. 8 without its value, of (H, N) steps: the discount restarts after each done."""
     t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
     starts = done.roll(1, 0)
     starts[0] = True

@@ -62,7 +62,7 @@ EXAMPLES = ASSETS / "examples"  # by task; benchmarks/gps_examples.py records th
 
 @dataclass
 class Args(Flags):
-    """The algorithm. Defaults: of a task that is not in the table."""
+    """The algorithm. Defaults are those of a task that is not in the table."""
 
     MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "lbfgs_iterations")
 
@@ -81,7 +81,7 @@ class Args(Flags):
     guiding_samples: Repeats = 40
     """trajectories drawn from the guiding distributions"""
     adaptive: Natural = 0
-    """the first so many iterations adapt the guides to the policy (Section 4.2; the paper: 40)"""
+    """number of first iterations that adapt the guides to the policy (Section 4.2; the paper: 40)"""
     adaptive_iterations: Repeats = 50
     """iLQR iterations of an adaptation"""
     hidden: Repeats = 50
@@ -89,7 +89,7 @@ class Args(Flags):
     noise: Positive = 0.1
     """the policy's standard deviation, relative to that of the example's actions over time (per task)"""
     tracking: NonNegative = 0.05
-    """weight of the squared deviation from the example's states, in the guides alone (Section 6; per task)"""
+    """weight of the squared deviation from the example's states, only in the guides (Section 6; per task)"""
     pretraining: Repeats = 1500
     """L-BFGS iterations of the fit to the guiding samples (per task)"""
     samples: Repeats = 10

@@ -55,44 +55,44 @@ HELD_OUT_BATCH = 1024
 
 @dataclass
 class Args(ParallelFlags):
-    """The algorithm. Defaults: of half_cheetah, and of a task that is not in the table."""
+    """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
 
     MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "steps", "updates", "batch_size", "real_ratio", "gamma", "tau")
 
     steps: Count = 16
     """control steps of an iteration (1/60 s each)"""
     seed_steps: Natural = 64
-    """control steps of each environment with random actions before anything is learnt"""
+    """control steps of each environment with random actions before training starts"""
     buffer_size: Count = 1_000_000
-    """real transitions that are kept, over all environments"""
+    """size of the buffer of real transitions, over all environments"""
     models: Few = 7
     """networks of the ensemble"""
     elites: Few = 5
-    """of which so many, those that predict held-out transitions best, make the rollouts"""
+    """networks that make the rollouts: those that predict held-out transitions best"""
     model_hidden: Widths = (200, 200, 200, 200)
     """units of the models' hidden layers (per task)"""
     model_updates: Repeats = 50
     """gradient updates of the models in an iteration"""
     model_batch_size: Count = 256
-    """samples of each model in such an update"""
+    """samples per model in each of these updates"""
     model_lr: Positive = 1e-3
     """learning rate of the models"""
     branches: Count = 1000
     """rollouts that each elite makes at once, branched from real states"""
     rollout_lengths: tuple[Count, Count] = (1, 1)
-    """steps of a rollout at first and from the middle of the iterations on, with a linear rise between (per task)"""
+    """first and final steps of a rollout, which grow linearly over the first half of the iterations (per task)"""
     retain: Repeats = 4
-    """iterations whose rollouts are kept"""
+    """iterations whose rollouts stay in the buffer"""
     sample_enhance: Natural = 0
-    """SE-MBPO: so many transitions around each real one, by the simulator's Jacobians (0: MBPO)"""
+    """SE-MBPO: transitions added around each real one with the simulator's Jacobians (0: MBPO)"""
     enhance_scale: Positive = 0.2
-    """their distance: of states in control steps' root mean square change, of actions in units before tanh"""
+    """distance of added states, in root mean square changes of a control step, and of actions before tanh"""
     updates: Repeats = 160
     """gradient updates of actor, critics and temperature in an iteration"""
     batch_size: Count = 256
-    """samples of such an update"""
+    """samples of each of these updates"""
     real_ratio: Fraction = 0.05
-    """share of them that are real transitions; the others are imagined"""
+    """share of these samples that are real transitions; models predict the others"""
     hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers of actor and critics (per task)"""
     actor_lr: Positive = 5e-4
@@ -114,11 +114,11 @@ class Args(ParallelFlags):
         rows, past = self.num_envs * (1 + self.sample_enhance), find_task(self.env).num_memory
         jacobians = "--sample-enhance takes Jacobians of"
         wrong = {
-            "one process alone: a replay buffer is not shared among ranks": distributed.size() > 1,
+            "start it without torchrun: processes do not share a replay buffer": distributed.size() > 1,
             "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
             "--models must be at least 2: of an ensemble some are chosen": self.models < 2,
             f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
-            f"--rollout-lengths {first} {last} are the wrong way round": first > last,
+            f"--rollout-lengths {first} {last}: the first must not exceed the second": first > last,
             f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step": self.buffer_size < rows,
             f"{jacobians} states that do not hold the past, on which {self.env} depends": self.sample_enhance and past,
             f"{jacobians} one robot: leave out --randomise": self.sample_enhance and self.randomise,

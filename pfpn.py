@@ -46,20 +46,20 @@ MAX_GRAD_NORM, TARGET_KL, CLIP, VALUE_COEF, BOUND_COEF = 1.0, 0.008, 0.2, 2.0, 1
 
 @dataclass
 class Args(ParallelFlags):
-    """The policy, and PPO. Defaults: the humanoid's."""
+    """The policy, and PPO. Defaults are the humanoid's."""
 
     MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "entropy_coef")
 
     policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
     """particles; one Gaussian; a mixture whose locations and scales depend on the state too; fixed bins"""
     std: Literal["state", "own"] = "state"
-    """of the Gaussian: its standard deviation depends on the state, or is a parameter of each action"""
+    """standard deviation of the Gaussian policy: a function of the state, or one parameter per action"""
     particles: Several = 35
     """particles (components, bins) of each action"""
     initial_log_std: float | None = None
     """log standard deviation of the first actions (default: a Gaussian's is 0, components cover [-1, 1], about -0.5)"""
     resampling: Literal["weighted", "uniform", "none"] = "weighted"
-    """where dead particles go: to living ones in proportion to their mean weight, to any of them, or nowhere"""
+    """dead particles become copies of living ones: in proportion to mean weights, uniformly, or not at all"""
     resampling_interval: Count = 20
     """iterations between resamplings"""
     resampling_noise: NonNegative = 0.1
@@ -67,28 +67,28 @@ class Args(ParallelFlags):
     dead: Decay = 0.05
     """a particle is dead if its weight since the last resampling is below this share of 1 / particles"""
     dead_by: Literal["mean", "max"] = "mean"
-    """which weight: its mean over the recorded steps, or its largest (Eq. 8)"""
+    """weight that decides: the mean over the recorded steps, or the largest (Eq. 8)"""
     log_particles: tuple[Natural, ...] = ()
     """actions, counted from 0, whose particles' locations and mean weights are logged"""
 
     horizon: Count = 32
-    """control steps of a window (1/60 s each) (per task)"""
+    """control steps of a rollout, of 1/60 s each (per task)"""
     hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers, which policy and value share (per task)"""
     lr: Positive = 3e-4
     """initial learning rate, which then follows the KL divergence of the updates"""
     lr_bounds: tuple[Positive, Positive] = (1e-6, 1e-2)
-    """lowest and highest learning rate; twice the same number fixes it"""
+    """smallest and largest learning rate; two equal numbers fix it"""
     gamma: Fraction = 0.99
     """discount factor"""
     trace_decay: Fraction = 0.95
     """lambda of the advantages"""
     epochs: Repeats = 5
-    """passes over a window's samples (per task)"""
+    """passes over the samples of a rollout (per task)"""
     minibatch_size: Count = 8192
     """samples of an update (per task; on a CPU at most 2048)"""
     entropy_coef: NonNegative = 0.0
-    """weight of the entropy, of a mixture's weights or of a Gaussian (per task)"""
+    """weight of the entropy bonus (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, PER_TASK["humanoid"]), strict=True))
@@ -99,7 +99,7 @@ class Args(ParallelFlags):
     def check(self) -> None:
         super().check()
         if self.lr_bounds[0] > self.lr_bounds[1]:
-            fail(f"--lr-bounds {self.lr_bounds}: the lowest exceeds the highest")
+            fail(f"--lr-bounds {self.lr_bounds}: the first must not exceed the second")
         if not LOG_STD[0] <= (self.initial_log_std or 0.0) <= LOG_STD[1]:
             fail(f"--initial-log-std must be from {LOG_STD[0]:g} to {LOG_STD[1]:g}, not {self.initial_log_std}")
 

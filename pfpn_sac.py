@@ -49,7 +49,7 @@ DENSITY = 0.01  # of an action, at least, in the implicit gradient
 
 @dataclass
 class Args(ParallelFlags):
-    """The policy, and SAC. Defaults: the humanoid's."""
+    """The policy, and SAC. Defaults are the humanoid's."""
 
     MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "temperature_lr")
 
@@ -67,7 +67,7 @@ class Args(ParallelFlags):
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
 
     horizon: Count = 32
-    """control steps of a window (1/60 s each)"""
+    """control steps of a rollout (1/60 s each)"""
     hidden: SomeWidths = (512, 256)
     """units of the policy's hidden layers (per task)"""
     critic_hidden: SomeWidths = (512, 256)
@@ -95,9 +95,9 @@ class Args(ParallelFlags):
     def check(self) -> None:
         super().check()
         if distributed.size() > 1:
-            fail("one process alone: a replay buffer is not shared among ranks")
+            fail("start it without torchrun: processes do not share a replay buffer")
         if self.buffer_size < (steps := self.horizon * self.num_envs):
-            fail(f"--buffer-size {self.buffer_size} holds no window of {steps} steps")
+            fail(f"--buffer-size {self.buffer_size} is smaller than a rollout of {steps} steps")
 
 
 # Policies -------------------------------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ def straight_through(mixture: Mixture) -> Tensor:
 def implicit(mixture: Mixture) -> Tensor:
     """A sample whose gradient has no bias: its cumulative probability F(u) stays, so du = -dF / p(u).
 
-    Figurnov et al. 2018, https://arxiv.org/abs/1805.08498. Where hardly any action is drawn p has a floor.
+    Figurnov et al. 2018, https://arxiv.org/abs/1805.08498. Where few actions are drawn, p has a floor.
     """
     u = mixture.sample().detach()
     z = (u.unsqueeze(-1) - mixture.loc) * (-mixture.log_std).exp()

@@ -45,30 +45,30 @@ PER_ORDER = {
 
 @dataclass
 class Args(Flags):
-    """The algorithm. Defaults: of a task that is not in the table."""
+    """The algorithm. Defaults are those of a task that is not in the table."""
 
     MAY_CHANGE = (*Flags.MAY_CHANGE, "improvements", "candidates", "max_step", "imitate", "epochs", "batch_size")
 
     iterations: Count = 120
     """learning iterations (per order)"""
     order: Literal[1, 2] = 1
-    """of the improvement: 1 follows the gradient of the return, 2 takes Gauss-Newton steps (iLQR)"""
+    """order of the improvement: 1 follows the gradient of the return, 2 takes Gauss-Newton steps (iLQR)"""
     num_envs: Count = 32
     """action sequences N of an iteration (per order)"""
     horizon: Count = 50
-    """control steps T of a sequence (1/60 s each), of which whole ones make an episode (per task)"""
+    """control steps T of a sequence (1/60 s each); it must divide an episode (per task)"""
     improvements: Count = 1
     """line-searched steps of each sequence in an iteration (per order)"""
     candidates: Repeats = 8
     """first order: step sizes of the line search, each half the one before"""
     max_step: Positive = 1.0
-    """first order: the largest of them, as root mean square change of the actions before tanh"""
+    """first order: largest step size, as root mean square change of the actions before tanh"""
     regularization: Positive = 0.01
-    """second order: initial weight of the distance from the states of the sequence before"""
+    """second order: initial weight of the distance from the previous sequence's states"""
     action_cost: NonNegative = 1e-2
     """second order: cost of the squared action before tanh, which bounds it where tanh is flat"""
     imitate: Literal["visited", "improved"] = "visited"
-    """states at which the improved actions are taught: which the policy visited, or they lead to (per order)"""
+    """states at which improved actions are taught: those that the policy visited, or they lead to (per order)"""
     epochs: Count = 4
     """passes of the imitation over the sequences (per order)"""
     batch_size: Count = 512
@@ -76,7 +76,7 @@ class Args(Flags):
     lr: Positive = 1e-3
     """learning rate of the imitation (per order)"""
     max_grad_norm: Positive = 1.0
-    """its gradients are clipped to this norm"""
+    """gradients of the imitation are clipped to this norm"""
     hidden: Widths = (128, 64, 32)
     """units of the policy's hidden layers (per task)"""
     normalize_obs: bool = True
@@ -90,7 +90,7 @@ class Args(Flags):
         super().check()
         task = find_task(self.env)
         if distributed.size() > 1:
-            fail("one process alone: sequences are not shared among ranks")
+            fail("start it without torchrun: processes do not share sequences")
         if task.num_memory:
             fail(f"{self.env} depends on the past, which planned states do not hold: choose another task")
         if self.early_termination and task.falls():
@@ -195,7 +195,7 @@ def gauss_newton(
 
     Args:
         cost: what they minimise: minus the reward, with a cost of actions.
-        reward: minus the reward alone, which decides.
+        reward: minus the reward, which decides.
         mu: initial regularization.
 
     Returns:

@@ -46,7 +46,7 @@ CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost m
 
 @dataclass
 class Args(SymmetricFlags):
-    """The algorithm. Defaults: of a task that is not in the table."""
+    """The algorithm. Defaults are those of a task that is not in the table."""
 
     MAY_CHANGE = (
         *SymmetricFlags.MAY_CHANGE,
@@ -59,15 +59,15 @@ class Args(SymmetricFlags):
     num_envs: Count = 1024
     """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
     horizon: Count = 32
-    """control steps of a rollout (1/60 s each) (per task)"""
+    """control steps of a rollout, of 1/60 s each (per task)"""
     hidden: Widths = (256, 128, 64)
     """units of the hidden layers that policy and value share (per task)"""
     lr: Positive = 3e-4
     """initial learning rate"""
     target_kl: Positive = 0.008
-    """the learning rate falls where a minibatch's KL divergence is beyond twice this, and rises below half of it"""
+    """the learning rate falls if a minibatch's KL divergence is above twice this, and rises if it is below half"""
     lr_bounds: tuple[Positive, Positive] = (1e-6, 1e-2)
-    """least and largest learning rate"""
+    """smallest and largest learning rate"""
     max_grad_norm: Positive = 1.0
     """gradients are clipped to this norm"""
     gamma: Fraction = 0.99
@@ -75,7 +75,7 @@ class Args(SymmetricFlags):
     gae_lambda: Fraction = 0.95
     """lambda of the advantage estimation"""
     epochs: Repeats = 5
-    """passes over a rollout's samples (per task)"""
+    """passes over the samples of a rollout (per task)"""
     minibatch_size: Count = 8192
     """samples of a minibatch (per task; on a CPU at most 2048)"""
     clip_coef: Positive = 0.2
@@ -101,7 +101,7 @@ class Args(SymmetricFlags):
         super().check()
         least, largest = self.lr_bounds
         if least > largest:
-            fail(f"--lr-bounds {least} {largest} are the wrong way round")
+            fail(f"--lr-bounds {least} {largest}: the first must not exceed the second")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ class ActorCritic(nn.Module):
         return self.mean(features), self.value(features if self.own is None else self.own(obs)).squeeze(-1)
 
     def deterministic(self) -> nn.Sequential:
-        """The mean alone, of observations as they come, with the same weights."""
+        """The mean of raw observations, with the same weights."""
         return nn.Sequential(self.normalizer, *self.features, *self.mean)
 
 

@@ -51,7 +51,7 @@ LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
 
 @dataclass
 class Args(ParallelFlags):
-    """The algorithm. Defaults: of a task that is not in the table."""
+    """The algorithm. Defaults are those of a task that is not in the table."""
 
     MAY_CHANGE = (
         *ParallelFlags.MAY_CHANGE,
@@ -70,7 +70,7 @@ class Args(ParallelFlags):
     updates_per_step: Repeats = 1
     """gradient updates of the critics after each control step of all environments"""
     actor_updates: Repeats = 1
-    """of which so many, the last ones, also update the actor and the temperature"""
+    """the last so many of these updates also update the actor and the temperature"""
     batch_size: Count = 2048
     """samples of an update (per task)"""
     buffer_size: Count = 1_000_000
@@ -82,7 +82,7 @@ class Args(ParallelFlags):
     critics: Few = 2
     """value functions"""
     critic_subset: Few = 2
-    """the target is the least of so many, drawn anew for each update"""
+    """the target is the minimum of this many critics, drawn for each update"""
     layer_norm: bool = False
     """normalize the critics' hidden layers, which steadies many updates on large batches"""
     actor_lr: Positive = 5e-4
@@ -94,13 +94,13 @@ class Args(ParallelFlags):
     initial_temperature: Positive = 1.0
     """initial weight of the entropy"""
     target_entropy: Finite = -1.0
-    """of the policy per action, in nats, to which the temperature is steered"""
+    """target entropy per action, in nats"""
     gamma: Fraction = 0.99
     """discount factor"""
     tau: Fraction = 0.005
     """target critics <- (1 - tau) target critics + tau critics, after each update"""
     max_grad_norm: Positive = 100.0
-    """gradients are clipped to this norm, which ordinary ones do not reach"""
+    """gradients are clipped to this norm, which few reach"""
     eval_every: Natural = 500
     """evaluate the deterministic policy every this many iterations (0: only at the end)"""
     save_every: Natural = 5000
@@ -115,7 +115,7 @@ class Args(ParallelFlags):
     def check(self) -> None:
         super().check()
         if distributed.size() > 1:
-            fail("one process alone: a replay buffer is not shared among ranks")
+            fail("start it without torchrun: processes do not share a replay buffer")
         if self.critic_subset > self.critics:
             fail(f"--critic-subset {self.critic_subset} is larger than --critics {self.critics}")
         if self.buffer_size < self.steps * self.num_envs:

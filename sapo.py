@@ -76,23 +76,23 @@ class Args(WindowFlags):
     state_std: bool = True
     """the standard deviation of the policy's noise depends on the state"""
     critics: Few = 2
-    """value functions: the least of them makes the targets, their mean the actor's loss"""
+    """value functions: the smallest makes the targets, the mean the actor's loss"""
     activation: Literal["elu", "silu"] = "silu"
     """nonlinearity of actor and critics (per task)"""
     population: Few = 1
-    """members that learn side by side, each in its share of the environments, until one goes on (per task)"""
+    """policies that learn in parallel, each in its share of the environments (per task)"""
     selection: Fraction = 0.5
-    """share of the iterations after which the best member goes on in all environments"""
+    """share of the iterations after which the best policy continues in all environments"""
     initial_target_entropy: Finite = -0.5
-    """entropy per action, in nats, at which the temperature aims in the first iteration (per task)"""
+    """target entropy per action in the first iteration, in nats (per task)"""
     target_entropy: Finite = -0.5
-    """and in the last; linear between them (per task)"""
+    """target entropy per action in the last iteration; linear between them (per task)"""
     initial_temperature: Positive = 1.0
     """initial weight of the entropy in the reward"""
     temperature_lr: Positive = 5e-3
     """learning rate of the temperature's logarithm"""
     horizon: Count = 32
-    """control steps h of a window (1/60 s each)"""
+    """control steps h of a rollout (1/60 s each)"""
     actor_hidden: SomeWidths = (256, 128)
     """units of the actor's hidden layers (per task)"""
     critic_hidden: SomeWidths = (128, 128)
@@ -114,7 +114,7 @@ class Args(WindowFlags):
     target_alpha: Fraction = 0.2
     """target critics <- alpha target critics + (1 - alpha) critics, each iteration (per task)"""
     critic_iterations: Repeats = 16
-    """passes over a window's samples to fit the critics (per task)"""
+    """passes over the samples of a rollout to fit the critics (per task)"""
     critic_minibatches: Repeats = 4
     """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
@@ -351,7 +351,7 @@ class SAPO:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """SHAC's Eq. 5 of (H, N) steps: windows are cut at their dones, and the discount starts anew after them."""
+    """SHAC's Eq. 5 of (H, N) steps: rollouts are cut at their dones, and the discount restarts after them."""
     t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
     starts, ends = done.roll(1, 0), done.clone()
     starts[0] = ends[-1] = True

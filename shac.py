@@ -60,13 +60,13 @@ class Args(WindowFlags):
     )
 
     horizon: Count = 32
-    """control steps h of a window (1/60 s each)"""
+    """control steps h of a rollout (1/60 s each)"""
     general_hyperparameters: bool = False
     """one setting for all tasks (Table 5) instead of the per-task ones"""
     deterministic_policy: bool = False
     """train a policy without noise (A.4.4)"""
     critic: bool = True
-    """a value stands for what comes after the window; without it, the ablation of section 4.3"""
+    """add a learned value at the end of the rollout; --no-critic is the ablation of section 4.3"""
     actor_hidden: Widths = (256, 128)
     """units of the actor's hidden layers (per task)"""
     critic_hidden: Widths = (128, 128)
@@ -88,13 +88,13 @@ class Args(WindowFlags):
     target_alpha: Fraction = 0.995
     """target critic <- alpha target critic + (1 - alpha) critic, each iteration (per task)"""
     critic_iterations: Repeats = 16
-    """passes over a window's samples to fit the critic"""
+    """passes over the samples of a rollout to fit the critic"""
     critic_minibatches: Repeats = 4
     """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh (per task)"""
     initial_gain: Positive = 1.0
-    """factor of the actor's last layer at the start: a small one begins with actions near zero (per task)"""
+    """initial factor of the actor's last layer; a small one begins with actions near zero (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
@@ -126,7 +126,7 @@ def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Seque
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state; or of its mean alone."""
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
     def __init__(
         self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
@@ -146,7 +146,7 @@ class Actor(nn.Module):
         make_even(self, "log_std", mirror)
 
     def sample_noise(self, *shape: int) -> Tensor:
-        """(*shape, action_dim) reparameterised noise of a whole window, differentiable in log_std (A.1)."""
+        """(*shape, action_dim) reparameterised noise of a rollout, differentiable in log_std (A.1)."""
         std = self.log_std.exp()
         return std * torch.randn(*shape, std.numel(), dtype=std.dtype, device=std.device)
 
@@ -247,7 +247,7 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
-    """Eq. 5 of (H, N) steps: each environment's window is cut at its dones, and the discount starts anew after them."""
+    """Eq. 5 of (H, N) steps: each environment's rollout is cut at its dones, and the discount restarts after them."""
     t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
     starts, ends = done.roll(1, 0), done.clone()
     starts[0] = ends[-1] = True

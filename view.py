@@ -32,13 +32,13 @@ class Args:
     web: Path | None = None
     """write a page that plays the motion in a browser: .html"""
     seconds: float = VIDEO_SECONDS
-    """how much of an episode video and page show"""
+    """seconds of the episode to show"""
     episodes: int = 8
-    """of as many episodes they show the one of median return"""
+    """episodes; the one of median return is shown"""
     env: str | None = None
-    """file of the task, if it is your own: it is run"""
+    """file of your own task; its code runs"""
     seed: int = SEED
-    """of the start states"""
+    """seed of the start states"""
     substeps: int | None = None
     """simulation steps per control step instead of those of the training"""
     size: tuple[int, int] = (640, 480)

@@ -145,7 +145,7 @@ def _give_up(robot: Path, seconds: float) -> None:
 
 
 def export(checkpoint: Positional[Path], output: Positional[Path], env: str | None = None, half: bool = False) -> None:
-    """Write the policy of a checkpoint alone: OUTPUT.pt for this package, or OUTPUT.onnx for other programs.
+    """Write only the policy of a checkpoint: OUTPUT.pt for this package, or OUTPUT.onnx for other programs.
 
     Args:
         env: file of the task, if it is your own and the output is .onnx: it is run.
@@ -164,7 +164,7 @@ def export(checkpoint: Positional[Path], output: Positional[Path], env: str | No
 
 
 def run_script(name: str, flags: Sequence[str]) -> None:
-    """A script of the repository: the wheel has them in the package, a clone beside it."""
+    """A script of the repository: the wheel has them in the package, a clone next to it."""
     if name not in (*LEARNERS, "view"):
         fail(f"unknown learner {name!r}: choose from {', '.join(LEARNERS)}")
     inside = PACKAGE / "learners"

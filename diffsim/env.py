@@ -155,6 +155,8 @@ class DiffEnv(VectorEnv):
         if self._pinned is not None:
             self.carry_over(self._pinned)
         self._starts, self._time = self._draw(self.horizon), 0
+        if self.device.type == "cuda":
+            self._time = self.horizon  # the next step draws start states, as it does in each replay of a graph
         return self._obs.clone(), {}
 
     @in_plain_mode

@@ -381,7 +381,7 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
         ("--demonstration {holes}", "{holes}: qvel holds numbers that are not finite"),
         ("--env ant", "--demonstration must be an example for ant; shipped are those of cartpole, hopper, "),
         ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
-        ("--evaluate {file}", "{file} is not a whole checkpoint of gps.py"),
+        ("--evaluate {file}", "{file} is not a complete checkpoint of gps.py"),
         ("--resume {trained}/checkpoint.pt --hidden 9", "has --hidden 8, not 9"),
         ("--resume {trained}/checkpoint.pt", "is at iteration 4 already"),
     ],

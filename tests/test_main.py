@@ -117,7 +117,7 @@ def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
     torch.save(torch.load(trained, weights_only=True) | {"simulator": "another"}, tmp_path / "other.pt")
     command.main(["export", str(tmp_path / "other.pt"), str(small)])
     assert (after.simulator, load_policy(small).simulator) == ("diffsim", "another")
-    assert "holds a policy alone" in refusal(lambda: shac.main(["--resume", str(small)]), capsys)
+    assert "holds only a policy" in refusal(lambda: shac.main(["--resume", str(small)]), capsys)
 
 
 @pytest.mark.parametrize(

@@ -291,7 +291,7 @@ def test_a_run_resumes_bitwise_with_its_buffers(tmp_path: Path) -> None:
         ("--models 1 --elites 1", "--models must be at least 2"),
         ("--elites 8", "--elites 8 are more than --models 7"),
         ("--num-envs 1", "--num-envs must be at least 2: one environment is held out"),
-        ("--rollout-lengths 3 2", "--rollout-lengths 3 2 are the wrong way round"),
+        ("--rollout-lengths 3 2", "--rollout-lengths 3 2: the first must not exceed the second"),
         ("--buffer-size 10", "--buffer-size 10 is less than the 64 transitions of a step"),
         ("--sample-enhance 1 --randomise mass=0.9:1.1", "--sample-enhance takes Jacobians of one robot"),
     ],

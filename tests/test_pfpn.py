@@ -484,11 +484,11 @@ def test_settings_are_those_of_the_baselines(script: Any, baseline: Any, env: st
     ("script", "arguments", "message"),
     [
         (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
-        (pfpn, "--lr-bounds 1e-2 1e-3", "the lowest exceeds the highest"),
+        (pfpn, "--lr-bounds 1e-2 1e-3", "the first must not exceed the second"),
         (pfpn, "--initial-log-std nan", "--initial-log-std must be from -5 to 2, not nan"),
         (pfpn, "--initial-log-std 2.5", "--initial-log-std must be from -5 to 2, not 2.5"),
         (pfpn, "--log-particles 1 8", "--log-particles 8: the actions of 'ant' are 0 to 7"),
-        (pfpn_sac, "--buffer-size 10", "--buffer-size 10 holds no window of 4096 steps"),
+        (pfpn_sac, "--buffer-size 10", "--buffer-size 10 is smaller than a rollout of 4096 steps"),
     ],
 )
 def test_wrong_arguments_are_refused(

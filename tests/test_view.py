@@ -53,7 +53,7 @@ def test_a_checkpoint_names_no_code_to_run(words, tmp_path, monkeypatch, capsys)
     given = [*flags, "policy.pt"] if name != "export" else ["policy.pt", *flags]
     call = functools.partial(view.main, given) if name == "view" else functools.partial(command.main, [name, *given])
     assert refusal(call, capsys).endswith(
-        "task of yours: give its file, which is run, by --env task.py (drive: as robot)"
+        "of your own task: give its file, whose code runs, by --env task.py (drive: as robot)"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.pt", "task.py"]
     with pytest.raises(ValueError, match="by --env task.py"):
@@ -67,7 +67,7 @@ def test_a_checkpoint_names_no_code_to_run(words, tmp_path, monkeypatch, capsys)
     [
         ("{run}", "nothing to show: give --video or --web"),
         ("{new}/nothing.pt --web {new}/a.html", "no such checkpoint: {new}/nothing.pt"),
-        ("{run}/progress.csv --web {new}/a.html", "{run}/progress.csv is not a whole checkpoint"),
+        ("{run}/progress.csv --web {new}/a.html", "{run}/progress.csv is not a complete checkpoint"),
         ("{run} --web {new}/a.htm", "--web: a page ends in .html, not '.htm'"),
         ("{run} --video {new}/a.avi", "--video: a video ends in .mp4 or .gif, not '.avi'"),
         ("{run} --video {new}/a.mp4 --size 100000 100000", "1 to 4096 pixels, not 100000 x 100000"),

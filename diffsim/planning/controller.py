@@ -1,4 +1,4 @@
-"""Gaussian controllers: linear ones about a trajectory, all over time, which are what iLQR knows beside its plan."""
+"""Gaussian controllers: linear in the state about a trajectory, for all times, from iLQR."""
 
 from __future__ import annotations
 

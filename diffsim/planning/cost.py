@@ -14,7 +14,7 @@ from diffsim.planning.system import System
 
 
 def _jacobian(y: Tensor, d: Tensor) -> Tensor:
-    """(..., k, n) derivatives of y (..., k), each row of which depends on its own d (..., n) alone."""
+    """(..., k, n) derivatives of y (..., k), each row of which depends only on its own d (..., n)."""
     return torch.stack([torch.autograd.grad(part.sum(), d, retain_graph=True)[0] for part in y.unbind(-1)], -2)
 
 

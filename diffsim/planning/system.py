@@ -18,7 +18,7 @@ BATCH = 8192  # steps whose Jacobians are computed at once: bounds the memory of
 
 
 class System:
-    """x' = f(x, u) over one control step, in float64. It knows level ground alone.
+    """x' = f(x, u) over one control step, in float64. The ground is level.
 
     A state x = (qpos, qvel) has nx = nq + nv numbers in MuJoCo's conventions. An action u (nu) is squashed: the motors
     get tanh(u), so that planning has no bounds to heed. Both may have leading dimensions where nothing else is said.

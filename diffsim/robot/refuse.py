@@ -107,7 +107,7 @@ def _bodies(m: mujoco.MjModel) -> Iterator[Row]:
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     welded = (m.body_mass > 0) & (m.body_jntnum == 0) & (m.body_weldid > 0)
     yield "body", m.body_mocapid >= 0, "mocap is not simulated"
-    yield "body", second, "a second base beside a floating one"
+    yield "body", second, "a second base besides a floating one"
     yield "body", welded & fluid, "in a fluid each body needs a joint; merge its geoms"
     yield "geom", m.geom_fluid[:, 0] * fluid, "fluidshape ellipsoid is not simulated"
 
@@ -121,7 +121,7 @@ def _joints(m: mujoco.MjModel) -> Iterator[Row]:
     tendons = (m.actuator_trntype == Transmission.mjTRN_TENDON).any()
     yield "joint", ball & limited, "the limit of a ball joint is not simulated"
     yield "joint", limited & _mixed(m.jnt_solref), "solreflimit mixes a positive with another number"
-    yield "joint", bounded & tendons, "actuatorfrcrange beside muscles is not simulated"
+    yield "joint", bounded & tendons, "actuatorfrcrange together with muscles is not simulated"
     yield "joint", bounded & (m.jnt_actgravcomp != 0), "actuatorgravcomp within actuatorfrcrange is not simulated"
     yield "joint", free & ((m.jnt_stiffness != 0) | loss), "a free joint has no stiffness or frictionloss here"
     yield "joint", free & armature & fluid, "armature of a free joint in a fluid is not simulated"

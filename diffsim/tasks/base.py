@@ -75,7 +75,7 @@ class Task:
 
     @classmethod
     def load_robot(cls) -> Scene:
-        """The robot of the asset. A file of diffsim's tasks is in diffsim/assets; another's is sought beside the file
+        """The robot of the asset. A file of diffsim's tasks is in diffsim/assets; another's is sought next to the file
         of the class that names it, in the working directory and in diffsim/assets."""
         owner = next((kind for kind in cls.__mro__ if "asset" in vars(kind)), cls).__module__
         asset: Asset | None = getattr(cls, "asset", None)
@@ -194,7 +194,7 @@ class Task:
 
     @classmethod
     def falls(cls) -> bool:
-        """Whether episodes end where the robot falls, and not by their time alone."""
+        """Whether episodes end where the robot falls, not only by time."""
         return cls.min_height is not None or cls.terminated is not Task.terminated
 
     @property
@@ -234,7 +234,7 @@ class Task:
         return memory
 
     def ghost(self, memory: Tensor) -> Tensor | None:
-        """qpos (..., nq) of what the robot is to track, which films and pages draw beside it; None if there is none."""
+        """qpos (..., nq) of what the robot is to track, which films and pages draw next to it, or None."""
         return None
 
     def program(self, policy: nn.Module, columns: int) -> tuple[nn.Module, dict[str, tuple[int, ...]], list[str]]:

@@ -1,4 +1,4 @@
-"""Where a robot's feet are: the kinematics of its legs alone, in torch."""
+"""Where a robot's feet are: the kinematics of its legs, in torch."""
 
 from __future__ import annotations
 

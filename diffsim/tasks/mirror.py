@@ -104,7 +104,7 @@ def _joint_signs(model: mujoco.MjModel, joint: int, partner: int) -> tuple[Seque
     mirrored = model.jnt_axis[joint] * (VECTOR if kind == mujoco.mjtJoint.mjJNT_SLIDE else PSEUDOVECTOR)
     sign = float(np.round(mirrored @ model.jnt_axis[partner], 6))
     if abs(sign) != 1.0:
-        raise ValueError(f"the axis of joint {model.joint(partner).name!r} is no mirror image of the other side's")
+        raise ValueError(f"the axis of joint {model.joint(partner).name!r} is not the mirror image of the other side's")
     return (sign,), (sign,)
 
 

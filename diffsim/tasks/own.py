@@ -37,7 +37,7 @@ def task_of_file(name: str) -> type[Task]:
 
 @functools.cache
 def _module(path: Path, _changed: int) -> ModuleType:
-    """A file as a module, which finds other modules beside it."""
+    """A file as a module, which finds other modules in its folder."""
     spec = importlib.util.spec_from_file_location(str(path), path)
     sys.modules[str(path)] = module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
     sys.path.insert(0, str(path.parent))

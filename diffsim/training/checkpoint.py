@@ -70,13 +70,13 @@ class SavedPolicy:
         Raises ValueError if the policy was trained on a file's task, and none is given.
         """
         if given is None and FILE.fullmatch(trained := self.args["env"]):
-            fail(f"the policy is of a task of yours: give its file, which is run, by --env {trained} (drive: as robot)")
+            fail(f"a policy of your own task: give its file, whose code runs, by --env {trained} (drive: as robot)")
         return given or self.args["env"]
 
 
 def parts(learner: Learner) -> dict[str, Any]:
-    """What the next iteration depends on, beside environments and random numbers, by name: the learner's attributes
-    that have a state_dict, but for its policy, which consists of others; and the learner itself, if it has one."""
+    """What the next iteration depends on, besides environments and random numbers, by name: the learner's attributes
+    that have a state_dict, except its policy, which consists of others; and the learner itself, if it has one."""
     found = {
         name: value
         for name, value in vars(learner).items()
@@ -132,7 +132,7 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
         whole = False
     if not whole:
-        fail(f"{path} is not a whole checkpoint{f' of {script}.py' if script else ''}: it is damaged")
+        fail(f"{path} is not a complete checkpoint{f' of {script}.py' if script else ''}: it is damaged")
     if form != FORMAT:
         fail(f"{path} is a checkpoint of format {form!r}, and this version reads format {FORMAT}")
     if script not in (None, state["script"]):
@@ -154,7 +154,7 @@ def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
         if task := TASKS.get(state["args"]["env"]):
             network(torch.zeros(1, task.obs_dim))  # on the device meta this would take seconds, of torch's imports
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
-        fail(f"{path} is not a whole checkpoint: its policy's weights do not fit its layers or its task")
+        fail(f"{path} is not a complete checkpoint: its policy's weights do not fit its layers or its task")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))
 
 

@@ -1,4 +1,4 @@
-"""Data-parallel training by torchrun: the same code runs as one process alone or as one of several ranks."""
+"""Data-parallel training by torchrun: the same code runs as a single process or as one of several ranks."""
 
 from __future__ import annotations
 

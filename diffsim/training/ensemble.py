@@ -53,10 +53,10 @@ class LayerNorms(nn.Module):
 class Ensemble(nn.Module):
     """E networks of one shape as one: (E, B, inputs) -> (E, B, outputs), each on its own inputs.
 
-    Indexed by e, it gives a copy of the network e. One network alone keeps its own layers, which are faster then.
+    Indexed by e, it gives a copy of the network e. A single network keeps its own layers, which are faster.
 
     Args:
-        networks: chains of Linear, LayerNorm and layers without parameters, equal but for their weights.
+        networks: chains of Linear, LayerNorm and layers without parameters, equal except for their weights.
     """
 
     def __init__(self, networks: Sequence[nn.Sequential]) -> None:

@@ -140,11 +140,13 @@ class Player:
     """Plays the first episode of each environment under policy(obs (n, obs_dim)) -> action (n, nu), again and again.
 
     Args:
-        graphs: on a GPU a control step is one CUDA graph; the environments must then be the player's alone.
+        graphs: on a GPU a control step is one CUDA graph; the environments, of horizon 1, are then the player's alone.
     """
 
     def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], graphs: bool = False) -> None:
         self.env, self.captured = env, graphs and env.device.type == "cuda"
+        if self.captured and env.horizon != 1:
+            raise ValueError(f"a graph of one control step needs environments of horizon 1, not {env.horizon}")
         self.policy = copy.deepcopy(policy) if self.captured else policy  # a graph knows the addresses of its weights
         self.obs = torch.zeros(env.num_envs, env.task.obs_dim, dtype=env.dtype, device=env.device)
         self.returns, self.lengths = torch.zeros_like(self.obs[:, 0]), torch.zeros_like(env.episode_step)

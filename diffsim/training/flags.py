@@ -47,13 +47,13 @@ class RunFlags:
     eval_every: Natural = 200
     """evaluate the deterministic policy every this many iterations (0: only at the end)"""
     eval_episodes: Count = 64
-    """episodes of an evaluation, one in each of as many fresh environments"""
+    """episodes of an evaluation, each in its own environment"""
     save_every: Natural = 100
     """save the checkpoint every this many iterations (0: only at the end)"""
     stop_after: Natural = 0
-    """stop at this iteration as Ctrl-C would, saved, to be resumed; schedules still run to --iterations (0: do not)"""
+    """stop and save at this iteration, as Ctrl-C would; schedules still run to --iterations (0: do not stop)"""
     resume: Path | None = None
-    """checkpoint to continue from; its arguments hold where the command line gives no other"""
+    """checkpoint to continue from, with its arguments unless the command line gives others"""
     evaluate: Path | None = None
     """checkpoint to evaluate without training, e.g. with other --substeps; writes evaluation.json to --run-dir"""
     finer: bool = True
@@ -88,21 +88,21 @@ class Flags(RunFlags):
     theta: Fraction = 0.0
     """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
     passes: Count = PASSES
-    """of Newton's method on the constraints in each substep, at most, with --integrator mujoco"""
+    """with --integrator mujoco: most passes of Newton's method per substep"""
     tolerance: Fraction = TOLERANCE
-    """residual that ends these passes (per --accuracy)"""
+    """with --integrator mujoco: residual that ends the passes (per --accuracy)"""
     touchdown: bool = True
-    """with --integrator mujoco, gradients count that a contact begins with a jump (docs/physics.md)"""
+    """with --integrator mujoco: gradients include the jump at which a contact begins (docs/physics.md)"""
     contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
     penalty: tuple[str, ...] = ()
     """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
     early_termination: bool = True
-    """end episodes where the robot falls, as the task says; otherwise only their time ends them"""
+    """end episodes when the robot falls; otherwise they end only by time"""
     clip: ClipFile = None
     """motions that g1_track or humanoid_imitation tracks: a file, a folder, or a shipped one (docs/tracking.md)"""
     threads: Natural = 0
-    """CPU threads of the simulator, which change no result (0: as many as have work)"""
+    """CPU threads of the simulator; they do not change results (0: chosen by the amount of work)"""
 
     def task_defaults(self) -> dict[str, Any]:
         """Defaults that depend on other flags, such as the task, the device or the preset."""
@@ -111,7 +111,7 @@ class Flags(RunFlags):
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
         if self.clip and not issubclass(find_task(self.env), Imitation):
-            fail(f"--clip is of {', '.join(tracking())}: {self.env} tracks no motion")
+            fail(f"--clip is for {', '.join(tracking())}: {self.env} tracks no motion")
 
     @classmethod
     def script(cls) -> str:
@@ -132,9 +132,9 @@ class ParallelFlags(Flags):
     randomise: tuple[str, ...] = ()
     """ranges drawn for each environment: friction=0.7:1.3 stiffness mass motor, some tasks: latency push (per task)"""
     redraw: Count = 10
-    """iterations between drawings of the factors"""
+    """iterations after which the ranges of --randomise are drawn again"""
     monitor: Natural = 50
-    """iterations between replays of a window with 4 times the substeps (sim/state_error, sim/return_lost); 0: none"""
+    """iterations between replays of 32 steps with 4 times the substeps (sim/state_error, sim/return_lost); 0: none"""
 
     def task_defaults(self) -> dict[str, Any]:
         return {"randomise": find_task(self.env).randomise}
@@ -151,10 +151,10 @@ class ParallelFlags(Flags):
 
 @dataclass
 class SymmetricFlags(ParallelFlags):
-    """Of learners that can treat left and right alike."""
+    """Flags of learners that can treat left and right alike."""
 
     symmetric: bool = False
-    """in a state's mirror image the policy does the mirror image of what it does there (per task; docs/sapo.md)"""
+    """treat left and right alike: a mirrored state gets the mirrored action (per task; docs/sapo.md)"""
 
     def task_defaults(self) -> dict[str, Any]:
         return super().task_defaults() | {"symmetric": find_task(self.env).symmetric}
@@ -167,12 +167,12 @@ class SymmetricFlags(ParallelFlags):
 
 @dataclass
 class WindowFlags(SymmetricFlags):
-    """Of learners that descend the gradient of short windows."""
+    """Flags of learners that descend the gradient of short rollouts."""
 
     MAY_CHANGE: ClassVar[tuple[str, ...]] = (*SymmetricFlags.MAY_CHANGE, "adjoint_clip")
 
     adjoint_clip: NonNegative = 0.0
-    """gradients with respect to a state of an environment are at most this many times the median (0: not clipped)"""
+    """clip gradients with respect to a state to this many times the batch's median (0: do not clip)"""
 
 
 Args = TypeVar("Args", bound=Flags)
@@ -235,7 +235,7 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     """The arguments of --resume or --evaluate: the checkpoint's, then the command line's."""
     saved = checkpoint.load(path, kind.script())
     if given.resume and "modules" not in saved:
-        fail(f"{path} holds a policy alone, which can be evaluated but not resumed")
+        fail(f"{path} holds only a policy, which can be evaluated but not resumed")
     hints = get_type_hints(kind, include_extras=True)
     choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
     known = {
@@ -247,7 +247,7 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         message = f"{path} was written by a {kind.script()}.py with other flags: {gone}"
         if given.resume:
             fail(message)
-        print(f"{Path(sys.argv[0]).name}: {message}; they do not count here", file=sys.stderr)
+        print(f"{Path(sys.argv[0]).name}: {message}; they are ignored", file=sys.stderr)
     defaults = kind(**known)
     if given.evaluate:
         defaults.device = "auto"  # wherever it was trained
@@ -263,7 +263,7 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         own, wanted = getattr(defaults, field.name), getattr(args, field.name)
         if own != wanted and field.name not in kind.MAY_CHANGE:
             free = ", ".join(map(flag, kind.MAY_CHANGE))
-            fail(f"{path} has {flag(field.name)} {own}, not {wanted}; what may change is {free}")
+            fail(f"{path} has {flag(field.name)} {own}, not {wanted}; only these may change: {free}")
     if args.resume:
         last = min(args.iterations, args.stop_after or args.iterations)
         if saved["iteration"] >= last:

@@ -78,7 +78,7 @@ class Likeliest(nn.Module):
 
 
 class Chain(nn.Sequential):
-    """Layers called by their `forward` alone: without the hooks of modules, which cost small networks 4 % of a pass."""
+    """Layers called by their `forward`, without the hooks of modules, which cost small networks 4 % of a pass."""
 
     def forward(self, x: Tensor) -> Tensor:
         for layer in self:
@@ -133,7 +133,7 @@ class Even(Both):
 
 
 def seeing(columns: int | None, network: nn.Sequential, mirror: Mirror | None = None) -> nn.Sequential:
-    """A network that sees the first columns of its input alone, or all (None); with a mirror, their image as well.
+    """A network that sees only the first columns of its input, or all (None); with a mirror, their image as well.
 
     Raises:
         UsageError: the image has other columns than those.

@@ -38,7 +38,7 @@ Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
 TOLD = {  # totals, and how a message tells that they have doubled
-    "grad/skipped": "updates skipped so far for their gradients",
+    "grad/skipped": "updates skipped so far because of their gradients",
     "sim/unconverged": "control steps so far in which Newton's method did not converge",
 }
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -389,7 +389,7 @@ class Run:
         return torch.default_generator
 
     def _own_state(self) -> dict[str, Any]:
-        """What this rank alone has."""
+        """The state of this rank."""
         env = self._env.state_dict() if self._env is not None else None
         return {"env": env, "rng": self._random_numbers().get_state()}
 
@@ -399,7 +399,7 @@ class Run:
         try:
             yield
         except distributed.LostRankError as error:
-            self.iteration -= 1  # which is not whole
+            self.iteration -= 1  # which is incomplete
             self._save([self._own_state() if k == distributed.rank() else None for k in range(distributed.size())])
             fail(f"{error}; {self._kept()}")
 

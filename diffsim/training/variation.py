@@ -34,21 +34,21 @@ def parse_ranges(items: Sequence[str], task: type[Task] = Task) -> dict[str, tup
         try:
             least, most = map(float, text.split(":"))
         except ValueError:
-            raise ValueError(f"{item!r} is no range of factors like friction=0.7:1.3") from None
+            raise ValueError(f"{item!r} is not a range like friction=0.7:1.3") from None
         if name not in VARIED and name not in task.disturbances:
             raise ValueError(f"unknown {name!r}: choose from {', '.join((*VARIED, *task.disturbances))}")
         if name in task.disturbances:
             bound = MOST_LATENCY if name == "latency" else math.inf
             if not (is_real(least) and 0 <= least <= most <= bound and most < math.inf):
-                raise ValueError(f"{item!r}: must be from 0 to {bound:g}, the least one first")
+                raise ValueError(f"{item!r}: must be from 0 to {bound:g}, the smaller one first")
         elif not (is_real(least) and 0 < least <= most < math.inf):
-            raise ValueError(f"{item!r}: factors must be positive and finite, the least one first")
+            raise ValueError(f"{item!r}: factors must be positive and finite, the smaller one first")
         ranges[name] = least, most
     return ranges
 
 
 class Variation:
-    """Sets the factors of an environment's constants, before each iteration, as the iteration alone decides.
+    """Sets the factors of an environment's constants, before each iteration, by the number of the iteration.
 
     Args:
         env: made with factors.

@@ -122,7 +122,7 @@ def actor(robot: str, task: type[Task], checkpoint: Path | None) -> tuple[torch.
 
 
 def thin(rows: Sequence[Row], best: Row | None) -> list[Row]:
-    """At most SHOWN of the rows, by leaving out the nearest in cost, but for the first, the last and the best one."""
+    """At most SHOWN of the rows, by leaving out the nearest in cost, except the first, the last and the best one."""
     rows = [*rows]
     while len(rows) > SHOWN:
         middle = [k for k in range(1, len(rows) - 1) if rows[k] is not best]

@@ -36,9 +36,9 @@ from diffsim.tasks.locomotion import Locomotion
 from diffsim.view import web
 
 KEYS = {  # of the tasks that can be driven
-    Joystick: "arrows or gamepad: walk, turn · Q, E: sideways · shift + drag: pull · enter: start anew",
-    Tracking: "shift + drag: pull · enter: start anew",
-    Locomotion: "left, right or gamepad: turn · shift + drag: pull · enter: start anew",
+    Joystick: "arrows or gamepad: walk, turn · Q, E: sideways · shift + drag: pull · enter: restart",
+    Tracking: "shift + drag: pull · enter: restart",
+    Locomotion: "left, right or gamepad: turn · shift + drag: pull · enter: restart",
 }
 TURN = 0.3  # rad/s by which a key turns the way of a robot that otherwise runs straight on; at 1 rad/s the ant falls
 STIFFNESS, MAX_PULL = 20.0, 19.62  # N/kg per m of the mouse's pull, and N/kg: twice the weight
@@ -148,7 +148,7 @@ class Stage:
             self.changed.notify_all()
 
     def watch(self) -> Generator[str, None, None]:
-        """The client's number, then each picture, but for those that come while it is busy with another."""
+        """The client's number, then each picture, except those that come while it is busy with another."""
         client, seen = next(self._clients), self._number
         with self.changed:
             self.wishes[client] = Wish()
@@ -175,7 +175,7 @@ def is_here(host: str, own: str) -> bool:
 
 
 def security(page: bytes) -> str:
-    """The page talks to this server alone, no other page shows it, and no script runs except those that it has now."""
+    """The page talks only to this server, no other page shows it, and no script runs except those that it has now."""
     scripts = re.findall(b"<script>(.*?)</script>", page, re.DOTALL)
     hashes = (base64.b64encode(hashlib.sha256(script).digest()).decode() for script in scripts)
     return f"{SECURITY}; script-src " + " ".join(f"'sha256-{each}'" for each in hashes)

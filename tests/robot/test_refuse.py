@@ -72,7 +72,7 @@ REFUSED = {
     "joint 'loose': one free joint, of the first moving body, is simulated": robot(
         f'<body><joint/>{BALL}</body><body><freejoint name="loose"/>{BALL}</body>'
     ),
-    "joint 'weak': actuatorfrcrange beside muscles is not simulated": tendon(
+    "joint 'weak': actuatorfrcrange together with muscles is not simulated": tendon(
         joint='<joint name="weak" actuatorfrcrange="-1 1"/>', actuator=MUSCLES
     ),
     "joint 'a', 'b': they have a motion without inertia": [
@@ -82,7 +82,7 @@ REFUSED = {
     ],
     # bodies and contact
     "file without a joint: there is nothing to simulate": robot(f"<body>{BALL}</body>"),
-    "body 'post': a second base beside a floating one": robot(
+    "body 'post': a second base besides a floating one": robot(
         f'<body><freejoint/>{BALL}</body><body name="post"><joint/>{BALL}</body>'
     ),
     "body 'hand': mocap is not simulated": pendulum(world=f'{FLOOR}<body name="hand" mocap="true"/>'),

@@ -73,15 +73,15 @@ def test_anything_else_is_refused_in_one_line(tmp_path, capsys):
     inverted = whole[:middle] + bytes(255 - byte for byte in whole[middle : middle + 400]) + whole[middle + 400 :]
     for broken in (b"", b"hello", whole[:100], whole[:-10], inverted):
         path.write_bytes(broken)
-        assert f": {path} is not a whole checkpoint of bptt.py" in refusal(lambda: load(path, "bptt"), capsys)
-        assert f": {path} is not a whole checkpoint" in refusal(lambda: load(path), capsys)
+        assert f": {path} is not a complete checkpoint of bptt.py" in refusal(lambda: load(path, "bptt"), capsys)
+        assert f": {path} is not a complete checkpoint" in refusal(lambda: load(path), capsys)
     for older in ("shac-1", 1):
         torch.save({"format": older, "actor": {}}, path)
         message = f": {path} is a checkpoint of format {older!r}, and this version reads format {FORMAT}"
         assert refusal(lambda: load(path, "shac"), capsys).endswith(message)
     for foreign in ({"weights": torch.zeros(3)}, [1, 2], {"format": FORMAT}):
         torch.save(foreign, path)
-        assert f": {path} is not a whole checkpoint" in refusal(lambda: load(path), capsys)
+        assert f": {path} is not a complete checkpoint" in refusal(lambda: load(path), capsys)
 
 
 def test_weights_are_compared_before_layers_are_built(tmp_path, capsys):

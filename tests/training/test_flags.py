@@ -69,12 +69,12 @@ def save(args: flags.Flags, **further: object) -> Path:
         (shac, "--theta 1.5", "in [0, 1]"),
         (bptt, "--betas 0.9 1.0", "in [0, 1)"),
         (sac_baseline, "--hidden ()", "at least one number"),
-        (ppo_baseline, "--lr-bounds 0.01 1e-06", "are the wrong way round"),
+        (ppo_baseline, "--lr-bounds 0.01 1e-06", ": the first must not exceed the second"),
     ],
 )
 def test_a_number_out_of_range_is_named_before_anything_is_written(script, arguments, allowed, tmp_path, capsys):
     name, *values = arguments.split()
-    complaint = f"{arguments} {allowed}" if "way" in allowed else f"{name} must be {allowed}, not {values[-1]}"
+    complaint = f"{arguments}{allowed}" if "exceed" in allowed else f"{name} must be {allowed}, not {values[-1]}"
     words = [word for word in arguments.split() if word != "()"]
     assert refusal(lambda: script.main(words), capsys) == f"script.py: {complaint}"
     assert not list(tmp_path.iterdir())
@@ -95,7 +95,7 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
         (f"--run-dir {300 * 'a'}", "File name too long"),
         ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
         ("--resume {file}.pt", "no such checkpoint: {file}.pt"),
-        ("--evaluate {file}", "{file} is not a whole checkpoint of shac.py"),
+        ("--evaluate {file}", "{file} is not a complete checkpoint of shac.py"),
         ("--evaluate {other}", "{other} is a checkpoint of 'other', not of shac.py"),
         ("--resume {elsewhere} --device cpu --iterations 9", "{elsewhere} was trained on cuda:0, which cpu cannot"),
         ("--evaluate {trained}/checkpoint.pt --run-dir {file}", "cannot write to run directory {file}"),
@@ -217,7 +217,7 @@ def test_what_a_checkpoint_decides(capsys):
         for mode in ("--resume", "--evaluate"):
             command = [mode, str(path), *argument.split()]
             line = refusal(lambda command=command: parse(shac.Args, command), capsys)
-            assert line.startswith(f"script.py: {path} has {saved}; what may change is --accuracy, ")
+            assert line.startswith(f"script.py: {path} has {saved}; only these may change: --accuracy, ")
             assert "--horizon" in line and "--num-envs 3, not 4" not in line.partition(";")[2]
 
 
@@ -229,7 +229,7 @@ def test_a_checkpoint_of_flags_that_the_script_lacks_is_only_evaluated(capsys):
     assert line == expected
     args = parse(shac.Args, ["--evaluate", str(path)])
     assert (args.gamma, args.accuracy) == (0.9, "default")
-    assert capsys.readouterr().err == f"{expected}; they do not count here\n"
+    assert capsys.readouterr().err == f"{expected}; they are ignored\n"
 
 
 def test_a_checkpoint_older_than_a_flag_has_its_default():

@@ -309,7 +309,7 @@ def test_progress_and_messages(tmp_path, capsys):
 def test_skipped_updates_are_told_when_they_have_doubled(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bptt, "ClippedAdam", lambda *given, **named: ClippedAdam(*given, **named | {"skip_norm": 0.0}))
     run(bptt, tmp_path, *TINY, "--iterations", 8)
-    words = "updates skipped so far for their gradients"
+    words = "updates skipped so far because of their gradients"
     assert re.findall(rf"iteration (\d): {words}: (\d)", capsys.readouterr().out) == [
         ("1", "1"),
         ("3", "3"),

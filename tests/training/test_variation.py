@@ -66,12 +66,12 @@ def test_what_divides_the_gradient_is_positive(env: diffsim.DiffEnv) -> None:
 @pytest.mark.parametrize(
     "items, message",
     [
-        ("friction", "'friction' is no range of factors like friction=0.7:1.3"),
-        ("friction=1", "'friction=1' is no range"),
-        ("friction=a:b", "'friction=a:b' is no range"),
+        ("friction", "'friction' is not a range like friction=0.7:1.3"),
+        ("friction=1", "'friction=1' is not a range"),
+        ("friction=a:b", "'friction=a:b' is not a range"),
         ("mu=0.5:1", "unknown 'mu': choose from friction, stiffness, mass, motor"),
-        ("mass=0:1", "factors must be positive and finite, the least one first"),
-        ("mass=2:1", "the least one first"),
+        ("mass=0:1", "factors must be positive and finite, the smaller one first"),
+        ("mass=2:1", "the smaller one first"),
         ("mass=1:inf", "positive and finite"),
         ("mass=nan:2", "positive and finite"),
     ],
@@ -92,8 +92,8 @@ def test_disturbances_are_the_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert 0.5 <= late.min() < 0.6 and 0.9 < late.max() <= 1 and env.task.disturbances["push"] == (0.0, 0.5)
     assert column(env, "mass").std() > 0.01 and (column(env, "motor") == 1).all()
     for item, message in (
-        ("latency=0:3", "'latency=0:3': must be from 0 to 2, the least one first"),
-        ("push=1:0.5", "'push=1:0.5': must be from 0 to inf, the least one first"),
+        ("latency=0:3", "'latency=0:3': must be from 0 to 2, the smaller one first"),
+        ("push=1:0.5", "'push=1:0.5': must be from 0 to inf, the smaller one first"),
         ("push=0:inf", "must be from 0 to inf"),
         ("mu=1:2", "choose from friction, stiffness, mass, motor, latency, push"),
     ):

@@ -35,7 +35,7 @@ def tangent(a: Tensor, b: Tensor) -> Tensor:
 class Clip:
     """A motion at the rate of control, or several.
 
-    The last frame of a loop is the first one of the next round: equal but for x and y.
+    The last frame of a loop is the first one of the next round: equal except for x and y.
 
     Attributes:
         name: of the file, without its suffix, or of the folder.
@@ -135,7 +135,7 @@ def read_clip(source: str | Path) -> Clip:
     if path.is_dir() and (found := sorted(each for each in path.iterdir() if each.suffix in READERS)):
         motions = [_read_file(each, fps).qpos for each in found]
         if len(widths := {motion.shape[1] for motion in motions}) > 1:
-            raise ValueError(f"the clips of {path} are of several robots: their qpos have {widths} columns")
+            raise ValueError(f"the clips of {path} are for several robots: their qpos have {widths} columns")
         return Clip(path.name, torch.cat(motions), loop=False, lengths=tuple(map(len, motions)))
     if not path.is_file():
         raise ValueError(

@@ -101,7 +101,7 @@ def test_bad_clips_are_refused_in_one_line(tmp_path: Path) -> None:
         read_clip(empty)
     write_csv(empty / "a.csv", good), write_csv(empty / "b.csv", good[:, :30])
     with pytest.raises(
-        ValueError, match=r"clips of .*empty are of several robots: their qpos have \{36, 30\}|\{30, 36"
+        ValueError, match=r"clips of .*empty are for several robots: their qpos have \{36, 30\}|\{30, 36"
     ):
         read_clip(empty)
     with pytest.raises(ValueError, match="task 'humanoid_imitation' tracks one motion, not the 2 of two"):
