@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -65,9 +66,11 @@ def test_schedule(arguments, evaluated, saved, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)])
-def test_signals(number, tmp_path, monkeypatch, capsys):
+def test_signals(number, tmp_path, monkeypatch, capsys, request):
     """The first one lets the iteration end, saved; the same a second time ends it at once. nohup's ignores SIGHUP."""
-    before, raised = signal.getsignal(number), []
+    request.addfinalizer(partial(signal.signal, number, signal.getsignal(number)))
+    before, raised = signal.default_int_handler, []  # also where pytest itself runs in the background and ignores it
+    signal.signal(number, before)
 
     def interrupted(count: int) -> Any:
         def loss(*arguments: Any) -> Tensor:
