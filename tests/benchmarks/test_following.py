@@ -83,7 +83,7 @@ def test_a_race_is_won_by_the_first_checkpoint_that_is_good_enough(
     run = tmp_path / "run"
     run.mkdir()
     shutil.copy(POLICIES / "go2.pt", run / "at_600.pt")
-    (run / "progress.csv").write_text("iteration,seconds,eval_return\n1,5,\n600,77,\n601,99,\n")
+    (run / "progress.csv").write_text("iteration,seconds,eval_return\n1,5,\n600,77,\n100000,99,\n")
     out = judged(f"{run / 'at_600.pt'} --race", tmp_path, capsys)
     (row,) = read_csv(tmp_path / "joystick_race.csv")
     assert row["checkpoint"] == "run/at_600" and row["training s"] == "77"
