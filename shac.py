@@ -46,6 +46,7 @@ PER_TASK = {
 # Near the pose from which a robot learns to walk
 STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01, "adjoint_clip": 5.0}
 BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"), STANDING | {"horizon": 16})
+ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  # where environments cost little
 
 
 @dataclass
@@ -101,6 +102,8 @@ class Args(WindowFlags):
             values = {name: value for name, value in values.items() if name == "iterations"}
         if self.contact == "mujoco":  # whose gradients agree over few steps: docs/transfer.md
             values |= {"horizon": 8, "num_envs": 4 * values.get("num_envs", self.num_envs)}
+        if self.device != "cpu":
+            values |= ON_GPU.get(self.env, {})
         return super().task_defaults() | values | BEGINNING.get(self.env, {})
 
 

@@ -64,7 +64,7 @@ def quadruped(order: Sequence[str]) -> Robot:
         for name in order
     )
     joints = tuple(f"{name}_{part}" for name in order for part in ("hip", "thigh", "calf"))
-    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.068, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
+    return Robot(joints, (0.0, 0.9, -1.8) * 4, 0.27, legs, 0.265, 0.072, 2.0, (("FR_", "FL_"), ("RR_", "RL_")))
 
 
 def humanoid() -> Robot:
@@ -102,7 +102,7 @@ class Joystick(Task):
         "mass=0.85:1.15",
         "motor=0.8:1.2",
         "latency=0:1",
-        "push=0:0.5",
+        "push=0:1",
     )
     substeps = 4
     control_dt = 0.02
@@ -110,7 +110,7 @@ class Joystick(Task):
 
     forward_column = None  # what counts is the command
     alive: ClassVar[float] = 4.0  # reward of a perfect step
-    smooth: ClassVar[float] = 2.0  # weight of changes of the action
+    smooth: ClassVar[float] = 2.2  # weight of changes of the action
     # By how much the actions of an episode come late; how large the pushes are that come at random
     disturbances = MappingProxyType({"latency": (0.0, 0.0), "push": (0.0, 0.0)})
 
