@@ -268,9 +268,9 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         scene=scene_types(U),
         Model=scene_types(U).Model,
         # a lane of an environment, or of a block of them, e; its n links are entries at, at + 1, ... of Model's arrays;
-        # rows of checkpoints: the substep's, and the factor's, which is kept if keep is 1; touchdown: 1 if gradients count
-        # that contacts begin with a jump; h: s, of a substep; theta: how implicit it is; constants of the laws, or
-        # factors of those that each link has its own of (k_limit to motor, read where they vary)
+        # rows of checkpoints: the substep's, and the factor's, which is kept if keep is 1; touchdown: 1 if gradients
+        # count that contacts begin with a jump; h: s, of a substep; theta: how implicit it is; constants of the laws,
+        # or factors of those that each link has its own of (k_limit to motor, read where they vary)
         Lane=struct("Lane", constants | dict.fromkeys("e lane at n row factor keep touchdown".split(), int)),
         # where a link is (about the carrier, in world axes), its joint's axis, its velocity, and its joint's state
         Link=Link,
