@@ -83,7 +83,7 @@ def test_saving_and_evaluating_change_no_numbers(script, small, tmp_path):
 
 
 def test_the_same_seed_interrupted_and_resumed_ends_bitwise_alike(script, small, checkpoint, tmp_path, monkeypatch):
-    path, evaluate = tmp_path / "checkpoint.pt", Run.evaluate
+    path, evaluate, before = tmp_path / "checkpoint.pt", Run.evaluate, signal.getsignal(signal.SIGTERM)
 
     def interrupted(*arguments: Any) -> Any:
         signal.raise_signal(signal.SIGTERM)
@@ -93,7 +93,7 @@ def test_the_same_seed_interrupted_and_resumed_ends_bitwise_alike(script, small,
         patch.setattr(Run, "evaluate", interrupted)
         run(script, tmp_path, *small, "--threads", 1)
     assert exit.value.code == 128 + signal.SIGTERM
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == before  # a bound method is made anew each time
     assert torch.load(path, weights_only=True)["iteration"] == 5
     with (tmp_path / "progress.csv").open("a") as file:  # of iterations after the checkpoint, as a crash leaves them
         file.write("9,999,9.9\n")
@@ -153,9 +153,13 @@ class Waits(TorchDispatchMode):
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if function.overloadpacket in self.asking:
-            stack = [frame for frame in traceback.extract_stack()[:-1] if frame.filename.startswith(str(ROOT))]
-            self.places.append(f"{Path(stack[-1].filename).name}: {stack[-1].line}")
+            ours = [frame for frame in traceback.extract_stack()[:-1] if self.is_ours(Path(frame.filename))]
+            self.places.append(f"{Path(ours[-1].filename).name}: {ours[-1].line}")
         return function(*args, **(kwargs or {}))
+
+    @staticmethod
+    def is_ours(path: Path) -> bool:
+        return path.is_relative_to(ROOT) and "site-packages" not in path.parts  # an environment may lie in the clone
 
 
 def test_nothing_captured_waits_for_the_device(script, small, tmp_path, monkeypatch):
