@@ -154,9 +154,10 @@ class DiffEnv(VectorEnv):
         self._begin(mask, self._draw(1)[0])
         if self._pinned is not None:
             self.carry_over(self._pinned)
-        self._starts, self._time = self._draw(self.horizon), 0
-        if self.device.type == "cuda":
-            self._time = self.horizon  # the next step draws start states, as it does in each replay of a graph
+        if self.device.type == "cuda":  # the next step draws start states, as it does in each replay of a graph
+            self._time = self.horizon
+        else:
+            self._starts, self._time = self._draw(self.horizon), 0
         return self._obs.clone(), {}
 
     @in_plain_mode

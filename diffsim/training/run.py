@@ -102,6 +102,7 @@ class Run:
         self._mark = Mark(self.device)
         self._evaluation: tuple[int, Evaluation] | None = None
         self._player: Player | None = None
+        self._graphs = getattr(args, "cuda_graph", False)  # a flag of ParallelFlags
         self._scalars: dict[str, float] = {}  # that were written last
         self._monitor: Monitor | None = None
         self._told = dict.fromkeys(TOLD, 0.0)  # by messages
@@ -164,7 +165,7 @@ class Run:
 
     def capture(self, function: Callable[[], Metrics], env: DiffEnv | None = None) -> Callable[[], Metrics]:
         """Half an iteration, timed as time/{name}; on a GPU its calls replay one CUDA graph. See graph.capture."""
-        call = graph.capture(function, self.device, env) if getattr(self.args, "cuda_graph", False) else function
+        call = graph.capture(function, self.device, env) if self._graphs else function
 
         def timed() -> Metrics:
             begin = Mark(self.device)
@@ -251,7 +252,7 @@ class Run:
 
     def evaluate(self, policy: nn.Module) -> None:
         """Evaluate the deterministic policy, always of one architecture, in the iteration that was logged last."""
-        self._player = self._player or Player(self.eval_env, policy, getattr(self.args, "cuda_graph", False))
+        self._player = self._player or Player(self.eval_env, policy, self._graphs)
         self._player.take(policy)
         self.log_evaluation(self._player.evaluate())
 

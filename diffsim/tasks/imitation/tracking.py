@@ -24,7 +24,7 @@ from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides
 
 SMOOTH = 5  # frames of 1/60 s whose mean a frame of the reference is
 STANDING = 0.05  # share of a clip's frames in which a foot may be in the ground: captured feet slip and sink
-REACH = 0.4  # rad, how far beyond the clip's own range a servo's target may be
+REACH = 0.4  # rad, by how much an action changes a servo's target: its range is the clip's and so much to both sides
 BEFORE_END = 60  # frames, at least, that an episode has of its clip, if this is longer
 AHEAD = 3  # frames, how much earlier the reference is seen
 TURNED = 1.0  # rad; the episode ends when the root is turned from the reference's by more
