@@ -26,7 +26,7 @@ import tables
 import torch
 from common import ABOUT, Case, Part, load_case, measured, run
 from tables import Row, grouped, middle, numbers
-from worlds import Array, OtherFile, State, in_double, rollout
+from worlds import Array, OtherFile, State, in_double, pushes, rollout
 
 from diffsim.tasks.joystick import Joystick
 from diffsim.training import NonNegative, Positive, fail, gait
@@ -37,7 +37,6 @@ FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
 COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) for v in SIDEWAYS)]
 COMMANDS += [(0.0, 0.0, w) for w in TURNING] + [(v, 0.0, w) for v in (0.5, -0.5) for w in TURNING]
 WALK = COMMANDS.index((0.5, 0.0, 0.0))
-PUSHED_EVERY = 4.0  # s
 RACE = (0.1, 0.05)  # m/s, errors to which learners race
 PAGE = "joystick.md"
 Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # the first second does not count
@@ -61,15 +60,7 @@ def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array, Arra
     task, scene, n = in_double(case.env), case.env.scene, len(COMMANDS)
     late = args.latency / 1e3 / task.control_dt
     task.disturbances = {"latency": (late, late), "push": (0.0, 0.0)}
-    every, drawn = round(PUSHED_EVERY / task.control_dt), np.random.default_rng(1)
-
-    def push(step: int, state: State) -> State:
-        if not args.push or not step or step % every:
-            return state
-        angles, kicks = drawn.uniform(0, 2 * np.pi, n), np.zeros((n, scene.nv))
-        kicks[:, :2] = args.push * np.stack((np.cos(angles), np.sin(angles)), 1)
-        return state._replace(qvel=state.qvel + torch.from_numpy(kicks))
-
+    push = pushes(args.push, task.control_dt, np.random.default_rng(1))
     rest = torch.tensor(task.start).double().expand(n, -1)  # the keyframe
     memory = task.begin(rest.new_full((n, task.num_random), 0.5))
     memory[:, :3] = torch.tensor(COMMANDS)

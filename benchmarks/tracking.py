@@ -22,9 +22,9 @@ import common
 import numpy as np
 import torch
 from common import ABOUT, Part, load_case, measured, run
-from joystick import PUSHED_EVERY, training
+from joystick import training
 from tables import Row, grouped, middle, numbers
-from worlds import Array, OtherFile, State, rollout
+from worlds import Array, OtherFile, State, pushes, rollout
 
 from diffsim import read_clip
 from diffsim.tasks.imitation.tracking import Tracking
@@ -51,13 +51,7 @@ def track(saved: SavedPolicy, task: Tracking, world: OtherFile, args: Args) -> t
     qpos, qvel = task.reference(memory)
     qpos[:, 7:] += torch.from_numpy(drawn.uniform(-OFF, OFF, (n, task.joints)))
 
-    def push(step: int, state: State) -> State:
-        if not args.push or not step or step % round(PUSHED_EVERY / task.control_dt):
-            return state
-        angles, kicks = drawn.uniform(0, 2 * np.pi, n), np.zeros(state.qvel.shape)
-        kicks[:, :2] = args.push * np.stack((np.cos(angles), np.sin(angles)), 1)
-        return state._replace(qvel=state.qvel + torch.from_numpy(kicks))
-
+    push = pushes(args.push, task.control_dt, drawn)
     start = State(qpos, qvel, torch.zeros(n, task.joints).double(), memory)
     names, sizes = zip(*task.obs_parts, strict=True)
     sums, counted, alive = torch.zeros(3, n).double(), torch.zeros(n), torch.ones(n, dtype=torch.bool)

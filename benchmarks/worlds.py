@@ -24,6 +24,7 @@ from diffsim.training.evaluation import SEED
 
 Array = NDArray[np.float64]
 FASTEST = 1e5  # m/s or rad/s; beyond it a robot is lost, as in Simulator
+PUSHED_EVERY = 4.0  # s
 
 mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable, which World.step says
 
@@ -199,6 +200,19 @@ def starts(env: DiffEnv, dtype: torch.dtype | None = None) -> State:
     nothing = torch.zeros(env.num_envs, env.scene.nu, device=env.device)
     parts = env.qpos, env.qvel, nothing, env.memory
     return State(*(part.to(dtype or env.dtype, copy=True) if part.is_floating_point() else part for part in parts))
+
+
+def pushes(size: float, control_dt: float, drawn: np.random.Generator) -> Callable[[int, State], State]:
+    """For rollout: every PUSHED_EVERY s each root's velocity changes by size [m/s] in a random horizontal direction."""
+
+    def push(step: int, state: State) -> State:
+        if not size or not step or step % round(PUSHED_EVERY / control_dt):
+            return state
+        angles, kicks = drawn.uniform(0, 2 * np.pi, len(state.qvel)), np.zeros(state.qvel.shape)
+        kicks[:, :2] = size * np.stack((np.cos(angles), np.sin(angles)), 1)
+        return state._replace(qvel=state.qvel + torch.from_numpy(kicks))
+
+    return push
 
 
 @torch.no_grad()
