@@ -25,7 +25,7 @@ from common import Part, measured, run
 from speed import timed, windows
 from tables import Cells, Row, read_csv
 from torch import Tensor
-from worlds import FASTEST, mujoco_model
+from worlds import FASTEST, MuJoCo, mujoco_model
 
 import diffsim
 import ppo_baseline
@@ -123,20 +123,15 @@ def measure_speed(args: Args, name: Name) -> Iterator[Row]:
 
 def mj_steps(sim: diffsim.Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor) -> float:
     """Control steps per second of MuJoCo's mj_step on one core, of some of the environments in turn."""
-    model = mujoco_model(sim.scene, sim.control_dt, sim.integration.substeps)
-    low, high = model.actuator_ctrlrange.T
-    worlds, seconds = [mujoco.MjData(model) for _ in range(min(sim.num_envs, 64))], 0.0
-    for k, data in enumerate(worlds):
+    world = MuJoCo(sim.scene, min(sim.num_envs, 64), sim.control_dt, 1.0, True, sim.integration.substeps)
+    for k, data in enumerate(world.data):
         data.qpos, data.qvel = qpos[k].numpy(force=True), qvel[k].numpy(force=True)
-        mujoco.mj_forward(model, data)
-    for action in actions.numpy(force=True):
-        for k, data in enumerate(worlds):
-            data.ctrl = low + (action[k] + 1) / 2 * (high - low)
-        start = time.perf_counter()
-        for data in worlds:
-            mujoco.mj_step(model, data, sim.integration.substeps)
-        seconds += time.perf_counter() - start
-    return len(actions) * len(worlds) / seconds
+        mujoco.mj_forward(world.model, data)
+    start = time.perf_counter()
+    for action in actions.double().numpy(force=True):
+        for k, data in enumerate(world.data):
+            world.advance(data, action[k])
+    return len(actions) * len(world.data) / (time.perf_counter() - start)
 
 
 def train(args: Args, name: Name) -> Iterator[Row]:

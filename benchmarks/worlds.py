@@ -97,7 +97,7 @@ class MuJoCo:
         self.data = [mujoco.MjData(model) for _ in range(num_envs)]
         self._pool = ThreadPoolExecutor(available_cores())
 
-    def _advance(self, data: mujoco.MjData, action: Array) -> None:
+    def advance(self, data: mujoco.MjData, action: Array) -> None:
         data.ctrl[:] = self._middle + self._reach * action
         mujoco.mj_step(self.model, data, self.substeps)  # without Python's lock
 
@@ -109,7 +109,7 @@ class MuJoCo:
             for k in rows:
                 data = self.data[k]
                 data.qpos[self.qpos], data.qvel[self.qvel] = new_qpos[k], new_qvel[k]
-                self._advance(data, actions[k])
+                self.advance(data, actions[k])
                 if (np.abs(data.qvel) < FASTEST).all() and np.isfinite(data.qpos).all():
                     new_qpos[k], new_qvel[k] = data.qpos[self.qpos], data.qvel[self.qvel]
                 else:
@@ -159,7 +159,7 @@ class OtherFile(MuJoCo):
         self._limited = model.actuator_ctrllimited[self._ctrl] != 0
         self._begin(model, num_envs, env.control_dt)
 
-    def _advance(self, data: mujoco.MjData, action: Array) -> None:
+    def advance(self, data: mujoco.MjData, action: Array) -> None:
         target = self._middle + self._reach * action[self._order]
         if self._servo.all():
             data.ctrl[self._ctrl] = np.where(self._limited, target.clip(self._least, self._most), target)
