@@ -2,8 +2,8 @@
 
 Then the adjoint, the loss's gradient with respect to a state, is clipped in each environment on its way back in time,
 as recurrent networks clip it at each step (Graves 2013, https://arxiv.org/abs/1308.0850, section 2.1; Pascanu et al.
-2013, https://arxiv.org/abs/1211.5063, has the reasons), but to what is usual in the batch. By default nothing is clipped;
-docs/transfer.md shows what clipping does.
+2013, https://arxiv.org/abs/1211.5063, has the reasons), but to what is usual in the batch. By default nothing is
+clipped; docs/transfer.md shows what clipping does.
 """
 
 from __future__ import annotations
