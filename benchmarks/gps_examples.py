@@ -21,6 +21,7 @@ from torch import Tensor
 
 from diffsim.planning import System
 from diffsim.tasks.hopper import Hopper
+from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.walker import Walker
 from diffsim.training import command, fail, load_policy, parse
 from diffsim.training.evaluation import make_env
@@ -52,6 +53,17 @@ class WalkerExample(Walker):
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         error = (obs[..., 8] - 1.2).square() + 10.0 * (obs[..., 0] + 0.05).square()
         return ALIVE - error - 10.0 * obs[..., 1].square() - 0.1 * action.square().sum(-1)
+
+
+class HumanoidExample(Humanoid):
+    """Runs at 2.5 m/s, straight on."""
+
+    name = "humanoid_example"
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        error = (obs[..., 5] - 2.5).square() + obs[..., 6].square() + 10.0 * (obs[..., 0] - 1.2).square()
+        turn = 4.0 * obs[..., 1:4].square().sum(-1) + 0.1 * obs[..., 8:11].square().sum(-1)
+        return 3.0 * ALIVE - error - turn - 0.3 * action.square().sum(-1)
 
 
 # Recording ------------------------------------------------------------------------------------------------------------
