@@ -207,7 +207,7 @@ class Restart(NonGuided):
         x = torch.cat([guide.x[:-1] for guide in self.guides])
         start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
         self.control_steps += count * self.args.horizon
-        return self.roll_out(self.system, theta, self.noise(count), start, source)
+        return self.roll_out(theta, self.noise(count), start, source)
 
 
 class SingleExample(NonGuided):

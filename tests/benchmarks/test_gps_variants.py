@@ -151,13 +151,15 @@ def test_a_search_on_several_terrains(tmp_path: Path, slopes: Path, monkeypatch:
     search = make_search("--terrain", *SLOPES, "--demonstration", str(slopes))
     search.prepare(lambda message: None)
     search.iterate(1)
-    assert len(search.guides) == search.S.initial == 3
+    assert len(search.guides) == search.initial == 3
     monkeypatch.setattr(search, "noise", lambda count, rng=None: torch.zeros(count, 8, 3).double())
     S, own = search.follow(search.guides, 6), search.draw(search.network.theta)
     for i, guide in enumerate(search.guides):
         assert (S.source == i).sum() == 2
         torch.testing.assert_close(S.x[S.source == i], guide.x.expand(2, -1, -1))
-        alone = search.roll_out(search.grounds[i], search.network.theta, search.noise(1), guide.x[:1])
+        with monkeypatch.context() as patch:
+            patch.setattr(search, "system", search.grounds[i])
+            alone = search.roll_out(search.network.theta, search.noise(1), guide.x[:1])
         torch.testing.assert_close(own.x[i::3], alone.x.expand(2, -1, -1))
     assert not any(torch.allclose(own.x[0], own.x[i]) for i in (1, 2))
     again = make_search("--terrain", *SLOPES[::-1], "--demonstration", str(slopes))
@@ -191,9 +193,9 @@ def test_variants(case: str, tmp_path: Path) -> None:
     modules = run(gps_variants, tmp_path, *SMALL, "--case", case)["modules"]
     search, S = modules["learner"], modules["S"]
     guided = case in ("guided", "one-start", "unregularized", "effective-samples")
-    assert any(len(generator) > 1 for generator in S["generators"]) == guided == (S["initial"] == 1)
+    assert any(len(generator) > 1 for generator in S["generators"]) == guided == (search["initial"] == 1)
     assert (search["w_r"] == 0) == (case == "unregularized")
-    moved = not torch.equal(modules["network"]["theta"], S["generators"][S["best"]][0])
+    moved = not torch.equal(modules["network"]["theta"], S["generators"][search["best"]][0])
     assert moved == (case in ("policy-gradient", "dagger"))
 
 
