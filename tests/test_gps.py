@@ -349,7 +349,7 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
     [
         ("--horizon 1", "--horizon must be from 2 to 1,000, not 1"),
         ("--guiding-samples 1", "--guiding-samples must be from 2 to 1,000, not 1"),
-        ("--active 20", "--active must be at least 50, not 20"),
+        ("--active 20", "--active must be at least 50, for the guides' and the policy's samples, not 20"),
         ("--resume {trained}/checkpoint.pt --control-dt 0.02", "has --control-dt 0.016666666666666666, not 0.02"),
         ("--regularizer-bounds 1 0.1", "--regularizer-bounds must be two numbers in order"),
         ("--demonstration {file}.npz", "no such trajectory: {file}.npz"),

@@ -60,7 +60,7 @@ def test_a_recorded_policy(tmp_path: Path) -> None:
 
 
 def test_a_swimmer_swims_forward(tmp_path: Path) -> None:
-    gps_examples.main(gps_examples.Args(to=tmp_path / "swim.npz", env="swimmer", steps=60))
+    gps_examples.main(gps_examples.Args(to=tmp_path / "swim.npz", env="swimmer", steps=60, settle=200))
     x = np.load(tmp_path / "swim.npz")["qpos"][:, 0]
     assert x[0] == 0.0 and x[-1] > 0.6 * 60 * 0.05
 
