@@ -25,12 +25,13 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, get_args
 
 import tables
+import torch
 import tyro
 from common import TASKS, CommonFlags, Line, Panel, Part, Tasks, measured, plot, run
 from tables import Cells, Row, grouped
 
 import diffsim
-from diffsim.sim.integration import PASSES
+from diffsim.sim.integration import PASSES, Integration
 from diffsim.tasks import Accuracy, find_task
 from diffsim.training import Count, load_policy, parse
 from diffsim.training.checkpoint import POLICIES
@@ -39,7 +40,7 @@ from diffsim.training.monitor import Monitor
 from diffsim.tune import actor, subject
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row as Measured
-from diffsim.tune.front import Setting, choice, finest, measure, settings
+from diffsim.tune.front import choice, finest, measure, settings
 from diffsim.tune.motion import SPANS, Motion
 
 PartName = Literal["presets", "extremes", "promise", "monitor"]
@@ -71,28 +72,38 @@ def motion_of(robot: str, states: int, seed: int = 0) -> Motion:
     return Motion(env, actor(robot, task, None)[0], seed)
 
 
+def kind(how: Integration) -> str:
+    """What it shares with those of other substeps."""
+    newton = f" to {how.tolerance:g}, {how.passes} passes"
+    return how.integrator + {"mujoco": newton, "implicit": f" {how.theta:g}"}.get(how.integrator, "")
+
+
+def named(how: Integration) -> str:
+    return f"{kind(how)}, {how.substeps} substeps"
+
+
 def measure_presets(args: Args, robot: str) -> Iterator[Row]:
     task, rows = subject(robot), list[Measured]()
     measure(motion_of(robot, args.states), settings(task, task.contact), rows, threads=1)
     for row in rows:
-        yield {"task": task.name, "setting": row.setting, "kind": row.setting.kind, **row.numbers}
+        yield {"task": task.name, "setting": named(row.how), "kind": kind(row.how), **row.numbers}
 
 
-def named(rows: list[Cells]) -> list[Cells]:
+def labelled(rows: list[Cells]) -> list[Cells]:
     """The rows, by task, with the name of the preset that has this setting, and the speed relative to the default."""
     lines = list[Cells]()
     for (task,), own in grouped(rows, "task").items():
-        names = {str(Setting(how)): name for name, how in find_task(task).presets().items()}
-        labelled = [row | {"preset": names.get(row["setting"], "")} for row in own]
-        (default,) = (float(row["us with gradient"]) for row in labelled if row["preset"] == "default")
-        lines += [row | {"speed": f"{default / float(row['us with gradient']):.2f}"} for row in labelled]
+        names = {named(how): name for name, how in find_task(task).presets().items()}
+        own = [row | {"preset": names.get(row["setting"], "")} for row in own]
+        (default,) = (float(row["us with gradient"]) for row in own if row["preset"] == "default")
+        lines += [row | {"speed": f"{default / float(row['us with gradient']):.2f}"} for row in own]
     return lines
 
 
 def presets(rows: list[Cells]) -> list[Row]:
     """A line for each preset, by task, the fastest first."""
     lines = sorted(
-        (row for row in named(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
+        (row for row in labelled(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
     )
     lines = [row | {"setting": row["setting"].replace(USUAL, "").removesuffix(" substeps")} for row in lines]
     return [{name: row[name] for name in SHOWN} for own in grouped(lines, "task").values() for row in own]
@@ -100,8 +111,9 @@ def presets(rows: list[Cells]) -> list[Row]:
 
 def measure_extremes(args: Args, robot: str) -> Iterator[Row]:
     task = subject(robot)
-    for row in stress(motion_of(robot, 8), task, dict.fromkeys((task.contact, "mujoco"))):
-        yield {"task": task.name} | row
+    contacts, motion = dict.fromkeys((task.contact, "mujoco")), motion_of(robot, 8)
+    for found in zip(*(stress(motion, task, contact) for contact in contacts), strict=True):
+        yield {"task": task.name} | {name: cell for row in found for name, cell in row.items()}
 
 
 def bounds(rows: list[Cells]) -> list[Row]:
@@ -122,15 +134,12 @@ def measure_promise(args: Args, robot: str) -> Iterator[Row]:
     task, rows = subject(robot), list[Measured]()
     found = settings(task, task.contact)
     measure(motion_of(robot, args.states), found, rows, threads=1)
-    default = next(row for row in rows if row.setting == Setting(task.integration("default")))
+    default = next(row for row in rows if row.how == task.integration("default"))
     best, others = choice(rows, ERROR), motion_of(robot, OTHERS, seed=1)
     assert best is not None, "no setting is good enough"
-    again = others.error(others.replay(best.setting), others.replay(finest(found)), SPANS[-1])
-    row: dict[str, object] = {
-        "robot": Path(robot).stem,
-        "chosen": f"{best.setting.kind}, {best.setting.integration.substeps}",
-    }
-    row |= {"default": f"{default.setting.kind}, {default.setting.integration.substeps}"}
+    again = others.error(others.replay(best.how), others.replay(finest(found), torch.float64), SPANS[-1])
+    row: dict[str, object] = {"robot": Path(robot).stem}
+    row |= {what: named(each.how).removesuffix(" substeps") for what, each in (("chosen", best), ("default", default))}
     row |= {"error": best.error, "error on 200 others": again, "times 0.01": again / ERROR}
     yield row | {"speed": default.cost / best.cost, "default's error": default.error}
 
@@ -176,7 +185,7 @@ def measure_monitor(args: Args, robot: str) -> Iterator[Row]:
 
 def draw(args: Args, rows: list[Cells]) -> None:
     panels = list[Panel]()
-    for (task,), own in grouped((row for row in named(rows) if "float64" not in row["kind"]), "task").items():
+    for (task,), own in grouped((row for row in labelled(rows) if "float64" not in row["kind"]), "task").items():
         lines = list[Line]()
         for k, ((kind,), same) in enumerate(grouped(own, "kind").items()):
             same = sorted(same, key=lambda row: float(row["us with gradient"]))

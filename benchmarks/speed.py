@@ -13,6 +13,7 @@ A machine that does something else meanwhile gives wrong numbers.
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import json
 import math
@@ -43,7 +44,6 @@ from diffsim.sim.launcher import TooLargeError, available_cores
 from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
 from diffsim.tune.front import clock
-from diffsim.tune.motion import without
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
@@ -136,6 +136,11 @@ def race(competitors: Mapping[K, Callable[[State], Times]], states: Sequence[Sta
     return {key: {what: median(t[what] for t in times) for what in times[0]} for key, times in found.items()}
 
 
+def without_muscles(scene: Scene) -> Scene:
+    names = "segment_link segment_position segment_muscle".split()
+    return dataclasses.replace(scene, **{name: getattr(scene, name)[:0] for name in names})
+
+
 def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     """Beside MuJoCo: without its muscles, if a task has any; the hopper also on rough ground.
 
@@ -146,7 +151,7 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
     if "muscle" in whole.features:
-        scenes = {"muscles": whole, "no muscles": without(whole, "muscle")}
+        scenes = {"muscles": whole, "no muscles": without_muscles(whole)}
     if name == "hopper":
         scenes["rough ground"] = whole.with_terrain(rough(0))
     for num_envs in args.num_envs:

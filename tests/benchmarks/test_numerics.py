@@ -46,7 +46,7 @@ def test_every_task_has_been_measured_with_all_its_presets() -> None:
 
 def test_no_setting_that_is_as_fast_beats_a_preset_in_all_errors() -> None:
     """By a tenth: medians over 32 states have no more digits."""
-    for _, own in grouped(numerics.named(SETTINGS), "task").items():
+    for _, own in grouped(numerics.labelled(SETTINGS), "task").items():
         for preset in (row for row in own if row["preset"]):
             cost, errors = float(preset["us with gradient"]), [float(preset[name]) for name in ERRORS]
             for other in own:
