@@ -3,28 +3,19 @@
     python benchmarks/numerics.py                                  presets and extremes of all tasks
     python benchmarks/numerics.py ant --parts presets
     python benchmarks/numerics.py go2 examples/own_robot.xml --parts promise
-    python benchmarks/numerics.py ant --parts monitor
 
 Presets: all settings of a task, timed side by side on one thread. Extremes: the first value of each sweep with which an
 integrator fails. Promise: the setting chosen for an error of 0.01, and its error on 200 states of other episodes.
-Monitor: how long a replay takes, and in which iteration it warns of a training with 2 substeps and theta 1.
 Writes numerics_*.csv and a picture, and with --update-results the tables of docs/numerics.md.
 """
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
-from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, get_args
 
-import tables
 import torch
 import tyro
 from common import TASKS, CommonFlags, Line, Panel, Part, Tasks, measured, plot, run
@@ -33,25 +24,19 @@ from tables import Cells, Row, grouped
 import diffsim
 from diffsim.sim.integration import PASSES, Integration
 from diffsim.tasks import Accuracy, find_task
-from diffsim.training import Count, load_policy, parse
-from diffsim.training.checkpoint import POLICIES
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.monitor import Monitor
+from diffsim.training import Count
 from diffsim.tune import actor, subject
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row as Measured
 from diffsim.tune.front import choice, finest, measure, settings
 from diffsim.tune.motion import SPANS, Motion
 
-PartName = Literal["presets", "extremes", "promise", "monitor"]
+PartName = Literal["presets", "extremes", "promise"]
 ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again
 PROMISED = ("robot", "chosen", "error", "error on 200 others", "speed", "default's error")
 USUAL = f", {PASSES} passes"  # of all presets on MuJoCo's contact
 WIDE = 4  # panels in a row of the picture
 SHOWN = ("task", "preset", "setting", "speed", "state 0.5 s", "gradient 8", "gradient 32")
-TURNS, REPLAYS = 2, 20  # of trainings and of replays after each
-SEEDS, WARNING = 3, r"iteration (\d+): with \d+ times .* is (\S+) m or rad"  # of trainings that cheat
-CHEAT = "--integrator implicit --theta 1 --substeps 2".split()
 
 
 @dataclass
@@ -148,41 +133,6 @@ def promised(rows: list[Cells]) -> list[Row]:
     return [{name: row[name] for name in PROMISED} for row in rows]
 
 
-def train(task: str, *flags: object) -> tuple[float, str]:
-    """Of a training's first 99 iterations: seconds of one, and what it prints."""
-    with TemporaryDirectory() as folder:
-        words = [tables.ROOT / "shac.py", "--env", task, "--device", "cpu", "--eval-every", 0, "--save-every", 0]
-        words += ["--run-dir", folder, "--stop-after", 99, *flags]
-        done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, check=True)
-        seconds = [float(row["seconds"]) for row in tables.read_csv(Path(folder) / "progress.csv")]
-    return (seconds[-1] - seconds[len(seconds) // 2]) / (
-        len(seconds) - 1 - len(seconds) // 2
-    ), done.stdout + done.stderr
-
-
-def measure_monitor(args: Args, robot: str) -> Iterator[Row]:
-    """Iterations of trainings in turn with replays of the shipped policy, whose length depends on no policy."""
-    parsed = parse(ParallelFlags, ["--env", robot, "--device", "cpu"])
-    policy = load_policy(POLICIES / f"{robot}.pt").network
-    iterations, replays = list[float](), list[float]()
-    for _ in range(TURNS):
-        iterations.append(train(robot, "--monitor", 0)[0])
-        env = diffsim.make(robot, parsed.num_envs, seed=0)
-        env.reset(seed=0)
-        watch = Monitor(parsed, env)
-        for _ in range(REPLAYS):
-            begin = time.perf_counter()
-            watch.replay(policy)
-            replays.append(time.perf_counter() - begin)
-    iteration, replay = median(iterations), median(replays)
-    row: dict[str, object] = {"task": robot, "iteration (ms)": 1e3 * iteration, "replay (ms)": 1e3 * replay}
-    row["share"] = f"{replay / (parsed.monitor * iteration):.2%}"
-    found = [re.findall(WARNING, train(robot, "--seed", seed, *CHEAT)[1]) for seed in range(1, SEEDS + 1)]
-    row["seeds"], row["warned"] = SEEDS, sum(map(bool, found))
-    row |= {name: " ".join(each[0][k] for each in found if each) for k, name in enumerate(("at", "error"))}
-    yield row
-
-
 def draw(args: Args, rows: list[Cells]) -> None:
     panels = list[Panel]()
     for (task,), own in grouped((row for row in labelled(rows) if "float64" not in row["kind"]), "task").items():
@@ -202,7 +152,6 @@ PARTS: dict[PartName, Part] = {
     "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, presets),
     "extremes": Part("numerics_extremes", measure_extremes, ("task", "sweep"), "extremes", PAGE, bounds),
     "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", PAGE, promised),
-    "monitor": Part("numerics_monitor", measure_monitor, ("task",), "monitor", PAGE),
 }
 
 
