@@ -52,7 +52,7 @@ def page() -> str:
         doc = inspect.getdoc(thing) or ""
         doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
         doc = doc.split("\n\n")[0] if name in BRIEF else doc
-        call = "" if name in ("Scene", "Task") else f"({signature(thing)})"
+        call = "" if isinstance(thing, type) and name != "Integration" else f"({signature(thing)})"
         parts.append(f"## {name}\n\n```python\ndiffsim.{name}{call}\n```\n\n```text\n{doc}\n```\n")
         if kind and (rows := [*members(thing)]):
             parts.append("\n".join(["| member | meaning |", "|---|---|", *rows]) + "\n")
