@@ -37,13 +37,13 @@ def tune(
 
     Args:
         robot: a task, a file my_task.py, or an MJCF file robot.xml.
-        error: of the state after 0.5 s that is allowed: root mean square over joints [m, rad], median over states.
-        checkpoint: whose policy moves the robot; default the shipped one, or smooth random actions.
-        contact: soft or mujoco; default the task's own.
-        device: whose time is measured; errors are measured on the CPU.
-        states: start states.
-        csv: where all rows are written, too.
-        extremes: find also what each integrator withstands.
+        error: allowed error of the state after 0.5 s: root mean square over joints [m, rad], median over states.
+        checkpoint: policy that moves the robot. Default: the shipped one, or smooth random actions.
+        contact: soft or mujoco. Default: the task's.
+        device: device whose time is measured; errors are measured on the CPU.
+        states: number of start states.
+        csv: file to which all rows are written.
+        extremes: also find the values with which each integrator fails.
     """
     check_device(device)
     if not error > 0:
