@@ -35,7 +35,6 @@ PartName = Literal["presets", "extremes", "promise"]
 ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again
 PROMISED = ("robot", "chosen", "error", "error on 200 others", "speed", "default's error")
 USUAL = f", {PASSES} passes"  # of all presets on MuJoCo's contact
-WIDE = 4  # panels in a row of the picture
 SHOWN = ("task", "preset", "setting", "speed", "state 0.5 s", "gradient 8", "gradient 32")
 
 
@@ -142,9 +141,7 @@ def draw(args: Args, rows: list[Cells]) -> None:
             x, y = ([float(row[name]) for row in same] for name in ("us with gradient", "state 0.5 s"))
             lines.append(Line(x, y, f"C{k}.-", kind, 0.8, [row["preset"] for row in same]))
         panels.append(Panel(lines, task, "us of a control step", "error of the state after 0.5 s", log="xy"))
-    panels += [Panel([])] * (-len(panels) % WIDE)
-    grid = [panels[k : k + WIDE] for k in range(0, len(panels), WIDE)]
-    plot(args.picture("numerics"), grid or [[]], (3.2, 2.8))
+    plot(args.picture("numerics"), [panels], (3.2, 2.8))
 
 
 PAGE = "numerics.md"
