@@ -338,15 +338,15 @@ class Search:
         """The best policy by the reward that is optimised, with the same noise each time."""
         system, count, steps = self.system, self.args.eval_episodes, self.args.horizon
         noise = self.noise(count + 1, torch.Generator().manual_seed(SEED))
-        noise[0] = 0.0
+        noise[count] = 0.0
         rollouts = self.roll_out(self.network.theta, noise, self.guides[0].x[:1])
-        S, speed = rollouts.pick(slice(1, None)), None
+        S, speed = rollouts.pick(slice(count)), None
         if (forward := system.task.forward_column) is not None:
             speed = (S.x[:, -1, forward] - S.x[:, 0, forward]).mean().item() / (steps * system.control_dt)
         qpos, action = S.x[:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
         lengths, (mean, std), size = torch.full_like(S.source, steps), S.spread, action.abs().mean().item()
         others = dict(objective=mean, objective_std=std, worst=S.returns.min().item(), action=size)
-        others["without_noise"] = rollouts.returns[0].item()
+        others["without_noise"] = rollouts.returns[count].item()
         return Evaluation(S.returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
 
     @property
