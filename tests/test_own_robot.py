@@ -72,7 +72,7 @@ def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     diffsim_main(check[2:])
     assert "own_robot: can be simulated" in capsys.readouterr().out
     view.main(small(watch, run))
-    assert "run_forward, ppo_baseline.py, iteration 2" in capsys.readouterr().out and (home / "run.html").is_file()
+    assert "run_forward, ppo_baseline.py, iteration 2" in capsys.readouterr().out and (home / "run.mp4").is_file()
     ppo_baseline.main(small(judge, run))
     written = json.loads((run / "evaluation.json").read_text())
     assert len(written["returns"]) == 2 and written["speed"] is not None
