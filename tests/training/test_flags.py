@@ -22,7 +22,6 @@ import ppo_baseline
 import sac_baseline
 import sapo
 import shac
-from diffsim.tasks import Task
 from diffsim.training import checkpoint, flags, parse, ranges
 from diffsim.training.evaluation import make_env
 
@@ -192,16 +191,6 @@ def test_accuracy_and_penalty_are_stored_and_can_be_replaced():
     sim, numbers = simulator("--substeps", "16", "--integrator", "semi_implicit", "--penalty", "k_limit=100")
     assert numbers == ("semi_implicit", 16, 0.0)
     assert (set(sim.scene.k_limit), sim.scene.mu) == ({100.0}, diffsim.make("cartpole", 1).scene.mu)
-
-
-def test_a_preset_that_a_task_lacks_is_named(monkeypatch, capsys):
-    class Bare(Task):
-        name, substeps, contact = "bare", 8, "soft"
-
-    monkeypatch.setitem(diffsim.TASKS, "bare", Bare)
-    assert parse(shac.Args, ["--env", "bare"]).substeps == 8
-    line = refusal(lambda: parse(shac.Args, ["--env", "bare", "--accuracy", "fast"]), capsys)
-    assert "'bare' has no preset 'fast'" in line
 
 
 def test_what_a_checkpoint_decides(capsys):
