@@ -1,6 +1,6 @@
 """The results of docs/experiments.md as one list of cells: a learner on a task with a seed, trained to its end, alone.
 
-    python benchmarks/paper.py --check                             what is missing, and results of no known origin
+    python benchmarks/paper.py --check                             what is missing
     python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables
     python benchmarks/paper.py --learners sapo --train-only        on a machine that is lent: bring runs/paper home
     python benchmarks/paper.py --pace 100                          there, alone: the seconds of an iteration
@@ -260,7 +260,7 @@ def printed(args: Args, name: str) -> str:
 
 
 def check(args: Args) -> str:
-    """What is missing, a line for each learner and task; then csv files whose origin is unknown, or not in history."""
+    """What is missing, a line for each learner and task."""
     lines, missing, count = list[str](), dict[tuple[str, str, str], list[Cell]](), 0
     known = {name: read_cells(common.RESULTS / name) for name in {GROUPS[g].machine for g in args.only}}
     for cell in wanted(args):
@@ -272,9 +272,6 @@ def check(args: Args) -> str:
         lines.append(f"{each[0].machine}: {each[0].command.replace(f'--seed {each[0].seed}', f'--seed {{{seeds}}}')}")
     lines.append(f"{sum(map(len, missing.values()))} of {count} cells are missing")
     lines += [unrecorded] if (unrecorded := fingerprints.open_end()) else []
-    for path in sorted(common.RESULTS.glob("*/*.csv")):
-        if found := next((bad for origin in tables.origins(path) if (bad := tables.unknown(origin))), ""):
-            lines.append(f"{path.relative_to(common.RESULTS.parent)}: {found}")
     return "\n".join(lines)
 
 
