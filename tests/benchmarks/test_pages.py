@@ -9,7 +9,7 @@ from typing import Any
 import common
 import pytest
 
-MADE = "gradients", "joystick", "numerics", "robustness", "suites", "tracking", "transfer", "gps_controllers"
+MADE = "gradients", "joystick", "numerics", "suites", "tracking", "transfer", "gps_controllers"
 CASES = [*((name, "cpu", {}) for name in (*MADE, "gps_stability")), ("joystick", "cpu", {"race": True})]
 CASES += [("numerics", "cpu", {"parts": ("promise",)})]
 
