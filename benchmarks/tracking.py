@@ -12,11 +12,13 @@ training, and a motor the torque that the task's servo would have. Nothing else 
 
 Writes tracking.csv, a row for each policy and world, or with --race tracking_race.csv, of checkpoints that were copied
 beside their run's progress.csv while it trained; with --update-results also the tables of docs/tracking.md. Trainings
-that shared a GPU have a folder whose name ends with _shared: their seconds do not count.
+that shared a GPU have a folder whose name ends with _shared: their seconds do not count. What lies in a folder named
+ablation has a table of its own, by the runs' names.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,12 +118,30 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each policy of one motion: medians over seeds on the file's friction. In brackets and of pushes the
     least share over seeds and frictions."""
     lines = list[Row]()
-    for policy, group, plain in groups([row for row in rows if row["motions"] == "1"]):
+    for policy, group, plain in groups([row for row in rows if row["motions"] == "1" and not is_ablation(row)]):
         alone = [row for row in plain if "_shared/" not in row["checkpoint"]]
         calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
         lines.append(
             {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
             | {"training (s)": middle(alone, "training s", ".0f")}
+            | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
+            | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
+        )
+    return lines
+
+
+def is_ablation(row: dict[str, str]) -> bool:
+    return row["checkpoint"].startswith("ablation/")
+
+
+def ablation(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each variant: success by friction, with and without pushes, and errors on the file's friction."""
+    lines = list[Row]()
+    for (name,), group in grouped(filter(is_ablation, rows), "checkpoint").items():
+        calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
+        plain = [row for row in calm if float(row["friction"]) == 1]
+        lines.append(
+            {"variant": name.removeprefix("ablation/").replace("_", " "), "iterations": group[0]["iteration"]}
             | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
             | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
         )
@@ -146,7 +166,7 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
         group.sort(key=lambda row: float(row["training s"]))
         reached = (row["training s"] for row in group if float(row["success"]) >= ENOUGH)
         lines.append(
-            {"clip": clip, "learner": learner.replace(" --randomise", ""), "seed": seed}
+            {"clip": clip, "learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner), "seed": seed}
             | {f"s to {ENOUGH:.0%}": next(reached, "never"), "in all (s)": group[-1]["training s"]}
             | {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
         )
@@ -160,6 +180,7 @@ def main(args: Args) -> None:
         return
     rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
     args.publish("many", markdown(many(rows)), PAGE)
+    args.publish("ablation", markdown(ablation(rows)), PAGE)
 
 
 if __name__ == "__main__":

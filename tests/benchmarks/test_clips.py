@@ -65,15 +65,20 @@ def test_a_row_for_each_friction_and_a_line_for_each_clip() -> None:
     }
     (line,) = tracking.many([*rows, several, several | {"friction": "1.3"}])
     assert (line["motions"], line["success"], line["motions with 95%"]) == ("44", "90%", "40")
-    assert len(tracking.table([*rows, several])) == 1
+    variant = row | {"checkpoint": "ablation/horizon_8", "friction": "0.7", "success": "0.5", "iteration": "600"}
+    variants = [several, variant, variant | {"friction": "1", "success": "1"}, variant | {"push": "0.5"}]
+    assert len(tracking.table([*rows, *variants])) == 1
+    (line,) = tracking.ablation([*rows, *variants])
+    assert (line["variant"], line["success"], line["pushed"]) == ("horizon 8", "100% (50%)", "50%")
 
 
 def test_a_race_ends_with_the_first_checkpoint_that_succeeds() -> None:
-    row = dict(clip="walk", learner="sapo --randomise", seed="1") | {"joint error": "0.06"}
+    row = dict(clip="walk", learner="sapo --randomise --initial-log-std -2", seed="1") | {"joint error": "0.06"}
     rows = [row | {"training s": str(s), "success": share} for s, share in ((90, "1"), (20, "0.5"), (60, "0.96"))]
-    rows.append(row | {"learner": "ppo", "training s": "70", "success": "0.1"})
+    rows.append(row | {"learner": "ppo --initial-log-std -1 in mujoco_warp", "training s": "70", "success": "0.1"})
     sapo, ppo = tracking.race(rows)
     assert (sapo["learner"], sapo["s to 95%"], sapo["in all (s)"], sapo["last success"]) == ("sapo", "60", "90", "100%")
+    assert ppo["learner"] == "ppo in mujoco_warp"
     assert (ppo["s to 95%"], ppo["last success"]) == ("never", "10%")
 
 
