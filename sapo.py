@@ -50,7 +50,7 @@ INTEGRATION |= {name: Integration("implicit", 16) for name in ("humanoid", "huma
 # They fall before they learn to walk
 BALANCING: dict[str, dict[str, Any]] = {"g1": {"horizon": 16, "adjoint_clip": 5.0}, "g1_track": {"horizon": 16}}
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
-ON_CPU = {
+ON_CPU: dict[str, dict[str, Any]] = {
     "ant": {"iterations": 1500},
     "humanoid": {"critic_iterations": 4},
     "humanoid_mtu": {"critic_iterations": 4, "iterations": 1000},
