@@ -362,6 +362,8 @@ class Search:
         for name in ("guides", "adapted"):
             guides = [LinearGaussian(*(part.to(self.system.device) for part in guide)) for guide in state[name]]
             setattr(self, name, guides)
+        if (steps := len(self.guides[0].u)) != self.args.horizon:
+            raise ValueError(f"--horizon is {steps}")
         self.grounds = [self.system] * len(self.guides)
         self.rng.set_state(state["rng"])
 

@@ -350,7 +350,7 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
         ("--horizon 1", "--horizon must be from 2 to 1,000, not 1"),
         ("--guiding-samples 1", "--guiding-samples must be from 2 to 1,000, not 1"),
         ("--active 20", "--active must be at least 50, for the guides' and the policy's samples, not 20"),
-        ("--resume {trained}/checkpoint.pt --control-dt 0.02", "has --control-dt 0.016666666666666666, not 0.02"),
+        ("--resume {trained}/checkpoint.pt --control-dt 0.02", "has --control-dt 0.016666666666666666, which cannot "),
         ("--regularizer-bounds 1 0.1", "--regularizer-bounds must be two numbers in order"),
         ("--demonstration {file}.npz", "no such trajectory: {file}.npz"),
         ("--demonstration {file}", "{file} is not an .npz with qpos, qvel and action"),
@@ -364,7 +364,14 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
         ("--env ant", "--demonstration must be an example for ant; shipped are those of cartpole, hopper, "),
         ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
         ("--evaluate {file}", "{file} is not a complete checkpoint of gps.py"),
-        ("--resume {trained}/checkpoint.pt --hidden 9", "has --hidden 8, not 9"),
+        (
+            "--resume {trained}/checkpoint.pt --horizon 9 --iterations 9",
+            "does not fit the flags, or the script as it is now: ",
+        ),
+        (
+            "--resume {trained}/checkpoint.pt --hidden 9 --iterations 9",
+            "does not fit the flags, or the script as it is now: ",
+        ),
         ("--resume {trained}/checkpoint.pt", "is at iteration 4 already"),
     ],
 )

@@ -29,7 +29,8 @@ ClipFile = Annotated[
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
-FIXED = ("env", "seed", "num_envs")  # of a run that goes on or is evaluated; what else must fit, `restore` tells
+# Of a run that goes on or is evaluated; what else must fit, `restore` tells.
+FIXED = ("env", "seed", "num_envs", "control_dt")
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
