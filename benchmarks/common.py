@@ -249,16 +249,25 @@ def can_draw() -> bool:
     return False
 
 
+WIDE = 3  # panels in a row: their text can be read where a page shows 800 pixels
+
+
 def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] = (3.4, 2.9)) -> None:
-    """Draw rows of panels, each of a size in inches. Without matplotlib it says so, once, and draws nothing."""
+    """Draw rows of panels, each of a size in inches, in blocks of WIDE columns below each other.
+
+    Without matplotlib it says so, once, and draws nothing.
+    """
     if not grid[0] or not can_draw():
         return
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.ticker import LogLocator
 
-    figure = Figure(figsize=(len(grid[0]) * size[0], len(grid) * size[1]), layout="constrained")
-    axes = figure.subplots(len(grid), len(grid[0]), squeeze=False)
+    width = min(WIDE, len(grid[0]))
+    blocks = [row[k : k + width] for k in range(0, len(grid[0]), width) for row in grid]
+    grid = [[*row, *[Panel([])] * (width - len(row))] for row in blocks]
+    figure = Figure(figsize=(width * size[0], len(grid) * size[1]), layout="constrained")
+    axes = figure.subplots(len(grid), width, squeeze=False)
     legend: dict[str, Line2D] = {}
     for axis, panel in zip(axes.flat, chain(*grid), strict=True):
         axis.set_visible(bool(panel.lines))
@@ -266,19 +275,19 @@ def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] 
             (drawn,) = axis.plot(line.x, line.y, line.style, linewidth=line.width, markersize=4)
             legend |= {line.label: drawn} if line.label else {}
             for x, y, note in zip(line.x, line.y, line.notes, strict=False):
-                axis.annotate(note, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6)
+                axis.annotate(note, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=8)
         axis.set(xlabel=panel.x, ylabel=panel.y)
         axis.set(xscale="log" if "x" in panel.log else "linear", yscale="log" if "y" in panel.log else "linear")
-        if "x" in panel.log:
+        if "x" in panel.log and np.log10(np.divide(*axis.get_xlim()[::-1])) < 3:  # decades: room for more labels
             axis.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
             axis.xaxis.set_major_formatter("{x:g}")
             axis.xaxis.set_minor_formatter("{x:g}")
         axis.set_title(panel.title, fontsize=10)
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
-    columns = max(1, round(len(grid[0]) * size[0] / 1.8))
+    columns = max(1, int(width * size[0] / (0.5 + 0.08 * max(map(len, legend), default=1))))  # inches
     if legend:
-        figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=8)
+        figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     print(path)

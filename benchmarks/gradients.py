@@ -33,7 +33,7 @@ GROUNDS: dict[str, dict[str, Any]] = {  # by their names in the csv file
     "mujoco": {"contact": "mujoco"},
     "mujoco --no-touchdown": {"contact": "mujoco", "touchdown": False},
 }
-SHOWN = *(f"cosine, {k} steps" for k in (4, 8, 16)), "clipped, 16 steps", "norm 95 %, 16 steps"
+SHOWN = tuple(f"cosine, {k} steps" for k in (4, 8, 16))
 NOISE, SHIFT = 0.3, 0.05  # standard deviation of the noise on the actions; their shift in either direction
 AGREE = 0.9  # least cosine of differences by SHIFT and by half of it, for which the page shows others
 KEY = ("task", "learner", "horizon", "ground")
@@ -110,8 +110,7 @@ def shown(rows: list[dict[str, str]]) -> list[Row]:
     lines = list[Row]()
     for (task, ground), own in grouped([row for row in rows if row["ground"] != "soft"], "task", "ground").items():
         agree = [row for row in own if float(row["differences"]) > AGREE]
-        cells = {f"{name}, {row['horizon']} steps": row[name] for row in agree for name in ("cosine", "clipped")}
-        cells |= {f"norm 95 %, {row['horizon']} steps": row["norm 95 %"] for row in own}
+        cells = {f"cosine, {row['horizon']} steps": row["cosine"] for row in agree}
         lines.append({"task": task, "ground": ground} | {name: cells.get(name, "") for name in SHOWN})
     return lines
 

@@ -3,54 +3,39 @@
     python benchmarks/numerics.py                                  presets and extremes of all tasks
     python benchmarks/numerics.py ant --parts presets
     python benchmarks/numerics.py go2 examples/own_robot.xml --parts promise
-    python benchmarks/numerics.py ant --parts monitor
 
 Presets: all settings of a task, timed side by side on one thread. Extremes: the first value of each sweep with which an
 integrator fails. Promise: the setting chosen for an error of 0.01, and its error on 200 states of other episodes.
-Monitor: how long a replay takes, and in which iteration it warns of a training with 2 substeps and theta 1.
 Writes numerics_*.csv and a picture, and with --update-results the tables of docs/numerics.md.
 """
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
-from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, get_args
 
-import tables
+import torch
 import tyro
 from common import TASKS, CommonFlags, Line, Panel, Part, Tasks, measured, plot, run
 from tables import Cells, Row, grouped
 
 import diffsim
-from diffsim.sim.integration import PASSES
+from diffsim.sim.integration import PASSES, Integration
 from diffsim.tasks import Accuracy, find_task
-from diffsim.training import Count, load_policy, parse
-from diffsim.training.checkpoint import POLICIES
-from diffsim.training.flags import ParallelFlags
-from diffsim.training.monitor import Monitor
+from diffsim.training import Count
 from diffsim.tune import actor, subject
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row as Measured
-from diffsim.tune.front import Setting, choice, finest, measure, settings
+from diffsim.tune.front import choice, finest, measure, settings
 from diffsim.tune.motion import SPANS, Motion
 
-PartName = Literal["presets", "extremes", "promise", "monitor"]
+PartName = Literal["presets", "extremes", "promise"]
 ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again
 PROMISED = ("robot", "chosen", "error", "error on 200 others", "speed", "default's error")
 USUAL = f", {PASSES} passes"  # of all presets on MuJoCo's contact
-WIDE = 4  # panels in a row of the picture
 SHOWN = ("task", "preset", "setting", "speed", "state 0.5 s", "gradient 8", "gradient 32")
-TURNS, REPLAYS = 2, 20  # of trainings and of replays after each
-SEEDS, WARNING = 3, r"iteration (\d+): with \d+ times .* is (\S+) m or rad"  # of trainings that cheat
-CHEAT = "--integrator implicit --theta 1 --substeps 2".split()
 
 
 @dataclass
@@ -71,28 +56,38 @@ def motion_of(robot: str, states: int, seed: int = 0) -> Motion:
     return Motion(env, actor(robot, task, None)[0], seed)
 
 
+def kind(how: Integration) -> str:
+    """What it shares with those of other substeps."""
+    newton = f" to {how.tolerance:g}, {how.passes} passes"
+    return how.integrator + {"mujoco": newton, "implicit": f" {how.theta:g}"}.get(how.integrator, "")
+
+
+def named(how: Integration) -> str:
+    return f"{kind(how)}, {how.substeps} substeps"
+
+
 def measure_presets(args: Args, robot: str) -> Iterator[Row]:
     task, rows = subject(robot), list[Measured]()
     measure(motion_of(robot, args.states), settings(task, task.contact), rows, threads=1)
     for row in rows:
-        yield {"task": task.name, "setting": row.setting, "kind": row.setting.kind, **row.numbers}
+        yield {"task": task.name, "setting": named(row.how), "kind": kind(row.how), **row.numbers}
 
 
-def named(rows: list[Cells]) -> list[Cells]:
+def labelled(rows: list[Cells]) -> list[Cells]:
     """The rows, by task, with the name of the preset that has this setting, and the speed relative to the default."""
     lines = list[Cells]()
     for (task,), own in grouped(rows, "task").items():
-        names = {str(Setting(how)): name for name, how in find_task(task).presets().items()}
-        labelled = [row | {"preset": names.get(row["setting"], "")} for row in own]
-        (default,) = (float(row["us with gradient"]) for row in labelled if row["preset"] == "default")
-        lines += [row | {"speed": f"{default / float(row['us with gradient']):.2f}"} for row in labelled]
+        names = {named(how): name for name, how in find_task(task).presets().items()}
+        own = [row | {"preset": names.get(row["setting"], "")} for row in own]
+        (default,) = (float(row["us with gradient"]) for row in own if row["preset"] == "default")
+        lines += [row | {"speed": f"{default / float(row['us with gradient']):.2f}"} for row in own]
     return lines
 
 
 def presets(rows: list[Cells]) -> list[Row]:
     """A line for each preset, by task, the fastest first."""
     lines = sorted(
-        (row for row in named(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
+        (row for row in labelled(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
     )
     lines = [row | {"setting": row["setting"].replace(USUAL, "").removesuffix(" substeps")} for row in lines]
     return [{name: row[name] for name in SHOWN} for own in grouped(lines, "task").values() for row in own]
@@ -100,8 +95,9 @@ def presets(rows: list[Cells]) -> list[Row]:
 
 def measure_extremes(args: Args, robot: str) -> Iterator[Row]:
     task = subject(robot)
-    for row in stress(motion_of(robot, 8), task, dict.fromkeys((task.contact, "mujoco"))):
-        yield {"task": task.name} | row
+    contacts, motion = dict.fromkeys((task.contact, "mujoco")), motion_of(robot, 8)
+    for found in zip(*(stress(motion, task, contact) for contact in contacts), strict=True):
+        yield {"task": task.name} | {name: cell for row in found for name, cell in row.items()}
 
 
 def bounds(rows: list[Cells]) -> list[Row]:
@@ -122,15 +118,12 @@ def measure_promise(args: Args, robot: str) -> Iterator[Row]:
     task, rows = subject(robot), list[Measured]()
     found = settings(task, task.contact)
     measure(motion_of(robot, args.states), found, rows, threads=1)
-    default = next(row for row in rows if row.setting == Setting(task.integration("default")))
+    default = next(row for row in rows if row.how == task.integration("default"))
     best, others = choice(rows, ERROR), motion_of(robot, OTHERS, seed=1)
     assert best is not None, "no setting is good enough"
-    again = others.error(others.replay(best.setting), others.replay(finest(found)), SPANS[-1])
-    row: dict[str, object] = {
-        "robot": Path(robot).stem,
-        "chosen": f"{best.setting.kind}, {best.setting.integration.substeps}",
-    }
-    row |= {"default": f"{default.setting.kind}, {default.setting.integration.substeps}"}
+    again = others.error(others.replay(best.how), others.replay(finest(found), torch.float64), SPANS[-1])
+    row: dict[str, object] = {"robot": Path(robot).stem}
+    row |= {what: named(each.how).removesuffix(" substeps") for what, each in (("chosen", best), ("default", default))}
     row |= {"error": best.error, "error on 200 others": again, "times 0.01": again / ERROR}
     yield row | {"speed": default.cost / best.cost, "default's error": default.error}
 
@@ -139,53 +132,16 @@ def promised(rows: list[Cells]) -> list[Row]:
     return [{name: row[name] for name in PROMISED} for row in rows]
 
 
-def train(task: str, *flags: object) -> tuple[float, str]:
-    """Of a training's first 99 iterations: seconds of one, and what it prints."""
-    with TemporaryDirectory() as folder:
-        words = [tables.ROOT / "shac.py", "--env", task, "--device", "cpu", "--eval-every", 0, "--save-every", 0]
-        words += ["--run-dir", folder, "--stop-after", 99, *flags]
-        done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, check=True)
-        seconds = [float(row["seconds"]) for row in tables.read_csv(Path(folder) / "progress.csv")]
-    return (seconds[-1] - seconds[len(seconds) // 2]) / (
-        len(seconds) - 1 - len(seconds) // 2
-    ), done.stdout + done.stderr
-
-
-def measure_monitor(args: Args, robot: str) -> Iterator[Row]:
-    """Iterations of trainings in turn with replays of the shipped policy, whose length depends on no policy."""
-    parsed = parse(ParallelFlags, ["--env", robot, "--device", "cpu"])
-    policy = load_policy(POLICIES / f"{robot}.pt").network
-    iterations, replays = list[float](), list[float]()
-    for _ in range(TURNS):
-        iterations.append(train(robot, "--monitor", 0)[0])
-        env = diffsim.make(robot, parsed.num_envs, seed=0)
-        env.reset(seed=0)
-        watch = Monitor(parsed, env)
-        for _ in range(REPLAYS):
-            begin = time.perf_counter()
-            watch.replay(policy)
-            replays.append(time.perf_counter() - begin)
-    iteration, replay = median(iterations), median(replays)
-    row: dict[str, object] = {"task": robot, "iteration (ms)": 1e3 * iteration, "replay (ms)": 1e3 * replay}
-    row["share"] = f"{replay / (parsed.monitor * iteration):.2%}"
-    found = [re.findall(WARNING, train(robot, "--seed", seed, *CHEAT)[1]) for seed in range(1, SEEDS + 1)]
-    row["seeds"], row["warned"] = SEEDS, sum(map(bool, found))
-    row |= {name: " ".join(each[0][k] for each in found if each) for k, name in enumerate(("at", "error"))}
-    yield row
-
-
 def draw(args: Args, rows: list[Cells]) -> None:
     panels = list[Panel]()
-    for (task,), own in grouped((row for row in named(rows) if "float64" not in row["kind"]), "task").items():
+    for (task,), own in grouped((row for row in labelled(rows) if "float64" not in row["kind"]), "task").items():
         lines = list[Line]()
         for k, ((kind,), same) in enumerate(grouped(own, "kind").items()):
             same = sorted(same, key=lambda row: float(row["us with gradient"]))
             x, y = ([float(row[name]) for row in same] for name in ("us with gradient", "state 0.5 s"))
             lines.append(Line(x, y, f"C{k}.-", kind, 0.8, [row["preset"] for row in same]))
         panels.append(Panel(lines, task, "us of a control step", "error of the state after 0.5 s", log="xy"))
-    panels += [Panel([])] * (-len(panels) % WIDE)
-    grid = [panels[k : k + WIDE] for k in range(0, len(panels), WIDE)]
-    plot(args.picture("numerics"), grid or [[]], (3.2, 2.8))
+    plot(args.picture("numerics"), [panels], (3.2, 2.8))
 
 
 PAGE = "numerics.md"
@@ -193,7 +149,6 @@ PARTS: dict[PartName, Part] = {
     "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, presets),
     "extremes": Part("numerics_extremes", measure_extremes, ("task", "sweep"), "extremes", PAGE, bounds),
     "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", PAGE, promised),
-    "monitor": Part("numerics_monitor", measure_monitor, ("task",), "monitor", PAGE),
 }
 
 

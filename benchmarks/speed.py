@@ -1,11 +1,8 @@
-"""How fast the simulator and a whole training iteration are, against MuJoCo's C step on the same model in the same run.
+"""How fast the simulator is, against MuJoCo's C step on the same model in the same run.
 
     python benchmarks/speed.py                                every task, 64 and 256 environments
     python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
     python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
-    python benchmarks/speed.py --parts training --env ant -- --contact mujoco    what follows "--" goes to the script
-    python benchmarks/speed.py --parts training --script pfpn -- --policy gaussian
-    python benchmarks/speed.py --parts memory --env ant humanoid_mtu    the most that a script takes
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
 A machine that does something else meanwhile gives wrong numbers.
@@ -13,28 +10,20 @@ A machine that does something else meanwhile gives wrong numbers.
 
 from __future__ import annotations
 
+import dataclasses
 import gc
-import json
-import math
-import os
-import re
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from statistics import median
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import mujoco
 import torch
 import tyro
-from cells import ScriptFlags
-from common import TASKS, Panel, Part, TaskName, lines, measured, plot, run
-from tables import ROOT, Row, read_csv
+from common import TASKS, CommonFlags, Panel, Part, TaskName, lines, measured, plot, run
+from tables import Row
 
 import diffsim
 from diffsim import Scene, Simulator
@@ -43,27 +32,22 @@ from diffsim.sim.launcher import TooLargeError, available_cores
 from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
 from diffsim.tune.front import clock
-from diffsim.tune.motion import without
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
 GRAPHS = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"  # of a GPU
-PartName = Literal["physics", "scaling", "training", "memory"]
+PartName = Literal["physics", "scaling"]
 SCALING = (64, 256, 1024, 4096, 16384, 65536)  # environments of the scaling table, at a horizon of 32
 HORIZONS = (1, 4, 8, 16, 32, 64, 128)  # its horizons, at 64 environments
-WARMUP = 3  # iterations of the training table that are not counted
 
 
 @dataclass
-class Args(ScriptFlags):
+class Args(CommonFlags):
     env: Annotated[tuple[TaskName | Robot, ...], tyro.conf.arg(aliases=["--env-id"])] = TASKS  # type: ignore[assignment]
-    device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
-    parts: tuple[PartName, ...] = ("physics", "training")  # tables to measure
-    num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table (training uses the task's own)
+    parts: tuple[PartName, ...] = ("physics",)  # tables to measure
+    num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts
     repeats: Count = 5  # turns of all competitors in each state; the fastest counts, the others were disturbed
-    script: str = "shac"  # script of the training table, in the repository's root, without .py
-    iterations: Count = 27  # iterations of the training table, after three that are not counted
 
 
 # A control step ------------------------------------------------------------------------------------------------------
@@ -136,6 +120,11 @@ def race(competitors: Mapping[K, Callable[[State], Times]], states: Sequence[Sta
     return {key: {what: median(t[what] for t in times) for what in times[0]} for key, times in found.items()}
 
 
+def without_muscles(scene: Scene) -> Scene:
+    names = "segment_link segment_position segment_muscle".split()
+    return dataclasses.replace(scene, **{name: getattr(scene, name)[:0] for name in names})
+
+
 def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     """Beside MuJoCo: without its muscles, if a task has any; the hopper also on rough ground.
 
@@ -146,7 +135,7 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
     if "muscle" in whole.features:
-        scenes = {"muscles": whole, "no muscles": without(whole, "muscle")}
+        scenes = {"muscles": whole, "no muscles": without_muscles(whole)}
     if name == "hopper":
         scenes["rough ground"] = whole.with_terrain(rough(0))
     for num_envs in args.num_envs:
@@ -240,68 +229,9 @@ def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:
     plot(args.picture("speed"), [panels], (4.5, 3.6))
 
 
-# Trainings -----------------------------------------------------------------------------------------------------------
-
-
-class Trial(NamedTuple):
-    """A script's run in a process of its own, without evaluations."""
-
-    first: float  # s from its start to the end of its first iteration
-    memory: float  # GiB: the most that its process takes on a CPU, or that others lack on a GPU
-    about: dict[str, object]
-    progress: list[dict[str, str]]
-
-
-def trial(args: Args, name: TaskName, iterations: int, *flags: object, **environment: str) -> Trial:
-    free, first, most = torch.cuda.mem_get_info()[0] if args.device != "cpu" else 0, math.inf, 0
-    with tempfile.TemporaryDirectory() as run:
-        words = f"--env {name} --device {args.device} --quiet --eval-every 0 --stop-after {iterations} --run-dir {run}"
-        script = str(ROOT / f"{args.script}.py")
-        command = [sys.executable, script, *words.split(), *map(str, flags), *args.arguments]
-        began = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | environment)
-        while process.poll() is None:
-            if first == math.inf and read_csv(Path(run, "progress.csv")):
-                first = time.perf_counter() - began
-            status = Path(f"/proc/{process.pid}/status").read_text()  # a process that has ended has no such line
-            resident = re.search(r"VmHWM:\s+(\d+) kB", status)
-            used = free - torch.cuda.mem_get_info()[0] if free else 1024 * int(resident[1] if resident else 0)
-            most = max(most, used)
-            time.sleep(0.01)
-        if process.returncode:
-            fail(f"{' '.join(command)} failed")
-        num_envs = json.loads(Path(run, "args.json").read_text())["num_envs"]
-        about = {"task": name, "environments": num_envs, "script": " ".join((args.script, *args.arguments))}
-        return Trial(first, most / 2**30, about, read_csv(Path(run, "progress.csv")))
-
-
-def measure_memory(args: Args, name: TaskName) -> Iterator[Row]:
-    found = trial(args, name, 3)
-    yield found.about | {"memory (GiB)": found.memory}
-
-
-def measure_training(args: Args, name: TaskName) -> Iterator[Row]:
-    """Iterations of a script, begun with no kernel compiled and with all of them."""
-    techniques = {technique: ["--threads", threads] for technique, threads in THREADS.items()}
-    if args.device != "cpu":
-        techniques = {"cuda graph": [], "cuda, eager": ["--no-cuda-graph"]}
-    last = args.iterations + WARMUP
-    for technique, flags in techniques.items():
-        flags += ["--iterations", last + 1, "--save-every", 0]
-        with tempfile.TemporaryDirectory() as cache:
-            cold, warm = (trial(args, name, count, *flags, WARP_CACHE_PATH=cache) for count in (1, last))
-        progress = warm.progress[WARMUP:]
-        critic = [1e3 * float(row["time_update_critic"]) for row in progress if "time_update_critic" in row]
-        row = warm.about | {"device": technique, "critic": median(critic) if critic else ""}
-        row["iteration (ms)"] = 1e3 * median(float(row["time_total"]) for row in progress)
-        yield row | {"start to first iteration (s)": warm.first, "start with nothing compiled (s)": cold.first}
-
-
 PARTS: dict[PartName, Part] = {
     "physics": Part("speed_physics", measure_physics, ("task", "environments", "scene", "kernel", "device")),
     "scaling": Part("speed_scaling", measure_scaling, ("task", "environments", "horizon", "technique")),
-    "training": Part("speed_training", measure_training, ("task", "environments", "device", "script")),
-    "memory": Part("speed_memory", measure_memory, ("task", "script"), "speed_memory", "performance.md"),
 }
 
 

@@ -31,8 +31,8 @@ from tables import Row, grouped, middle, numbers
 from worlds import Here, Motion, MuJoCo, World, travel
 
 import diffsim
-from diffsim import DiffEnv, Integration, Scene, Simulator
-from diffsim.training import Count, Positive, fail, gait
+from diffsim import DiffEnv, Integration, Simulator
+from diffsim.training import Count, Positive, fail
 from diffsim.training.checkpoint import HOME
 from diffsim.training.evaluation import FINER
 
@@ -53,21 +53,6 @@ def speed(motion: Motion, control_dt: float, forward: int) -> float:
     return float((np.take_along_axis(x, motion.lengths[None], 0)[0] - x[0]).sum() / (control_dt * motion.lengths.sum()))
 
 
-def penetration(motion: Motion, scene: Scene) -> float | str:
-    """Median depth of the feet that touch the ground, mm; a foot is a body at the end of a limb. Empty in flight."""
-    if "contact" not in scene.features:
-        return ""
-    frames = np.arange(1, len(motion.qpos))[:, None] <= motion.lengths  # the states after each step
-    depth, body, parents = (
-        gait.trace(scene, motion.qpos[1:][frames])[0],
-        gait.contact_bodies(scene),
-        scene.mj_model.body_parentid,
-    )
-    feet = [depth[:, body == k].max(1) for k in np.unique(body) if k not in parents and parents[k]]
-    touching = [foot[foot > 0] for foot in feet]
-    return float(1e3 * np.median(np.concatenate(touching))) if any(map(len, touching)) else ""
-
-
 def summary(motion: Motion, env: DiffEnv) -> dict[str, object]:
     """The csv's columns of one motion."""
     column = env.task.forward_column
@@ -75,7 +60,6 @@ def summary(motion: Motion, env: DiffEnv) -> dict[str, object]:
         "return": float(np.median(motion.returns)),
         "speed": "" if column is None else speed(motion, env.control_dt, column),
         "whole": float((~motion.fallen).mean()),
-        "penetration": penetration(motion, env.scene),
     }
 
 
@@ -125,9 +109,9 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task, contact and learner, over its seeds: medians of the speed in each world in m/s, or of the
-    return of a robot that does not travel, what is kept of the training's own speed in the world that judges, mean
-    shares of whole episodes here and in MuJoCo, medians of the feet's penetration.
+    """A line for each task, contact and learner, over its seeds: medians of the speed in m/s, or of the return of a
+    robot that does not travel; what is kept of the training's own speed in the other simulator, the median and the
+    worst; mean shares of whole episodes here and in MuJoCo.
 
     Runs that are not named {learner}/{task}__{seed} have a line each.
     """
@@ -138,36 +122,22 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     rows = sorted(rows, key=lambda row: (tasks.index(row["task"]), row["contact"] != "soft"))
     names, lines = {row["condition"] for row in rows}, list[Row]()
     worlds = sorted((name for name in names if name.startswith("MuJoCo x")), key=lambda name: float(name[8:]))
-    for (task, contact, learner, home), own in grouped(rows, "task", "contact", "learner", "trained in").items():
+    for (task, _, learner, home), own in grouped(rows, "task", "contact", "learner", "trained in").items():
         group = {name: found for (name,), found in grouped(own, "condition").items()}
-        here, there = group["here"], group.get("MuJoCo x1", [])
-        unit = ("speed", ".2f") if here[0]["speed"] else ("return", ".0f")
-        trained, judge = ("here", "MuJoCo x1") if home == HOME else (home, "here")
-        kept = numbers(group.get(judge, []), "kept")
+        unit = ("speed", ".2f") if group["here"][0]["speed"] else ("return", ".0f")
+        kept = numbers(group.get("MuJoCo x1" if home == HOME else "here", []), "kept")
         shares = [mean(numbers(group[name], "whole")) for name in ("here", *worlds) if name in group]
         lines.append(
-            {"task": task, "contact": contact, "learner": learner, "seeds": len(here)}
-            | {name: middle(group.get(name, []), *unit) for name in ("here", *({SAME} & names), *worlds)}
-            | {"trained in": trained, "judged in": judge}
-            | {"kept": f"{median(kept):.0%}" if kept else "", "worst": f"{min(kept):.0%}" if kept else ""}
-            | {"whole": " / ".join(f"{share:.0%}" for share in shares)}
-            | {"depth here": middle(here, "penetration", ".1f"), "depth MuJoCo x1": middle(there, "penetration", ".1f")}
+            {"task": task, "learner": learner, "seeds": len(group["here"])}
+            | {name: middle(group.get(name, []), *unit) for name in ("here", "MuJoCo x1")}
+            | {"retained (worst)": f"{median(kept):.0%} ({min(kept):.0%})" if kept else ""}
+            | {"episodes without a fall": " / ".join(f"{share:.0%}" for share in shares)}
         )
     return lines
 
 
-def shown(rows: list[dict[str, str]]) -> list[Row]:
-    """The lines of the page."""
-    lines = list[Row]()
-    for line in table(rows):
-        retained = f"{line['kept']} ({line['worst']})" if line["kept"] else ""
-        cells = {name: line[name] for name in ("task", "learner", "seeds", "here", "MuJoCo x1")}
-        lines.append(cells | {"retained (worst)": retained, "episodes without a fall": line["whole"]})
-    return lines
-
-
 def main(args: Args) -> None:
-    measured(args, Part("transfer", measure, (*ABOUT[:-1], "condition"), "transfer", "transfer.md", shown))
+    measured(args, Part("transfer", measure, (*ABOUT[:-1], "condition"), "transfer", "transfer.md", table))
 
 
 if __name__ == "__main__":

@@ -139,7 +139,7 @@ def make(
     asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance, touchdown=touchdown)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
     if penalty and integration.constrained:
-        raise ValueError("penalty: constants of springs and dampers, which the integrator mujoco has not")
+        raise ValueError("penalty sets constants of the penalty law, but the contact is mujoco")
     scene = scene.with_penalty(penalty or {})
     scene = scene if terrain is None else scene.with_terrain(terrain)
     episodes: Any = dict(stochastic_init=stochastic_init, early_termination=early_termination)

@@ -1,4 +1,4 @@
-"""What is installed and what is missing, without a command: tasks, devices, versions, hints about usual troubles."""
+"""Without a command: tasks, devices and versions, what is missing, and hints."""
 
 from __future__ import annotations
 
@@ -58,7 +58,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None:
-    """Film a policy that comes with the package, as .mp4 or .gif; needs no display."""
+    """Film a shipped policy; needs no display.
+
+    Args:
+        task: name of a task.
+        output: video to write, .mp4 or .gif.
+    """
     policy = shipped(find_task(task).name)
     render.check_video(output)
     render.check_opengl()
@@ -74,23 +79,23 @@ def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None
 
 
 def shipped(task: str) -> Path:
-    """The policy of a task that comes with the package."""
+    """The shipped policy of a task."""
     there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
     if task not in there:
-        fail(f"no policy of {task} comes with this version; there are: {', '.join(there) or 'none'}")
+        fail(f"no policy for {task} is shipped; there are: {', '.join(there) or 'none'}")
     return POLICIES / f"{task}.pt"
 
 
 def drive(
     robot: Positional[str] = "go2", checkpoint: Path | None = None, host: str = "127.0.0.1", port: int = 8080
 ) -> None:
-    """Drive a robot from a page of your browser, with keys, a gamepad and the mouse; needs no display.
+    """Drive a robot in your browser with keys, a gamepad and the mouse; needs no display.
 
     Args:
-        robot: a task whose policy comes with the package, or that of the checkpoint, by its name or file.
-        checkpoint: of any script.
-        host: where the page is served: 0.0.0.0 lets other machines drive, too.
-        port: of the page; 0 takes a free one.
+        robot: name or file of a task.
+        checkpoint: policy of any script. Default: the shipped one.
+        host: address of the page; 0.0.0.0 lets other machines drive, too.
+        port: port of the page; 0 takes a free one.
     """
     from diffsim.view.drive import KEYS, serve
 
@@ -109,20 +114,20 @@ def drive(
 
 
 def train(learner: Positional[str]) -> None:
-    """Train with a learner of the package: diffsim train shac --env ant, and --help for its flags."""
+    """Train: diffsim train shac --env ant. `diffsim train shac --help` lists the learner's flags."""
 
 
 def view() -> None:
-    """Show a run as video or page: diffsim view runs/<run> --web ant.html, and --help for its flags."""
+    """Show a run as video or page: diffsim view runs/<run> --web ant.html. `diffsim view --help` lists flags."""
 
 
 def check(robot: Positional[Path], contact: Contact = "mujoco", seconds: float = 20.0) -> None:
-    """Say what of an MJCF file is used, approximated and refused; exit code 1 if it is refused.
+    """List what of an MJCF file is simulated, approximated and refused; the exit code is 1 if it is refused.
 
     Args:
-        robot: the file.
-        contact: that of your task; soft contact needs constants that the file names.
-        seconds: how long to read it at most: a file of few lines may hold millions of bodies.
+        robot: MJCF file.
+        contact: contact model of your task; soft needs constants in the file.
+        seconds: time limit, because a file of few lines may define millions of bodies.
     """
     alarm = threading.Timer(seconds, _give_up, (robot, seconds))
     alarm.daemon = True
@@ -140,16 +145,18 @@ def check(robot: Positional[Path], contact: Contact = "mujoco", seconds: float =
 
 def _give_up(robot: Path, seconds: float) -> None:
     """MuJoCo's compiler heeds no signal."""
-    print(f"Cannot be simulated.\n\n{robot}: it is not read in {seconds:g} s; --seconds allows more", flush=True)
+    print(f"Cannot be simulated.\n\n{robot} could not be read within {seconds:g} s; --seconds allows more", flush=True)
     os._exit(1)
 
 
 def export(checkpoint: Positional[Path], output: Positional[Path], env: str | None = None, half: bool = False) -> None:
-    """Write only the policy of a checkpoint: OUTPUT.pt for this package, or OUTPUT.onnx for other programs.
+    """Write only the policy of a checkpoint, for diffsim (.pt) or for other programs (.onnx).
 
     Args:
-        env: file of the task, if it is your own and the output is .onnx: it is run.
-        half: of OUTPUT.pt, round the weights to 16 bits: half the size.
+        checkpoint: file of any script.
+        output: file to write, .pt or .onnx.
+        env: file of your own task, for .onnx; its code runs.
+        half: round the weights of a .pt file to 16 bits, which halves its size.
     """
     saved = load_policy(checkpoint)
     with render.whole_file(output) as part:

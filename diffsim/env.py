@@ -233,7 +233,7 @@ class DiffEnv(VectorEnv):
     def _mask(self, options: dict[str, Any]) -> Tensor:
         """The environments that reset's options name; raises ValueError for other options."""
         if not isinstance(options, Mapping) or options.keys() != {"reset_mask"}:
-            raise ValueError(f"options are {options!r}, must be a dictionary of reset_mask alone")
+            raise ValueError(f"options are {options!r}, must be a dictionary with only reset_mask")
         mask = options["reset_mask"]
         mask = torch.as_tensor(mask) if isinstance(mask, np.ndarray | Tensor) else torch.empty(0)
         if mask.dtype != torch.bool or mask.shape != (self.num_envs,):

@@ -353,6 +353,44 @@ def test_slips_and_impacts_converge_to_mujocos(friction, speed, rng):
     check_gradients(scene, [x[:8] for x in states], rng, enough=0.9)
 
 
+THROWN = """<mujoco><option timestep="0.002" cone="elliptic" iterations="2000" tolerance="0" ls_iterations="500"
+ls_tolerance="1e-14"/><worldbody><geom type="plane" size="0 0 1"/><body pos="0 0 .5"><freejoint/>
+<geom type="sphere" size=".2" mass="{root}"/><body pos="0 0 -.25"><joint axis="0 1 0" range="-60 60"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.2" size=".03" mass="{link}" friction="{friction}"/><body pos="0 0 -.2">
+<joint axis="1 0 0" range="-30 30"/><geom type="sphere" size=".05" mass="{link}" friction="{friction}"/>
+</body></body></body></worldbody></mujoco>"""
+MASSES = (1.0, 1.0), (1e2, 1e-2), (1e4, 1e-4), (1e5, 1e-4), (1e-4, 1e-4), (3e5, 3e5)  # kg, of root and of links
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("root, link, friction", [*((*m, 1.0) for m in MASSES), (1.0, 1.0, 0.0), (1.0, 1.0, 100.0)])
+@pytest.mark.parametrize("speed, depth", [(1.0, 0.01), (10.0, 0.05), (100.0, 0.1), (1000.0, 0.3)])  # m/s, rad/s; m
+def test_light_and_heavy_links_are_thrown_into_the_ground_as_in_mujoco(root, link, friction, speed, depth, rng):
+    """None is contained. Of the largest velocity and its change, errors are small in float64, solved to the end, and in
+    float32 to the default tolerance."""
+    scene, states = parse(THROWN.format(root=root, link=link, friction=friction)), []
+    model, data = scene.mj_model, mujoco.MjData(scene.mj_model)
+    for _ in range(16):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv) * ([0] * 3 + [0.1] * 5), 1.0)
+        data.qpos[7:] = rng.uniform(-0.7, 0.7, 2)
+        mujoco.mj_kinematics(model, data)
+        lowest = min(data.geom_xpos[1, 2] - 0.2, data.geom_xpos[3, 2] - 0.05)
+        data.qpos[2] -= lowest + rng.uniform(0, depth)
+        data.qvel[:] = rng.normal(size=model.nv) * speed
+        start = data.qpos.copy(), data.qvel.copy()
+        mujoco.mj_step(model, data)
+        states.append((*start, data.qvel.copy()))
+    qpos, qvel, expected = (np.stack(parts) for parts in zip(*states, strict=True))
+    scale = abs(expected).max(1) + abs(expected - qvel).max(1)
+    exact = Integration("mujoco", 1, passes=300, tolerance=1e-13)
+    for dtype, how, enough in ((torch.float64, exact, 1e-9), (torch.float32, Integration("mujoco", 1), 1e-2)):
+        sim = Simulator(scene, 16, how, 0.002, dtype=dtype)
+        _, after = sim.step(*(torch.tensor(x).to(dtype) for x in (qpos, qvel)), torch.zeros(16, 0, dtype=dtype))
+        assert not sim.nonfinite.any()
+        assert (abs(after.double().numpy() - expected).max(1) / scale).max() < enough
+
+
 def test_violent_states_on_stiff_ground_converge_to_mujocos(rng):
     """A quadruped deep in a ground of impedance 0.9999 and impratio 100, with dry friction and limits."""
     scene, n = diffsim.make("go2", 1).scene, 1024

@@ -67,6 +67,59 @@ def test_quaternions_without_a_direction_are_contained(scene, length, rng):
     assert all((gradient[BAD] == 0).all() for gradient in bad_gradients)
 
 
+INTEGRATIONS = (
+    *(Integration(kind, 8) for kind in INTEGRATORS[:3]),
+    Integration("implicit", 8, 1.0),
+    Integration("mujoco", 4),
+)
+BATCHES = [  # environments, and how wide a kernel's blocks are
+    *((16, 16, torch.float32), (17, 16, torch.float32), (8, 8, torch.float32)),
+    *((5, None, torch.float32), (3, None, torch.float64), (33, None, torch.float32)),
+]
+DISTURBANCES = [  # what of an environment gets which value
+    *(("qvel", 0, np.nan), ("qvel", -1, np.inf), ("qvel", slice(None), 9e4), ("qvel", slice(None), 1e30)),
+    *(("qpos", -1, np.nan), ("qpos", 1, -100.0), ("ctrl", slice(None), np.nan), ("ctrl", slice(None), 1e30)),
+    *(("forces", 1, 1e30), ("forces", 1, 1e8), ("factors", [0, 4], 1e30), ("factors", 6, 0.0)),
+    *(("factors", 6, 1e30), ("factors", 7, 1e30)),
+]
+
+
+def four_steps(sim, given):
+    """States, gradients and what was contained of four steps and their backward pass, a row for each environment."""
+    inputs = {name: x.clone().requires_grad_() for name, x in given.items()}
+    sim.factors, sim.forces = inputs["factors"], inputs["forces"]
+    state, states, lost = (inputs["qpos"], inputs["qvel"]), [], []
+    sim.nonfinite_gradients.zero_()
+    for _ in range(4):
+        states += (state := sim.step(*state, inputs["ctrl"]))
+        lost.append(sim.nonfinite.clone())
+    weights = torch.arange(1.0, sim.num_envs + 1, dtype=sim.dtype).unsqueeze(1)  # each environment has its own
+    gradients = torch.autograd.grad((torch.cat(states, 1) * weights).sum(), list(inputs.values()))
+    parts = [x.detach() for x in states], [x.flatten(1) for x in gradients], [torch.stack(lost, 1).int()]
+    return [*(torch.cat(each, 1) for each in parts), sim.nonfinite_gradients.clone()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integration", INTEGRATIONS, ids=str)
+def test_numbers_that_nothing_has_stay_in_their_environment(integration):
+    """The first, the middle or the last of a batch gets them: the others' states, gradients, flags and counts are bit
+    for bit those without it. Its own states are finite, unless they began otherwise, and its gradients, too."""
+    env, drawn = diffsim.make("hopper", 33, seed=3), torch.Generator().manual_seed(0)
+    for n, block, dtype in BATCHES:
+        sim = Simulator(env.scene, n, integration, 1 / 60, 4, dtype=dtype, block=block, factors=True, forces=True)
+        ctrl = 2 * torch.rand(n, env.scene.nu, generator=drawn) - 1
+        parts = dict(qpos=env.qpos[:n], qvel=env.qvel[:n], ctrl=ctrl, factors=sim.factors, forces=sim.forces)
+        given = {name: part.to(dtype) for name, part in parts.items()}
+        expected = four_steps(sim, given)
+        for what, where, value in DISTURBANCES:
+            for k in (0, n // 2, n - 1):
+                (tensor := given[what].clone())[k][where] = value
+                found, others = four_steps(sim, given | {what: tensor}), torch.arange(n) != k
+                assert all(torch.equal(x[others], y[others]) for x, y in zip(found, expected, strict=True))
+                assert found[1][k].isfinite().all()
+                assert found[0][k].isfinite().all() or what in ("qpos", "qvel") and not np.isfinite(value)
+
+
 def test_a_speed_that_nothing_has_is_contained():
     """Finite, but its square is not far from the end of float32: a task or a network would make inf and NaN of it."""
     scene = parse(BALL)

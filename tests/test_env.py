@@ -177,7 +177,7 @@ def test_reset_of_some():
             (dict(options={"reset_mask": mask}), r"bool \(2,\)")
             for mask in (torch.ones(3), np.ones(3, bool), "all", None)
         ),
-        *((dict(options=options), "of reset_mask alone") for options in (5, {"mask": np.array([True, False])})),
+        *((dict(options=options), "with only reset_mask") for options in (5, {"mask": np.array([True, False])})),
         *((dict(seed=seed), "must be one integer of 64 bits") for seed in (True, 1.5, "a", [1, 2], 10**30)),
     ],
 )

@@ -124,7 +124,7 @@ def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
     ("arguments", "message"),
     [
         ("demo nothing", "unknown task 'nothing': choose from cartpole, hopper"),
-        ("demo hopper", "no policy of hopper comes with this version; there are: none"),
+        ("demo hopper", "no policy for hopper is shipped; there are: none"),
         ("train nothing --env ant", "unknown learner 'nothing': choose from shac, sapo"),
         ("export {tmp}/nothing.pt {tmp}/new/out.pt", "no such checkpoint: {tmp}/nothing.pt"),
         ("export {trained} {trained}/out.pt", "File exists"),

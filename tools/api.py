@@ -16,9 +16,10 @@ HEAD = """# API
 files and tasks (`SceneError`, `TaskError`) are `ValueError`s.
 """
 NAMES = "make DiffEnv NumpyEnv Simulator Integration Task load_scene Scene read_clip".split()
+BRIEF = "NumpyEnv Scene".split()  # their first paragraph
 # Methods that few programs need
 INTERNAL = """pin carry_over take_statistics advance check_tensor rewind tangent explicit replaced check load_robot
-scene bind presets integration falls metadata over""".split()
+scene bind presets integration falls metadata over ghost program disturb observe_with""".split()
 
 
 def signature(thing: object) -> str:
@@ -39,7 +40,8 @@ def members(kind: type) -> Iterator[str]:
         doc = each.__doc__ if inspect.isfunction(each) else None
         if doc and not name.startswith("_") and name not in INTERNAL:
             call = re.sub(r"\s+", " ", f"({signature(each)})")
-            yield f"| `{name}{call}` | {re.split(r'(?<=[.:;]) ', ' '.join(doc.split()))[0].rstrip(':;')} |"
+            first = re.split(r"(?<=[.;]) |(?<=[\w)]): ", " ".join(doc.split()))[0]
+            yield f"| `{name}{call}` | {first.rstrip(';')} |"
 
 
 def page() -> str:
@@ -49,7 +51,8 @@ def page() -> str:
         thing, kind = getattr(diffsim, name), isinstance(getattr(diffsim, name), type)
         doc = inspect.getdoc(thing) or ""
         doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
-        call = "" if name in ("Scene", "Task") else f"({signature(thing)})"
+        doc = doc.split("\n\n")[0] if name in BRIEF else doc
+        call = "" if isinstance(thing, type) and name != "Integration" else f"({signature(thing)})"
         parts.append(f"## {name}\n\n```python\ndiffsim.{name}{call}\n```\n\n```text\n{doc}\n```\n")
         if kind and (rows := [*members(thing)]):
             parts.append("\n".join(["| member | meaning |", "|---|---|", *rows]) + "\n")

@@ -21,6 +21,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from tyro.conf import Positional
 
-from diffsim import Scene
+from diffsim import TASKS, Scene
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
 from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.tasks.joystick import Joystick
@@ -277,33 +278,67 @@ def overview() -> None:
     print(FIGURES / "overview.png")
 
 
-def bars() -> None:
-    """Return and seconds of training of three learners on one H200, as in the table of docs/experiments.md."""
+class Bar(NamedTuple):
+    """A learner on a task: median, lowest and highest return, and seconds of training, in all (0: not measured)."""
+
+    learner: str
+    task: str
+    returns: list[float]
+    training: float
+    total: float = 0.0
+
+
+def measured_bars() -> dict[str, list[Bar]]:
+    """Those of one H200, by contact. Trainings in mujoco_warp ended after the same time."""
     import paper
+    from tables import grouped, read_csv
+
+    names, folder = {"ppo_4096": "ppo", "sac_large": "sac, large batch"}, paper.ROOT / "results" / "h200"
+    args = paper.Args(output=folder.with_name("cpu"))
+    penalty: dict[tuple[str, str], Bar] = {}
+    for line in (line for group in ("headline", "large_batch") for line in paper.table(args, group)):
+        learner, task, seconds, total = (str(line[key]) for key in ("learner", "task", "training (s)", "in all (s)"))
+        values = [float(x) for x in re.findall(r"-?\d+", str(line["return"]))]
+        if task != "cartpole":  # whose return is < 0
+            penalty[learner, task] = Bar(names.get(learner, learner), task, values, float(seconds), float(total or 0))
+    exact = []
+    for row in read_csv(folder / "learning.csv"):
+        seeds = [float(x) for x in row["each seed"].split()]
+        values = [float(row["return"]), min(seeds), max(seeds)]
+        exact.append(Bar(row["learner"].removesuffix("_mujoco"), row["task"], values, float(row["training (s)"])))
+    for (task,), rows in grouped(read_csv(folder / "peer_train.csv"), "task").items():
+        ends, times = ([float(row[key]) for row in rows] for key in ("return", "training (s)"))
+        values = [median(ends), min(ends), max(ends)]
+        exact.append(Bar("ppo in mujoco_warp", task, values, median(times)))
+    return {"penalty contact": [*penalty.values()], "MuJoCo's contact": exact}
+
+
+def bars() -> None:
+    """Return and seconds of learners on one H200, as in the tables of docs/experiments.md and docs/transfer.md."""
     from matplotlib.figure import Figure
 
-    lines = [
-        line
-        for line in paper.table(paper.Args(output=paper.ROOT / "results" / "cpu"), "headline")
-        if line["task"] != "cartpole"
-    ]  # whose return is < 0
-    learners, tasks = (list(dict.fromkeys(str(line[key]) for line in lines)) for key in ("learner", "task"))
-    figure = Figure(figsize=(8, 2.9), dpi=200)
-    panels = figure.subplots(1, 2)
-    for k, learner in enumerate(learners):
-        own = [line for line in lines if line["learner"] == learner]
-        middle, low, high = np.array([[float(x) for x in re.findall(r"-?\d+", str(line["return"]))] for line in own]).T
-        at = np.arange(len(own)) + 0.27 * (k - 1)
-        how: Any = dict(width=0.25, color=f"C{k}", label=learner.replace("ppo_4096", "ppo, 4096 environments"))
-        panels[0].bar(at, middle, yerr=(middle - low, high - middle), capsize=2, **how)
-        panels[1].bar(at, [float(str(line["training (s)"]).rstrip("*")) for line in own], **how)
-    for panel, text in zip(panels, ("return, median and range of 5 seeds", "training on one H200 (s)"), strict=True):
-        panel.set_ylabel(text, fontsize=9)
-        panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8)
-        panel.tick_params(axis="y", labelsize=9)
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[1].legend(fontsize=9, frameon=False)
-    figure.tight_layout()
+    figure = Figure(figsize=(8, 5.2), dpi=200)
+    panels, colours = figure.subplots(2, 2), dict[str, str]()
+    for (first, second), (contact, found) in zip(panels, measured_bars().items(), strict=True):
+        learners, tasks = (list(dict.fromkeys(getattr(bar, key) for bar in found)) for key in ("learner", "task"))
+        tasks.sort(key=list(TASKS).index)
+        for k, learner in enumerate(learners):
+            colour = colours.setdefault(learner, f"C{len(colours)}")
+            own = [bar for bar in found if bar.learner == learner]
+            at = np.array([tasks.index(bar.task) for bar in own]) + 0.2 * (k - 1.5)
+            middle, low, high = np.array([bar.returns for bar in own]).T
+            first.bar(at, middle, 0.18, yerr=(middle - low, high - middle), capsize=2, color=colour, label=learner)
+            second.bar(at, [max(bar.total, bar.training) for bar in own], 0.18, color=colour, alpha=0.4)
+            second.bar(at, [bar.training for bar in own], 0.18, color=colour, label=learner)
+        for panel, text in ((first, "return, median and range"), (second, "training; light: total (s)")):
+            panel.set_ylabel(text, fontsize=9)
+            panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8.5)
+            panel.tick_params(axis="y", labelsize=9)
+            panel.spines[["top", "right"]].set_visible(False)
+        first.set_title(contact, fontsize=10, loc="left")
+    shown = {label: bar for row in panels for bar, label in zip(*row[1].get_legend_handles_labels(), strict=True)}
+    figure.legend(shown.values(), shown, loc="lower center", ncols=len(shown), fontsize=9, frameon=False)
+    figure.tight_layout(rect=(0, 0.05, 1, 1))
     figure.savefig(FIGURES / "h200" / "bars.png")
     print(FIGURES / "h200" / "bars.png")
 

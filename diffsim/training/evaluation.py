@@ -272,7 +272,7 @@ def evaluate_checkpoint(
         share = kept(evaluation.returns.median().item(), value)
         found["finer"] = {"substeps": substeps, "return": value, "kept": share}
         warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-        say(f"{finer.integrator} with {substeps} substeps: return median {value:.1f}, {share:.1%} kept{warning}")
+        say(f"{finer.integrator} with {substeps} substeps: return median {value:.1f}, {share:.1%} retained{warning}")
     write_evaluation(args, evaluation, state["iteration"], **found)
 
 

@@ -78,29 +78,29 @@ class Flags(RunFlags):
     )
 
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
-    """task, one of diffsim.TASKS, or the file of your own: my_task.py or my_task.py:Class (docs/own_robot.md)"""
+    """task: one of diffsim.TASKS, or a file with your own, my_task.py or my_task.py:Class (docs/own_robot.md)"""
     accuracy: Literal["fast", "default", "accurate"] = "default"
-    """preset of integrator, substeps and theta (docs/numerics.md); default is the paper's"""
+    """preset of integrator, substeps and theta (docs/numerics.md); default: the papers' settings"""
     integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
-    """time integration (per task, --accuracy and --contact); mujoco has MuJoCo's own contact and limits"""
+    """time integration (per task, --accuracy and --contact); mujoco includes MuJoCo's own contact and limits"""
     substeps: Count = 16
     """simulation steps per control step (per task and --accuracy)"""
     theta: Fraction = 0.0
     """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
     passes: Count = PASSES
-    """with --integrator mujoco: most passes of Newton's method per substep"""
+    """with --integrator mujoco: at most this many passes of Newton's method per substep"""
     tolerance: Fraction = TOLERANCE
     """with --integrator mujoco: residual that ends the passes (per --accuracy)"""
     touchdown: bool = True
-    """with --integrator mujoco: gradients include the jump at which a contact begins (docs/physics.md)"""
+    """with --integrator mujoco: gradients include the jump at which a contact begins (docs/adjoint.md)"""
     contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
     penalty: tuple[str, ...] = ()
-    """constants of contact and limits in place of the robot file's, e.g. k_n=1e5 k_d=1e4"""
+    """constants of penalty contact and limits that replace those of the robot's file, e.g. k_n=1e5 k_d=1e4"""
     early_termination: bool = True
     """end episodes when the robot falls; otherwise they end only by time"""
     clip: ClipFile = None
-    """motions that g1_track or humanoid_imitation tracks: a file, a folder, or a shipped one (docs/tracking.md)"""
+    """motions that g1_track or humanoid_imitation tracks: a file, a folder, or a shipped clip (docs/tracking.md)"""
     threads: Natural = 0
     """CPU threads of the simulator; they do not change results (0: chosen by the amount of work)"""
 
@@ -130,7 +130,7 @@ class ParallelFlags(Flags):
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
     randomise: tuple[str, ...] = ()
-    """ranges drawn for each environment: friction=0.7:1.3 stiffness mass motor, some tasks: latency push (per task)"""
+    """ranges from which environments draw: friction=0.7:1.3, stiffness, mass, motor; latency, push (per task)"""
     redraw: Count = 10
     """iterations after which the ranges of --randomise are drawn again"""
     monitor: Natural = 50

@@ -1,10 +1,9 @@
-"""Motions from which settings are judged: start states on the way of a policy, and the actions that follow."""
+"""The motion by which settings are judged: start states that a policy visits, and the actions that follow."""
 
 from __future__ import annotations
 
 import copy
-import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim.env import DiffEnv
-from diffsim.robot.scene import Scene, Spheres
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.training.monitor import apart
@@ -25,36 +23,8 @@ SPREAD = (0.25, 0.5, 1.0, 2.0)  # s after the start, where a quarter of the star
 CHUNK = 8  # environments whose gradients are held at once
 
 
-class Setting(NamedTuple):
-    """How a scene is integrated, and in which precision."""
-
-    integration: Integration
-    dtype: torch.dtype = torch.float32
-
-    def __str__(self) -> str:
-        return f"{self.kind}, {self.integration.substeps} substeps"
-
-    @property
-    def kind(self) -> str:
-        """What it shares with the settings of other substeps."""
-        how = self.integration
-        newton = f" to {how.tolerance:g}, {how.passes} passes"
-        of = {"mujoco": newton, "implicit": f" {how.theta:g}"}.get(how.integrator, "")
-        return how.integrator + of + " float64" * (self.dtype == torch.float64)
-
-    @property
-    def flags(self) -> str:
-        """What a script is given to use it."""
-        how = self.integration
-        theta = f" --theta {how.theta:g}" if how.integrator == "implicit" else ""
-        words = f"--contact soft --integrator {how.integrator}{theta} --substeps {how.substeps}"
-        if how.constrained:
-            words = f"--contact mujoco --substeps {how.substeps} --passes {how.passes} --tolerance {how.tolerance:g}"
-        return words + (" (float64: dtype=torch.float64 in diffsim.make)" if self.dtype == torch.float64 else "")
-
-
 class Trail(NamedTuple):
-    """What a setting makes of a motion."""
+    """What an integration makes of a motion."""
 
     qpos: Tensor  # (T, N, nq), (T, N, nv) after each control step, in float64
     qvel: Tensor
@@ -67,6 +37,7 @@ class Motion:
 
     @torch.no_grad()
     def __init__(self, env: DiffEnv, policy: torch.nn.Module | None, seed: int = 0) -> None:
+        """Without a policy the actions are smooth and random."""
         dt, n, nu = env.control_dt, env.num_envs, env.scene.nu
         self.scene, self.dt, self.half_second = env.scene, dt, round(SPANS[-1] / dt)
         steps = max(*HORIZONS, self.half_second)
@@ -84,33 +55,32 @@ class Motion:
         self.qpos, self.qvel = qpos[starts, range(n)], qvel[starts, range(n)]
         self.actions = torch.stack([actions[first : first + steps, k] for k, first in enumerate(starts)], 1)
 
-    def simulator(self, setting: Setting, num_envs: int, scene: Scene | None = None, **options: object) -> Simulator:
-        how, dtype = setting
-        return Simulator(scene or self.scene, num_envs, how, self.dt, max(HORIZONS), dtype=dtype, **options)
+    def simulator(self, how: Integration, num_envs: int, **options: object) -> Simulator:
+        return Simulator(self.scene, num_envs, how, self.dt, max(HORIZONS), **options)
 
     @torch.no_grad()
-    def replay(self, setting: Setting) -> Trail:
-        sim = self.simulator(setting, len(self.qpos))
-        q, v, states = self.qpos.to(sim.dtype), self.qvel.to(sim.dtype), []
+    def replay(self, how: Integration, dtype: torch.dtype = torch.float32) -> Trail:
+        sim = self.simulator(how, len(self.qpos), dtype=dtype)
+        q, v, states = self.qpos.to(dtype), self.qvel.to(dtype), []
         bad, residual = torch.zeros_like(sim.nonfinite), torch.zeros_like(sim.residual)
-        for action in self.actions.to(sim.dtype):
+        for action in self.actions.to(dtype):
             q, v = sim.step(q, v, action)
             states.append((q.double(), v.double()))
             bad, residual = bad | sim.nonfinite, residual.maximum(sim.residual)
         qpos, qvel = map(torch.stack, zip(*states, strict=True))
         return Trail(qpos, qvel, residual.median().item(), bad.double().mean().item())
 
-    def gradients(self, setting: Setting) -> dict[int, Tensor]:
+    def gradients(self, how: Integration, dtype: torch.dtype = torch.float32) -> dict[int, Tensor]:
         """Over HORIZONS: (N, steps * nu), of the sum of the velocities, weighted 0.5 to 1.5 along dofs, in actions."""
-        n, sim = len(self.qpos), self.simulator(setting, CHUNK)
-        weights = torch.linspace(0.5, 1.5, self.scene.nv, dtype=sim.dtype)
+        n, sim = len(self.qpos), self.simulator(how, CHUNK, dtype=dtype)
+        weights = torch.linspace(0.5, 1.5, self.scene.nv, dtype=dtype)
         found = {h: torch.empty(0, h * self.scene.nu, dtype=torch.float64) for h in HORIZONS}
         for first in range(0, n, CHUNK):
             rows = torch.arange(first, first + CHUNK) % n
             for horizon in HORIZONS:
                 sim.rewind()
-                leaves = [a.to(sim.dtype).requires_grad_() for a in self.actions[:horizon, rows]]
-                q, v, total = self.qpos[rows].to(sim.dtype), self.qvel[rows].to(sim.dtype), torch.zeros(())
+                leaves = [a.to(dtype).requires_grad_() for a in self.actions[:horizon, rows]]
+                q, v, total = self.qpos[rows].to(dtype), self.qvel[rows].to(dtype), torch.zeros(())
                 for leaf in leaves:
                     q, v = sim.step(q, v, leaf)
                     total = total + (v * weights).sum()
@@ -123,15 +93,8 @@ class Motion:
         step = max(1, round(span / self.dt)) - 1
         return float(np.median(apart(self.scene.mj_model, found.qpos[step], truth.qpos[step])))
 
-    def falling(self) -> Motion:
-        """The same without ground and without actuators' forces."""
-        passive, muscle = copy.copy(self), torch.tensor(self.scene.motor_link) == 0
-        passive.scene = without(self.scene, "contact")
-        passive.actions = torch.where(muscle, -1.0, 0.0).expand_as(self.actions)
-        return passive
-
     def energies(self, trail: Trail) -> NDArray[np.float64]:
-        """Kinetic energy and energy (T, N, 2) [J] over 0.5 s."""
+        """Kinetic energies (T, N) [J] over 0.5 s."""
         model = copy.deepcopy(self.scene.mj_model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
@@ -139,26 +102,5 @@ class Motion:
         states = (x[: self.half_second].flatten(0, 1).numpy() for x in (trail.qpos, trail.qvel))
         for data.qpos[:], data.qvel[:] in zip(*states, strict=True):
             mujoco.mj_forward(model, data)
-            rows.append((data.energy[1], data.energy.sum()))
-        return np.array(rows).reshape(-1, len(self.qpos), 2)
-
-
-def without(scene: Scene, part: str) -> Scene:
-    """The scene without its contact, limits, dry friction, muscles, terrain or fluid."""
-    model = copy.deepcopy(scene.mj_model)
-    model.dof_frictionloss[:] = 0.0
-
-    def empty(names: str) -> dict[str, Any]:
-        return {name: getattr(scene, name)[:0] for name in names.split()}
-
-    spheres: Any = (values[:0] for values in scene.spheres)
-    changes: dict[str, Any] = {
-        "contact": empty("contact_link contact_position contact_radius")
-        | {"spheres": Spheres(*spheres), "terrain": None},
-        "limit": {"lower": np.full(scene.nlink, -np.inf), "upper": np.full(scene.nlink, np.inf)},
-        "muscle": empty("segment_link segment_position segment_muscle"),
-        "terrain": {"terrain": None},
-        "drag": {"density": 0.0, "viscosity": 0.0},
-        "frictionloss": {"mj_model": model},
-    }
-    return dataclasses.replace(scene, **changes[part])
+            rows.append(data.energy[1])
+        return np.reshape(rows, (-1, len(self.qpos)))

@@ -285,6 +285,8 @@ def check_opengl() -> str:
     """
     wanted = os.environ.get("MUJOCO_GL")
     os.environ.setdefault("EGL_LOG_LEVEL", "fatal")  # Mesa prints its search for drivers otherwise
+    with suppress(ImportError):  # torch.optim imports it; the process crashes if it comes after Mesa's LLVM
+        import_module("triton")
     try:
         if sys.platform == "linux" and not wanted:
             sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = import_module("mujoco.egl").GLContext

@@ -13,26 +13,17 @@ from learners import refusal
 from tables import markdown, read_csv
 
 import diffsim
-from diffsim.training import gait
 
 POLICIES = Path(diffsim.__file__).parent / "policies"
-DT = 1 / 60
 
 
 def test_the_summary_of_a_known_motion() -> None:
-    """A stiff hopper glides along with its foot 10 mm deep, then 30 mm; the second episode ends after half of it."""
-    env = diffsim.make("hopper", 2, stochastic_init=False, dtype=torch.float64)
-    scene, rest = env.scene, env.qpos[:1].numpy()
-    depth = gait.trace(scene, rest)[0]
-    t = DT * np.arange(61)
-    qpos, qvel = np.tile(rest, (61, 2, 1)), np.zeros((61, 2, scene.nv))
-    qpos[..., 0], qvel[..., 0] = 1.5 * t[:, None], 1.5
-    qpos[..., 1] += depth.max() - np.where(t < 0.7, 0.01, 0.03)[:, None]
+    """A hopper glides along; the second episode ends after half of it."""
+    env = diffsim.make("hopper", 2)
+    qpos, qvel = np.zeros((61, 2, 6)), np.zeros((61, 2, 6))
+    qpos[..., 0] = 1.5 * env.control_dt * np.arange(61)[:, None]
     motion = transfer.Motion(qpos, qvel, np.array([3.0, 1.0]), np.array([60, 30]), np.array([False, True]))
-    found = transfer.summary(motion, env)
-    assert found == pytest.approx({"return": 2.0, "speed": 1.5, "whole": 0.5, "penetration": 10.0})
-    qpos[..., 1] += 1.0
-    assert transfer.penetration(motion, scene) == ""  # in flight
+    assert transfer.summary(motion, env) == pytest.approx({"return": 2.0, "speed": 1.5, "whole": 0.5})
 
 
 def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,7 +39,7 @@ def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.
     transfer.main(parse(transfer.Args, None, [*map(str, paths), *flags, str(tmp_path)]))
     rows = read_csv(tmp_path / "transfer.csv")
     lines = {line["learner"]: line for line in transfer.table(rows)}
-    assert markdown(transfer.shown(rows)) in capsys.readouterr().out
+    assert markdown(transfer.table(rows)) in capsys.readouterr().out
     worlds = ["here", "finer", "MuJoCo x1", "MuJoCo x0.5"]
     for learner, names, judge in (
         ("policies/hopper", worlds, "MuJoCo x1"),
@@ -61,14 +52,14 @@ def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.
         assert "MuJoCo same" in own or speed["finer"] == pytest.approx(speed["here"], rel=0.02)
         kept = float(own[judge]["kept"])
         assert kept == pytest.approx(speed[judge] / speed[names[0]], rel=0.01)
-        assert (lines[learner]["judged in"], lines[learner]["kept"]) == (judge, f"{kept:.0%}")
+        assert lines[learner]["retained (worst)"] == f"{kept:.0%} ({kept:.0%})"
         if "MuJoCo same" in own:  # one law
             assert speed["here"] == pytest.approx(speed["MuJoCo same"], rel=0.01)
     alone = [row for row in rows if row["task"] == "cartpole"]  # which touches nothing: a return, the same in MuJoCo
     assert [row["condition"] for row in alone] == ["here", "finer", "MuJoCo x1"]
-    assert all(row["return"] and not row["speed"] + row["penetration"] for row in alone)
+    assert all(row["return"] and not row["speed"] for row in alone)
     line = lines["policies/cartpole"]
-    assert float(line["here"]) == pytest.approx(float(line["MuJoCo x1"]), rel=0.02) and line["kept"] == ""
+    assert float(line["here"]) == pytest.approx(float(line["MuJoCo x1"]), rel=0.02) and line["retained (worst)"] == ""
 
 
 def test_the_page_has_the_table_of_the_csv_file(capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,7 +67,7 @@ def test_a_file_that_takes_forever_is_given_up(tmp_path):
     words = [sys.executable, "-m", "diffsim", "check", str(file), "--seconds", "0.1"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1 and done.stderr == ""
-    assert done.stdout == f"Cannot be simulated.\n\n{file}: it is not read in 0.1 s; --seconds allows more\n"
+    assert done.stdout == f"Cannot be simulated.\n\n{file} could not be read within 0.1 s; --seconds allows more\n"
 
 
 def test_targets_in_degrees_are_perhaps_a_mistake():

@@ -130,7 +130,7 @@ def test_evaluate_a_checkpoint_with_other_substeps(
     finer, out = own.pop("finer"), capsys.readouterr().out
     assert own == json.loads((tiny_run / "evaluation.json").read_text())
     assert finer["substeps"] == 16 and finer["kept"] == pytest.approx(own["return"] / finer["return"])
-    assert f"semi_implicit with 16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} kept" in out
+    assert f"semi_implicit with 16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} retained" in out
     explicit = found("explicit", *"--integrator semi_implicit --substeps 16 --no-finer".split())
     assert explicit["return"] == finer["return"] and "finer" not in explicit
     other = found("other", *"--substeps 16 --eval-episodes 4 --no-finer".split())["settings"]

@@ -177,7 +177,7 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
     )
     assert returns.startswith("ant, 2 episodes")
     assert finer == f"semi_implicit with 32 substeps: return median {found['finer']['return']:.1f}, " + (
-        f"{found['finer']['kept']:.1%} kept"
+        f"{found['finer']['kept']:.1%} retained"
     )
     assert found["finer"]["kept"] == pytest.approx(found["finer"]["return"] / found["return"])
     assert found["finer"]["kept"] > evaluation.ENOUGH

@@ -237,7 +237,7 @@ def test_the_ant_turns_to_where_it_is_sent():
     [
         ("drive nothing", "unknown task 'nothing': choose from cartpole, hopper"),
         ("drive hopper", "hopper cannot be driven: choose from ant, humanoid"),
-        ("drive go1", "no policy of go1 comes with this version; there are: "),
+        ("drive go1", "no policy for go1 is shipped; there are: "),
         ("drive go1 --checkpoint {go2}", "go2.pt is a checkpoint of go2, not of go1"),
         (
             "drive go2 --port {taken}",
