@@ -6,7 +6,7 @@
 Robots walk for 2 to 4 s, each for a time of its own, so that they are in any phase of their gait. Then each is pushed
 at its trunk, as in Table 1 of the PFPN paper (Xu and Karamouzas 2021). To fall is to end an episode of the task.
 
-Writes robustness.csv, a row for each policy, and with --update-results the table of docs/pfpn.md.
+Writes robustness.csv, a row for each policy, and prints its table; docs/pfpn.md quotes means.
 """
 
 from __future__ import annotations
