@@ -141,8 +141,9 @@ class ParallelFlags(Flags):
 
     def check(self) -> None:
         super().check()
+        task = find_task(self.env)
         try:
-            parse_ranges(self.randomise, find_task(self.env))
+            parse_ranges(self.randomise, task)
         except ValueError as error:
             fail(f"--randomise: {error}")
         if self.num_envs % distributed.size():
