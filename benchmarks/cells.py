@@ -211,7 +211,9 @@ def passing(run: Curve, target: float, x: str) -> float:
 
 
 def spread(values: Sequence[float]) -> str:
-    return f"{mean(values):.0f} ± {pstdev(values):.0f}" if len(values) > 1 else f"{values[0]:.0f}"
+    if len(values) == 1:
+        return f"{values[0]:.0f}"
+    return f"{mean(values):.0f} ± {pstdev(values):.{int(pstdev(values) < 0.5)}f}"
 
 
 # Results --------------------------------------------------------------------------------------------------------------
