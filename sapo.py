@@ -65,12 +65,6 @@ SCORE_RATE = 0.03  # of a member's running mean reward, per iteration
 class Args(WindowFlags):
     """The algorithm. With --no-entropy --no-state-std --critics 1 --activation elu it is SHAC."""
 
-    MAY_CHANGE = (
-        *WindowFlags.MAY_CHANGE,
-        *("horizon", "actor_lr", "critic_lr", "final_lr", "temperature_lr", "betas", "max_grad_norm", "gamma"),
-        *("td_lambda", "target_alpha", "target_entropy", "critic_iterations", "critic_minibatches"),
-    )
-
     entropy: bool = True
     """the policy's entropy is part of the reward"""
     state_std: bool = True

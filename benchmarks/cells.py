@@ -23,9 +23,7 @@ import numpy as np
 import tables
 from tables import ROOT, Cells, read_csv
 
-import diffsim
 from diffsim.training import checkpoint, fail
-from diffsim.training.evaluation import FINER
 
 COLUMNS = ("iteration", "control_steps", "seconds", "return")  # of progress.csv, which a curve has
 Curve = dict[str, np.ndarray]
@@ -90,17 +88,10 @@ class Runner:
         return self._call(case, *start, "--stop-after", until, *self.args.arguments)
 
     def evaluate(self, case: Case) -> bool:
-        """Evaluate the checkpoint in all ways in which that is not done; whether it is now."""
-        state = checkpoint.load(path := case.folder / "checkpoint.pt")
-        settings: dict[Path, list[object]] = {case.folder: ["--no-finer"]}
-        for substeps in checked(case.env, how := state["args"]):
-            law = "mujoco" if how["integrator"] == "mujoco" else "semi_implicit"
-            explicit = ["--integrator", law, "--theta", 0, "--substeps", FINER * substeps]
-            settings[finer(case.folder, substeps)] = ["--no-finer", *explicit]
-        return all(
-            evaluation(folder, state["iteration"]) or self._call(case, "--evaluate", path, "--run-dir", folder, *flags)
-            for folder, flags in settings.items()
-        )
+        """Evaluate the checkpoint, with finer steps as well, if that is not done; whether it is now."""
+        iteration = checkpoint.load(path := case.folder / "checkpoint.pt")["iteration"]
+        done = "finer" in evaluation(case.folder, iteration)
+        return done or self._call(case, "--evaluate", path, "--run-dir", case.folder)
 
     def _call(self, case: Case, *arguments: object) -> bool:
         """Whether the script came to its end. It is stopped, and saves, when the time is up."""
@@ -180,15 +171,6 @@ def train(runner: Runner, cell: Cell) -> bool:
     if fresh and "--eval-every" not in runner.args.arguments:  # trained in one go, with all evaluations
         (case.folder / "cell.json").write_text(json.dumps(begun | {"in all (s)": time.monotonic() - start}))
     return True
-
-
-def checked(env: str, how: Mapping[str, Any]) -> tuple[int, int]:
-    """Substeps of which the finer evaluations take multiples: a run's own, and the task's on that contact."""
-    return how["substeps"], diffsim.TASKS[env].integration("default", how.get("contact", "soft")).substeps
-
-
-def finer(folder: Path, substeps: int) -> Path:
-    return folder / f"explicit_{FINER * substeps}"
 
 
 def evaluation(folder: Path, iteration: int | None = None) -> dict[str, Any]:

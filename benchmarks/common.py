@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -241,23 +239,12 @@ class Panel(NamedTuple):
     log: str = ""  # the logarithmic axes: x, y or xy
 
 
-@functools.cache
-def can_draw() -> bool:
-    if importlib.util.find_spec("matplotlib"):
-        return True
-    print("pictures need matplotlib: pip install -e '.[test]'", file=sys.stderr)
-    return False
-
-
 WIDE = 3  # panels in a row: their text can be read where a page shows 800 pixels
 
 
 def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] = (3.4, 2.9)) -> None:
-    """Draw rows of panels, each of a size in inches, in blocks of WIDE columns below each other.
-
-    Without matplotlib it says so, once, and draws nothing.
-    """
-    if not grid[0] or not can_draw():
+    """Draw rows of panels, each of a size in inches, in blocks of WIDE columns below each other."""
+    if not grid[0]:
         return
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

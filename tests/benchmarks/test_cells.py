@@ -95,5 +95,5 @@ def test_a_stopped_call_goes_on_where_it_was(tmp_path, monkeypatch):
     rows = tables.read_csv(folder / "progress.csv")
     assert [int(row["iteration"]) for row in rows] == list(range(1, done + 31))
     assert cells.evaluation(folder)["return"] < 0
-    assert cells.evaluation(folder / "explicit_16")["settings"]["substeps"] == 16
+    assert cells.evaluation(folder)["finer"]["substeps"] == 16
     assert not cells.evaluation(folder, done)  # of another iteration

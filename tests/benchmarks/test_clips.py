@@ -41,19 +41,6 @@ def test_who_stands_succeeds_and_who_is_to_fly_fails() -> None:
     assert (root[:3] < 0.05).all() and (root[3:] > 0.1).all() and (turn[:3] < 0.1).all() and (joints < 0.1).all()
 
 
-def test_a_row_for_each_friction_and_a_line_for_each_clip() -> None:
-    row = dict(task="g1_track", clip="walk", learner="sapo --randomise", file="g1", push="0", success="1")
-    row |= {"training s": "100", "joint error": "0.06", "root error": "0.04"}
-    rows = [row | dict(checkpoint=f"h100/{k}", friction=str(f)) for k in (1, 2) for f in (0.7, 1, 1.3)]
-    rows[0]["success"], rows[-2]["success"] = "0.5", "0.8"
-    (line,) = tracking.table([*rows, row | dict(checkpoint="h100/1", friction="1", push="0.5", success="0.25")])
-    assert (line["policy"], line["seeds"], line["training (s)"]) == ("walk, sapo, h100", 2, "100")
-    assert (line["success"], line["pushed"]) == ("90% (50%)", "25%")
-    assert (line["joints (rad)"], line["root (m)"]) == ("0.060", "0.040")
-    (line,) = tracking.table([row | dict(checkpoint="h100/1", friction="1", learner="sapo")])
-    assert (line["policy"], line["success"], line["pushed"]) == ("walk, sapo, h100, not randomised", "100% (100%)", "")
-
-
 def test_what_cannot_be_judged(capsys: pytest.CaptureFixture[str]) -> None:
     args = tracking.Args(checkpoints=(POLICIES / "hopper.pt",))
     error = refusal(lambda: tracking.main(args), capsys)
