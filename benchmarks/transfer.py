@@ -1,4 +1,4 @@
-"""The share of their speed that policies retain in another simulator: trained here and judged in MuJoCo, or the reverse.
+"""The share of speed that policies retain in another simulator: trained here and judged in MuJoCo, or the reverse.
 
     python benchmarks/transfer.py runs/learning/shac/ant__1            a run, or a checkpoint of any learner's script
     python benchmarks/transfer.py runs/learning/*/* --friction 0.5 0.7 1 1.3 1.5
