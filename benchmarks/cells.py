@@ -68,7 +68,7 @@ class Case(NamedTuple):
     folder: Path
     env: str
     seed: int
-    script: str
+    script: str  # without .py; "shac@2": two processes of torchrun
     flags: tuple[str, ...] = ()
 
 
@@ -98,7 +98,10 @@ class Runner:
         left = self.stop_at - time.monotonic()
         if left <= 0:
             return False
-        command = [sys.executable, str(ROOT / f"{case.script}.py"), *map(str, arguments), "--device", self.args.device]
+        script, _, ranks = case.script.partition("@")
+        torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}", "--"] if ranks else []
+        command = [sys.executable, *torchrun, str(ROOT / f"{script}.py"), *map(str, arguments)]
+        command += ["--device", self.args.device]
         case.folder.mkdir(parents=True, exist_ok=True)
         with (case.folder / "output.txt").open("a") as output:
             process = subprocess.Popen(command, stdout=output, stderr=output)
@@ -190,7 +193,9 @@ def passing(run: Curve, target: float, x: str) -> float:
 
 
 def spread(values: Sequence[float]) -> str:
-    return f"{mean(values):.0f} ± {pstdev(values):.0f}" if len(values) > 1 else f"{values[0]:.0f}"
+    if len(values) == 1:
+        return f"{values[0]:.0f}"
+    return f"{mean(values):.0f} ± {pstdev(values):.{int(pstdev(values) < 0.5)}f}"
 
 
 # Results --------------------------------------------------------------------------------------------------------------

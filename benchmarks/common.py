@@ -42,6 +42,7 @@ class CommonFlags:
     figures: Path | None = None  # directory of the pictures (default: that of the csv files)
     update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
     draw_only: bool = False  # measure nothing, read csv files
+    machine: str = ""  # whose results these are, a folder of results/ (default: that of --device)
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
 
     @property
@@ -50,9 +51,13 @@ class CommonFlags:
         return () if self.draw_only else self.env
 
     @property
+    def place(self) -> str:
+        return self.machine or machine(self.device)
+
+    @property
     def directory(self) -> Path:
         tree = RESULTS if self.update_results else OUTPUT
-        return self.output.resolve() if self.output else tree / machine(self.device)
+        return self.output.resolve() if self.output else tree / self.place
 
     def csv(self, name: str) -> Path:
         return self.directory / f"{name}.csv"

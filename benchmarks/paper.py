@@ -50,7 +50,6 @@ class Args(ScriptFlags):
     only: tuple[str, ...] = tuple(name for name in GROUPS if not GROUPS[name].older)  # groups
     learners: tuple[str, ...] = ()  # learners (default: all of a group)
     seeds: tuple[int, ...] = ()  # seeds (default: all of a group)
-    machine: str = ""  # whose cells these are (default: that of --device)
     check: bool = False  # only say what is missing
     train_only: bool = False  # evaluate nothing
     evaluate_only: bool = False  # train nothing
@@ -63,14 +62,6 @@ class Args(ScriptFlags):
     def alone(self, cell: Cell) -> bool:
         """Whether a cell's seconds mean something."""
         return cell.timed and not self.shared
-
-    @property
-    def place(self) -> str:
-        return self.machine or common.machine(self.device)
-
-    @property
-    def directory(self) -> Path:
-        return self.output or (common.RESULTS if self.update_results else common.OUTPUT) / self.place
 
 
 def wanted(args: Args) -> Iterator[Cell]:

@@ -161,16 +161,17 @@ def train(args: Args, name: Name) -> Iterator[Row]:
 
 
 KEY = ("task", "environments")
+SPEED = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward", "lost"  # of the columns those that a page shows
+TRAIN = "task", "seed", "control steps", "training (s)", "control steps/s", "return", "lost"
 
 
-def shown(rows: list[Cells]) -> list[Row]:
-    columns = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward", "lost"
+def shown(columns: tuple[str, ...], rows: list[Cells]) -> list[Row]:
     return [{name: row.get(name, "") for name in columns} for row in rows]
 
 
 PARTS = {
-    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", shown),
-    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md"),
+    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", partial(shown, SPEED)),
+    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", partial(shown, TRAIN)),
 }
 
 

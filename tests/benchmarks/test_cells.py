@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import time
+from pathlib import Path
 
 import cells
 import numpy as np
@@ -29,6 +30,8 @@ def test_policies_are_compared_within_the_control_steps_that_all_made(tmp_path, 
     rows += points("a", 3, 9.0, 10)  # a third seed is not of the group
     tables.replace_csv(tmp_path / "h200" / "curves.csv", rows, paper.KEY)
     args = paper.Args(output=tmp_path / "cpu")
+    found = paper.curves(args, "both")
+    assert all(np.isnan(run["seconds"]).all() for runs in found.values() for run in runs)  # the group is not timed
     (row,) = paper.ratios(args, "both")  # on the hopper a seed is missing
     assert row == {"task": "ant", "control steps": "0.003 M", "a": "45 ± 15", "b": "22 ± 8", "ratio": "2.00"}
 
@@ -48,6 +51,25 @@ def test_a_picture_has_steps_for_all_and_seconds_for_those_alone():
     steps, seconds = (paper.panel(group, found, "hopper", x) for x in ("control_steps", "seconds"))
     assert [line.label for line in steps.lines] == ["", "", "shac", "", "sapo", "shac, published"]
     assert [line.label for line in seconds.lines] == ["", "", "shac", "shac, published"]
+
+
+def test_a_script_may_be_several_processes(tmp_path_factory, monkeypatch):
+    """Of torchrun, to which --monitor would be a flag of its own without the dashes before the script."""
+    called, folder = list[list[str]](), tmp_path_factory.getbasetemp()
+    monkeypatch.setattr(cells.subprocess, "Popen", lambda command, **_: called.append(command) or Ended())
+    for script in ("shac", "shac@2"):
+        assert cells.Runner(cells.ScriptFlags(device="cpu")).train(cells.Case(folder, "ant", 1, script))
+    alone, both = called
+    at = both.index("--")
+    assert both[1:3] == ["-m", "torch.distributed.run"] and "--nproc-per-node=2" in both[:at]
+    assert both[at + 1 :] == alone[1:] and Path(alone[1]).is_file()
+
+
+class Ended:
+    returncode = 0
+
+    def wait(self, _: float | None) -> int:
+        return 0
 
 
 def test_a_stopped_call_goes_on_where_it_was(tmp_path, monkeypatch):

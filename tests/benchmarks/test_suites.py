@@ -13,6 +13,7 @@ from tables import read_csv
 
 import pfpn
 import pfpn_sac
+import ppo_baseline
 import sapo
 import shac
 from diffsim.training import parse
@@ -21,6 +22,7 @@ SCRIPTS = {
     "benchmarks/gps_variants": VariantArgs,
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,
+    "ppo_baseline": ppo_baseline.Args,
     "shac": shac.Args,
     "sapo": sapo.Args,
 }
@@ -31,9 +33,10 @@ def test_each_run_of_the_page_is_a_command(group: str, monkeypatch: pytest.Monke
     monkeypatch.chdir(ROOT)
     suite, runs = suites.SUITES[suites.GROUPS[group]], list(suites.cases(suites.Args(), group))
     for case in {case.flags: case for _, case in runs}.values():  # seeds share them
-        args = parse(SCRIPTS[case.script], ["--env", case.env, "--device", "cpu", *case.flags])
+        args = parse(SCRIPTS[case.script.partition("@")[0]], ["--env", case.env, "--device", "cpu", *case.flags])
         assert args.iterations > 1
-    rows = [row for row in read_csv(RESULTS / "cpu" / f"{suite.csv}.csv") if row["group"] == group]
+    every = read_csv(RESULTS / suite.machine / f"{suite.csv}.csv")
+    rows = [row for row in every if row["group"] == group]
     assert {(row["cell"], int(row["seed"])) for row in rows} <= {(cell, case.seed) for cell, case in runs}
     assert rows
     some = suites.Args(cells=(runs[-1][0],), seeds=(7,))
