@@ -218,13 +218,10 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     hints = get_type_hints(kind, include_extras=True)
     choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
     known = {
-        name: value
-        for name, value in saved["args"].items()
-        if name in hints and not name.isupper() and value in choices.get(name, (value,))
+        name: value for name, value in saved["args"].items() if name in hints and value in choices.get(name, (value,))
     }
-    if gone := ", ".join(
-        f"{flag(name)} {value}" for name, value in saved["args"].items() if value and name not in known
-    ):
+    others = {name: value for name, value in saved["args"].items() if name not in known and value}
+    if gone := ", ".join(f"{flag(name)} {value}" for name, value in others.items()):
         message = f"{path} was written by a {kind.script()}.py with other flags: {gone}"
         if given.resume:
             fail(message)
