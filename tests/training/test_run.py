@@ -162,7 +162,7 @@ def test_a_directory_that_is_moved_is_made_again(tmp_path, monkeypatch):
 
     original = bptt.bptt_loss
     monkeypatch.setattr(bptt, "bptt_loss", moved)
-    assert run(bptt, tmp_path / "run", *TINY, "--iterations", 3, "--quiet")["iteration"] == 3
+    assert run(bptt, tmp_path / "run", *TINY, "--iterations", 3, "--eval-every", 1, "--quiet")["iteration"] == 3
     assert len(read_progress(tmp_path / "moved")) == 3
 
 
