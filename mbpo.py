@@ -28,7 +28,7 @@ from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, seeing
+from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Few, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -127,15 +127,6 @@ class Args(ParallelFlags):
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
-
-
-def mlp(inputs: int, hidden: Widths, outputs: int | None, activation: type[nn.Module]) -> nn.Sequential:
-    """Linear and activation per hidden layer, and a linear output, if any."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), activation()]
-        inputs = width
-    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
 
 
 class Actor(nn.Module):

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, moments, seeing
+from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Fraction, Natural, NonNegative, Positive, Repeats, Several, SomeWidths
 
@@ -226,22 +226,13 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
     return layer
 
 
-def mlp(inputs: int, hidden: SomeWidths) -> nn.Sequential:
-    """Linear and ELU per hidden layer."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU()]
-        inputs = width
-    return nn.Sequential(*layers)
-
-
 class Actor(nn.Module):
     """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden))
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ELU))
         self.head = Head(args, args.hidden[-1], action_dim)
         self.value = nn.Linear(args.hidden[-1], 1)
 

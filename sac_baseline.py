@@ -24,7 +24,7 @@ from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, seeing
+from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -119,22 +119,13 @@ class Args(ParallelFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, args: Args, outputs: int | None = None, layer_norm: bool = False) -> nn.Sequential:
-    """Linear and ReLU per hidden layer, with LayerNorm after it if asked for; and a linear output."""
-    layers: list[nn.Module] = []
-    for width in args.hidden:
-        layers += [nn.Linear(inputs, width), nn.ReLU()] + ([nn.LayerNorm(width)] if layer_norm else [])
-        inputs = width
-    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
-
-
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args))
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,7 +156,8 @@ class SAC:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
-        critics = [mlp(obs_dim + action_dim, args, 1, args.layer_norm) for _ in range(args.critics)]
+        inputs = obs_dim + action_dim
+        critics = [mlp(inputs, args.hidden, 1, nn.ReLU, args.layer_norm) for _ in range(args.critics)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         log = torch.full((), math.log(args.initial_temperature))
