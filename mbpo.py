@@ -319,9 +319,9 @@ class MBPO:
         args = self.args
         with torch.no_grad():
             action, density = self.actor(next_obs)
-            value = q_values(self.targets, next_obs, action).amin(0) - self.temperature["log"].exp() * density
+            value = self.targets.value(next_obs, action).amin(0) - self.temperature["log"].exp() * density
             target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
-        values = q_values(self.critics, obs, batch.action)
+        values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
         norm = self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -331,18 +331,12 @@ class MBPO:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         action, density = self.actor(obs)
-        value = q_values(self.critics, obs, action).amin(0)
+        value = self.critics.value(obs, action).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = action.shape[1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
-
-
-def q_values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-    """Each critic's Q(s, a) (2, B)."""
-    inputs = torch.cat((obs, action), -1)
-    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
 
 # SE-MBPO --------------------------------------------------------------------------------------------------------------

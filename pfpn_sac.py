@@ -353,10 +353,10 @@ class SAC:
         with torch.no_grad():
             mixture = self.actor(next_obs)
             u = mixture.sample()
-            soft = values(self.targets, next_obs, torch.tanh(u)).amin(0)
+            soft = self.targets.value(next_obs, torch.tanh(u)).amin(0)
             soft = soft - self.temperature["log"].exp() * mixture.log_prob(u)
             target = batch.reward + self.args.gamma * (1 - batch.terminated) * soft
-        value = values(self.critics, obs, batch.action)
+        value = self.critics.value(obs, batch.action)
         loss = (value - target).square().mean(1).sum()
         self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -368,18 +368,12 @@ class SAC:
         mixture = self.actor(obs)
         u = self.sample(mixture)
         density = mixture.log_prob(u)
-        value = values(self.critics, obs, torch.tanh(u)).amin(0)
+        value = self.critics.value(obs, torch.tanh(u)).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         norm = self.optimizer.step(loss)
         surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
-
-
-def values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-    """Each critic's Q(s, a) (2, B)."""
-    inputs = torch.cat((obs, action), -1)
-    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
 
 # The run --------------------------------------------------------------------------------------------------------------

@@ -218,14 +218,14 @@ class SAC:
         args = self.args
         with torch.no_grad():
             action, density = self.actor(next_obs)
-            values = self.values(self.targets, next_obs, action)
+            values = self.targets.value(next_obs, action)
             if args.critic_subset < args.critics:
                 values = values[torch.rand(args.critics, device=obs.device).argsort()[: args.critic_subset]]
             entropy = -self.temperature["log"].exp() * density
             target = batch.reward + args.gamma * (1 - batch.terminated) * (
                 values.amin(0) + entropy
             )  # none after a fall
-        values = self.values(self.critics, obs, batch.action)
+        values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
         norm = self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -236,18 +236,13 @@ class SAC:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to the target entropy."""
         action, density = self.actor(obs)
-        values = self.values(self.critics, obs, action)
+        values = self.critics.value(obs, action)
         value = values.amin(0) if self.args.critic_subset == self.args.critics else values.mean(0)  # REDQ: the mean
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = -density.detach().mean() - self.args.target_entropy * action.shape[1]  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
-
-    def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-        """Each critic's Q(s, a) (critics, B)."""
-        inputs = torch.cat((obs, action), -1)
-        return critics(inputs.expand(self.args.critics, *inputs.shape)).squeeze(-1)
 
 
 # The run --------------------------------------------------------------------------------------------------------------
