@@ -135,14 +135,14 @@ def is_ablation(row: dict[str, str]) -> bool:
 
 
 def ablation(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each variant: success by friction, with and without pushes, and errors on the file's friction."""
+    """A line for each variant, on the file's friction: success, in brackets the least over frictions, and errors."""
     lines = list[Row]()
     for (name,), group in grouped(filter(is_ablation, rows), "checkpoint").items():
-        calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
+        calm = [row for row in group if float(row["push"]) == 0]
         plain = [row for row in calm if float(row["friction"]) == 1]
         lines.append(
-            {"variant": name.removeprefix("ablation/").replace("_", " "), "iterations": group[0]["iteration"]}
-            | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
+            {"variant": name.removeprefix("ablation/").replace("_", " ")}
+            | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})"}
             | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
         )
     return lines
@@ -162,11 +162,11 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
 def race(rows: list[dict[str, str]]) -> list[Row]:
     """Seconds of training until enough episodes succeed, from checkpoints along the way."""
     lines = list[Row]()
-    for (clip, learner, seed), group in grouped(rows, "clip", "learner", "seed").items():
+    for (_, learner, _), group in grouped(rows, "clip", "learner", "seed").items():
         group.sort(key=lambda row: float(row["training s"]))
         reached = (row["training s"] for row in group if float(row["success"]) >= ENOUGH)
         lines.append(
-            {"clip": clip, "learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner), "seed": seed}
+            {"learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner)}
             | {f"s to {ENOUGH:.0%}": next(reached, "never"), "in all (s)": group[-1]["training s"]}
             | {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
         )
