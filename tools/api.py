@@ -13,9 +13,10 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 HEAD = """# API
 
 `python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. `NumpyEnv`
-and `NumpyVectorEnv`: [gymnasium.md](gymnasium.md). `SceneError` and `TaskError` are `ValueError`s.
+and `NumpyVectorEnv`: [gymnasium.md](gymnasium.md). `read_clip`: [tracking.md](tracking.md#clips). `SceneError` and
+`TaskError` are `ValueError`s.
 """
-NAMES = "make DiffEnv Simulator Integration Task load_scene Scene read_clip".split()
+NAMES = "make DiffEnv Simulator Integration Task load_scene Scene".split()
 # Methods that few programs need
 INTERNAL = """pin carry_over take_statistics advance check_tensor rewind tangent explicit replaced check load_robot
 scene bind presets integration falls metadata over ghost program disturb observe_with""".split()

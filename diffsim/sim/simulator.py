@@ -164,8 +164,8 @@ class Simulator:
 
         Args:
             qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, which need not have unit length.
-            qvel: (N, nv) MuJoCo's generalised velocities; of a free joint the linear one in the world's frame, the
-                angular one in the body's.
+            qvel: (N, nv) MuJoCo's generalised velocities; a free joint's linear velocity is in the world frame, its
+                angular velocity in the body's.
             ctrl: (N, nu) one number per motor, [-1, 1] over its control range, constant over the step, not clipped.
 
         Returns:

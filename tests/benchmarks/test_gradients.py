@@ -8,7 +8,6 @@ import gradients
 import pytest
 import torch
 from common import parse
-from learners import refusal
 from tables import read_csv
 
 import diffsim
@@ -38,8 +37,3 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert [row["ground"] for row in rows] == [*gradients.GROUNDS]
     assert len({row["norm"] for row in rows}) == len(rows)
     assert all(abs(float(row["cosine"])) <= 1 for row in rows) and float(rows[0]["differences"]) > 0.99
-    for arguments, message in (
-        ([], "of what? give a checkpoint"),
-        ([str(POLICIES / "cartpole.pt")], "cartpole, which has no ground"),
-    ):
-        assert message in refusal(lambda a=arguments: gradients.main(parse(gradients.Args, None, a)), capsys)

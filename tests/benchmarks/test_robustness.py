@@ -115,20 +115,6 @@ def test_the_command_writes_a_row(tmp_path: Path) -> None:
     assert "sideways N" not in row and 10 < float(row["forward N"]) < 500
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("", "of what? give a checkpoint"),
-        ("cartpole.pt", "was trained on cartpole, whose episodes do not end with a fall"),
-        ("half_cheetah.pt", "was trained on half_cheetah, whose episodes do not end with a fall"),
-    ],
-)
-def test_what_cannot_be_pushed_over(arguments: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    args = parse(robustness.Args, None, arguments.split())
-    args.checkpoints = tuple(POLICIES / path for path in args.checkpoints)
-    assert message in refusal(lambda: robustness.main(args), capsys)
-
-
 def test_a_motion_that_ends_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

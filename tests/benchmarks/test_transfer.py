@@ -9,7 +9,6 @@ import pytest
 import torch
 import transfer
 from common import parse
-from learners import refusal
 from tables import markdown, read_csv
 
 import diffsim
@@ -60,21 +59,3 @@ def test_the_command_writes_a_row_for_each_world(tmp_path: Path, capsys: pytest.
     assert all(row["return"] and not row["speed"] for row in alone)
     line = lines["policies/cartpole"]
     assert float(line["here"]) == pytest.approx(float(line["MuJoCo x1"]), rel=0.02) and line["retained (worst)"] == ""
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("", "of what? give a checkpoint"),
-        ("none.pt", "no such checkpoint: "),
-        ("humanoid_mtu.pt", "humanoid_mtu, whose muscles are not simulated in MuJoCo here"),
-        ("other.pt", "was trained elsewhere: unknown task 'juggler': choose from cartpole, hopper"),
-    ],
-)
-def test_what_cannot_be_compared(name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = POLICIES / name if name == "humanoid_mtu.pt" else tmp_path / name
-    if name == "other.pt":
-        state = torch.load(POLICIES / "cartpole.pt", weights_only=True)
-        torch.save(state | {"args": state["args"] | {"env": "juggler"}}, path)
-    args = parse(transfer.Args, None, [str(path)] if name else [])
-    assert message in refusal(lambda: transfer.main(args), capsys)

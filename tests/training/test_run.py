@@ -27,7 +27,7 @@ import diffsim
 import shac
 from diffsim.env import DiffEnv
 from diffsim.tasks.cartpole import CartPole
-from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, distributed, evaluate, load_policy, parse
+from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, evaluate, load_policy, parse
 from diffsim.training.directory import COLUMNS
 
 # Iterations of a few milliseconds.
@@ -164,36 +164,6 @@ def test_a_directory_that_is_moved_is_made_again(tmp_path, monkeypatch):
     monkeypatch.setattr(bptt, "bptt_loss", moved)
     assert run(bptt, tmp_path / "run", *TINY, "--iterations", 3, "--quiet")["iteration"] == 3
     assert len(read_progress(tmp_path / "moved")) == 3
-
-
-def test_what_a_rank_has_is_saved_when_another_is_lost(tmp_path, monkeypatch, capsys):
-    """In the third iteration. A rank whose state is not there begins new episodes."""
-    calls, path, average = [], tmp_path / "checkpoint.pt", distributed.average
-
-    def all_reduce(_: Tensor) -> None:
-        raise RuntimeError("Connection closed by peer")  # gloo's
-
-    def lost(tensor: Tensor) -> Tensor:
-        calls.append(1)
-        if len(calls) > 6:
-            monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
-        return average(tensor)
-
-    argv = [*TINY, "--iterations", "5", "--quiet", "--run-dir", str(tmp_path)]
-    with monkeypatch.context() as patch:
-        patch.setattr("torch.distributed.all_reduce", all_reduce)
-        patch.setattr("torch.distributed.destroy_process_group", lambda: None)
-        patch.setattr("torch.distributed.get_rank", lambda: 0)
-        patch.setattr("torch.distributed.get_world_size", lambda: 1)
-        patch.setattr(distributed, "average", lost)
-        error = refusal(lambda: bptt.main(argv), capsys)
-    monkeypatch.undo()
-    state = checkpoint.load(path)
-    assert error == f"script.py: another process of this training is gone; {path} is of iteration {state['iteration']}"
-    assert 1 <= state["iteration"] < 5
-    torch.save(state | {"ranks": [None]}, path)
-    bptt.main(["--resume", str(path)])
-    assert checkpoint.load(path)["iteration"] == 5
 
 
 @pytest.mark.parametrize("part", ["reward", "observation 2"])
