@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import seeing
+from diffsim.training.layers import mlp, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
 
 # Windows: section 4.2 of the SHAC paper; everything else: its authors' released settings.
@@ -72,28 +73,14 @@ class Args(ParallelFlags):
 # Network --------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Sequential:
-    """Linear, ELU, LayerNorm per hidden layer and a linear output; torch's default or orthogonal initialisation."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True), nn.LayerNorm(width)]
-        inputs = width
-    layers.append(nn.Linear(inputs, outputs))
-    if orthogonal:
-        for layer in layers:
-            if isinstance(layer, nn.Linear):
-                nn.init.orthogonal_(layer.weight, math.sqrt(2))
-                nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
-
-
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        network = mlp(seen or obs_dim, args.hidden, action_dim, orthogonal=args.deterministic_policy)
+        orthogonal, elu = args.deterministic_policy, partial(nn.ELU, inplace=True)
+        network = mlp(seen or obs_dim, args.hidden, action_dim, elu, norm=True, orthogonal=orthogonal)
         self.mean = seeing(seen, network)
         log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
         self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)

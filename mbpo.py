@@ -28,7 +28,7 @@ from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, seeing
+from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Few, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -127,15 +127,6 @@ class Args(ParallelFlags):
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
-
-
-def mlp(inputs: int, hidden: Widths, outputs: int | None, activation: type[nn.Module]) -> nn.Sequential:
-    """Linear and activation per hidden layer, and a linear output, if any."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), activation()]
-        inputs = width
-    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
 
 
 class Actor(nn.Module):
@@ -328,9 +319,9 @@ class MBPO:
         args = self.args
         with torch.no_grad():
             action, density = self.actor(next_obs)
-            value = q_values(self.targets, next_obs, action).amin(0) - self.temperature["log"].exp() * density
+            value = self.targets.value(next_obs, action).amin(0) - self.temperature["log"].exp() * density
             target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
-        values = q_values(self.critics, obs, batch.action)
+        values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
         norm = self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -340,18 +331,12 @@ class MBPO:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         action, density = self.actor(obs)
-        value = q_values(self.critics, obs, action).amin(0)
+        value = self.critics.value(obs, action).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = action.shape[1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
-
-
-def q_values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-    """Each critic's Q(s, a) (2, B)."""
-    inputs = torch.cat((obs, action), -1)
-    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
 
 # SE-MBPO --------------------------------------------------------------------------------------------------------------

@@ -23,9 +23,9 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, moments, seeing
+from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Decay, Fraction, Natural, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 
 # The settings of ppo_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
 # fmt: off
@@ -66,8 +66,6 @@ class Args(ParallelFlags):
     """a particle is dead if its weight since the last resampling is below this share of 1 / particles"""
     dead_by: Literal["mean", "max"] = "mean"
     """weight that decides: the mean over the recorded steps, or the largest (Eq. 8)"""
-    log_particles: tuple[Natural, ...] = ()
-    """actions, counted from 0, whose particles' locations and mean weights are logged"""
 
     horizon: Count = 32
     """control steps of a rollout, of 1/60 s each (per task)"""
@@ -226,22 +224,13 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
     return layer
 
 
-def mlp(inputs: int, hidden: SomeWidths) -> nn.Sequential:
-    """Linear and ELU per hidden layer."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU()]
-        inputs = width
-    return nn.Sequential(*layers)
-
-
 class Actor(nn.Module):
     """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden))
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ELU))
         self.head = Head(args, args.hidden[-1], action_dim)
         self.value = nn.Linear(args.hidden[-1], 1)
 
@@ -267,8 +256,6 @@ class Resampling(nn.Module):
         self.seen: Tensor = nn.Buffer(torch.zeros(2, *head.shape))  # since the last one: sum and largest of weights
         self.age: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # iterations
         self.moved: Tensor = nn.Buffer(torch.zeros(()))  # particles, ever
-        if self.active and (wrong := [k for k in args.log_particles if k >= head.shape[0]]):
-            fail(f"--log-particles {wrong[0]}: the actions of {args.env!r} are 0 to {head.shape[0] - 1}")
 
     def record(self, acting: Mixture) -> None:
         """Take the weights (..., m, n) with which the policy acts."""
@@ -294,17 +281,13 @@ class Resampling(nn.Module):
         if self.args.resampling != "none":
             chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
             self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))
-        found = {
+        self.seen *= ~due
+        return {
             **{f"particles/dead_{by}": each.to(weight.dtype).mean() for by, each in below.items()},
             "particles/moved": self.moved,
             "particles/active": (-torch.xlogy(weight, weight).sum(-1)).exp().mean(),
             "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
         }
-        for name, values in (("loc", head.loc.clone()), ("weight", weight)):
-            for k in self.args.log_particles:
-                found |= {f"particles/{name}_{k}_{i}": value for i, value in enumerate(values[k].unbind())}
-        self.seen *= ~due
-        return found
 
     def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
         """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).

@@ -25,7 +25,7 @@ from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, seeing
+from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -186,22 +186,13 @@ def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
     return loc.float().repeat(actions, 1), widest.log().float().repeat(actions, 1)
 
 
-def mlp(inputs: int, hidden: SomeWidths, outputs: int | None = None) -> nn.Sequential:
-    """Linear and ReLU per hidden layer, and a linear output, if any."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ReLU()]
-        inputs = width
-    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
-
-
 class Actor(nn.Module):
     """pi(a|s), of normalized observations."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden))
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.head = Head(args, args.hidden[-1], action_dim)
 
     def forward(self, obs: Tensor) -> Mixture:
@@ -316,7 +307,7 @@ class SAC:
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
-        critics = [mlp(obs_dim + action_dim, args.critic_hidden, 1) for _ in range(2)]
+        critics = [mlp(obs_dim + action_dim, args.critic_hidden, 1, nn.ReLU) for _ in range(2)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)  # the entropy's weight
@@ -362,10 +353,10 @@ class SAC:
         with torch.no_grad():
             mixture = self.actor(next_obs)
             u = mixture.sample()
-            soft = values(self.targets, next_obs, torch.tanh(u)).amin(0)
+            soft = self.targets.value(next_obs, torch.tanh(u)).amin(0)
             soft = soft - self.temperature["log"].exp() * mixture.log_prob(u)
             target = batch.reward + self.args.gamma * (1 - batch.terminated) * soft
-        value = values(self.critics, obs, batch.action)
+        value = self.critics.value(obs, batch.action)
         loss = (value - target).square().mean(1).sum()
         self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -377,18 +368,12 @@ class SAC:
         mixture = self.actor(obs)
         u = self.sample(mixture)
         density = mixture.log_prob(u)
-        value = values(self.critics, obs, torch.tanh(u)).amin(0)
+        value = self.critics.value(obs, torch.tanh(u)).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         norm = self.optimizer.step(loss)
         surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
-
-
-def values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-    """Each critic's Q(s, a) (2, B)."""
-    inputs = torch.cat((obs, action), -1)
-    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
 
 # The run --------------------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import seeing
+from diffsim.training.layers import mlp, seeing
 from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
 
 # fmt: off
@@ -106,11 +106,7 @@ class Actor(nn.Module):
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        layers, inputs = list[nn.Module](), seen or obs_dim
-        for width in args.hidden:
-            layers += [nn.Linear(inputs, width), nn.ELU(), nn.LayerNorm(width)]
-            inputs = width
-        self.mean = seeing(seen, nn.Sequential(*layers, nn.Linear(inputs, action_dim)))
+        self.mean = seeing(seen, mlp(seen or obs_dim, args.hidden, action_dim, nn.ELU, norm=True))
 
     def forward(self, obs: Tensor) -> Tensor:
         """u (..., action_dim), the action before tanh."""

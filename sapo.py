@@ -25,8 +25,8 @@ from diffsim.tasks.mirror import Mirror
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import WindowFlags
-from diffsim.training.layers import ObsNormalizer, folded, make_even, seeing
-from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
+from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, seeing
+from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths
 
 # SHAC's networks; docs/sapo.md has what was measured with these settings, which are those of its best results.
 # fmt: off
@@ -137,24 +137,6 @@ class Args(WindowFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, hidden: Widths, activation: str) -> nn.Sequential:
-    """Linear, nonlinearity, LayerNorm per hidden layer."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), ACTIVATIONS[activation](), nn.LayerNorm(width)]
-        inputs = width
-    return nn.Sequential(*layers)
-
-
-def critic(args: Args, obs_dim: int, mirror: Mirror | None) -> nn.Sequential:
-    network = mlp(obs_dim, args.critic_hidden, args.activation).append(nn.Linear(args.critic_hidden[-1], 1))
-    for layer in network:
-        if isinstance(layer, nn.Linear):
-            nn.init.orthogonal_(layer.weight, math.sqrt(2))
-            nn.init.zeros_(layer.bias)
-    return folded(seeing(None, network, mirror), mirror and mirror.value)
-
-
 class Actor(nn.Module):
     """pi(a|s) of K members, tanh of a Gaussian. Observations are normalized by the statistics of all members."""
 
@@ -164,7 +146,7 @@ class Actor(nn.Module):
         super().__init__()
         K, width = args.population, args.actor_hidden[-1]
         self.normalizer = ObsNormalizer(obs_dim, mirror)
-        bodies = [mlp(seen or obs_dim, args.actor_hidden, args.activation) for _ in range(K)]
+        bodies = [mlp(seen or obs_dim, args.actor_hidden, None, ACTIVATIONS[args.activation], True) for _ in range(K)]
         self.body = Ensemble([seeing(seen, body, mirror) for body in bodies])
         means = [nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)]
         self.mean = Ensemble([folded(mean, mirror and mirror.action) for mean in means])
@@ -218,7 +200,10 @@ class SAPO:
         self.args, self.env, K, obs_dim = args, env, args.population, env.task.obs_dim
         mirror = env.task.mirror if args.symmetric else None
         self.actor = Actor(args, obs_dim, env.scene.nu, env.task.actor_dim, mirror).to(env.device)
-        self.critics = Ensemble([critic(args, obs_dim, mirror) for _ in range(args.critics * K)]).to(env.device)
+        options = args.critic_hidden, 1, ACTIVATIONS[args.activation]
+        networks = [mlp(obs_dim, *options, norm=True, orthogonal=True) for _ in range(args.critics * K)]
+        critics = [folded(seeing(None, network, mirror), mirror and mirror.value) for network in networks]
+        self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         log = torch.full((K,), math.log(args.initial_temperature))
         self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight

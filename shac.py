@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -23,7 +24,7 @@ from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import WindowFlags
-from diffsim.training.layers import Chain, folded, make_even, seeing
+from diffsim.training.layers import Chain, folded, make_even, mlp, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
@@ -46,6 +47,7 @@ PER_TASK = {
 # Near the pose from which a robot learns to walk
 STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01, "adjoint_clip": 5.0}
 BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"), STANDING | {"horizon": 16})
+ELU = partial(nn.ELU, inplace=True)
 ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  # where environments cost little
 
 
@@ -104,21 +106,6 @@ class Args(WindowFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Sequential:
-    """Linear, ELU, LayerNorm per hidden layer and a linear output; torch's default or orthogonal initialisation."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True), nn.LayerNorm(width)]
-        inputs = width
-    layers.append(nn.Linear(inputs, outputs))
-    if orthogonal:
-        for layer in layers:
-            if isinstance(layer, nn.Linear):
-                nn.init.orthogonal_(layer.weight, math.sqrt(2))
-                nn.init.zeros_(layer.bias)
-    return Chain(*layers)
-
-
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
@@ -127,7 +114,8 @@ class Actor(nn.Module):
     ) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim, mirror)
-        network = mlp(seen or obs_dim, args.actor_hidden, action_dim, orthogonal=args.deterministic_policy)
+        orthogonal = args.deterministic_policy
+        network = mlp(seen or obs_dim, args.actor_hidden, action_dim, ELU, norm=True, orthogonal=orthogonal)
         if args.initial_gain != 1.0:
             last = network[-1]
             assert isinstance(last, nn.Linear)
@@ -177,7 +165,7 @@ class SHAC:
         mirror = env.task.mirror if args.symmetric else None
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim, mirror).to(env.device)
         self.policy = self.actor.deterministic()
-        critic = seeing(None, mlp(obs_dim, args.critic_hidden, 1, orthogonal=True), mirror)
+        critic = seeing(None, mlp(obs_dim, args.critic_hidden, 1, ELU, norm=True, orthogonal=True), mirror)
         self.critic = folded(critic, mirror and mirror.value).to(env.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)

@@ -427,6 +427,6 @@ class Run:
             say(f"evaluation of iteration {iteration}, {args.eval_episodes} episodes: {evaluation}")
         say(f"written to {path}")
         if self.iteration < args.iterations:
-            say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} goes on")
+            say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} continues")
         elif self._evaluation:
             write_evaluation(args, self._evaluation[1], self.iteration)

@@ -83,6 +83,7 @@ def test_the_smallest_push_is_found() -> None:
 
     for first in (1.0, 500.0):
         assert 14 <= robustness.smallest(fallen, first) <= 14 * (1 + robustness.TOLERANCE)
+    assert 5 <= robustness.smallest(lambda newtons: newtons / 10, 1.0) <= 5 * (1 + robustness.TOLERANCE)
     assert robustness.smallest(lambda newtons: pushes.append(newtons) or 0.49, 3.0) == math.inf
     assert max(pushes) == 3.0 * robustness.MOST
 
