@@ -38,6 +38,7 @@ Name = Literal["hopper", "half_cheetah", "ant", "humanoid", "go1", "go2", "g1", 
 # With more than ROWS in all worlds together mujoco_warp 4.0.0 reads outside of its memory.
 ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64)}
 ROOM |= {"humanoid": (64, 256), "go1": (16, 96), "go2": (16, 96), "g1": (24, 192), "g1_track": (24, 192)}
+ROWS = 2**18
 PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
 HORIZON = 32  # control steps of a timed window
 
