@@ -1,8 +1,8 @@
 """MBPO, Model-Based Policy Optimization (Janner et al. 2019, https://arxiv.org/abs/1906.08253), and SE-MBPO.
 
-An ensemble of networks learns the dynamics; SAC learns from short rollouts of it, branched from real states. With
---sample-enhance (Qiao et al. 2021, https://arxiv.org/abs/2109.07719) the simulator's exact Jacobians add transitions
-around each real one.
+An ensemble of networks learns the dynamics, and SAC learns from its short rollouts, which branch from real states.
+--sample-enhance (Qiao et al. 2021, https://arxiv.org/abs/2109.07719) adds transitions around each real one by the
+simulator's Jacobians.
 
     python mbpo.py --env ant --seed 1                        train; writes runs/ant__mbpo__1__<time>/
     python mbpo.py --env ant --sample-enhance 4              SE-MBPO: four more transitions around each real one
@@ -58,7 +58,7 @@ class Args(ParallelFlags):
     """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
 
     steps: Count = 16
-    """control steps of an iteration (1/60 s each)"""
+    """control steps of an iteration"""
     seed_steps: Natural = 64
     """control steps of each environment with random actions before training starts"""
     buffer_size: Count = 1_000_000
@@ -78,7 +78,7 @@ class Args(ParallelFlags):
     branches: Count = 1000
     """rollouts that each elite makes at once, branched from real states"""
     rollout_lengths: tuple[Count, Count] = (1, 1)
-    """first and final steps of a rollout, which grow linearly over the first half of the iterations (per task)"""
+    """steps of a rollout at first and from half of the iterations on; they grow linearly between (per task)"""
     retain: Repeats = 4
     """iterations whose rollouts stay in the buffer"""
     sample_enhance: Natural = 0

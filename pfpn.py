@@ -1,8 +1,8 @@
 """PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301), by PPO.
 
-A Gaussian policy has one peak. Here each action has particles: normal distributions, the same in all states, whose
-weights the network gives. The policy is their mixture. Particles without weight are moved to those that have it. PPO
-trains this policy and those with which the paper compares it; pfpn_sac.py trains it off-policy.
+A Gaussian policy has one peak. Here each action has particles: normal distributions that are the same in all states,
+with weights from the network. The policy is their mixture. Particles without weight are moved to others that have some.
+PPO trains this policy and those with which the paper compares it; pfpn_sac.py trains it off-policy.
 
     python pfpn.py --env ant --seed 1                        train; writes runs/ant__pfpn__1__<time>/
     python pfpn.py --env ant --policy gaussian               or gmm, discrete: the policies to compare
@@ -49,7 +49,7 @@ class Args(ParallelFlags):
     """The policy, and PPO. Defaults are the humanoid's."""
 
     policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
-    """particles; one Gaussian; a mixture whose locations and scales depend on the state too; fixed bins"""
+    """particles; one Gaussian; a mixture whose locations and scales also depend on the state; fixed bins"""
     std: Literal["state", "own"] = "state"
     """standard deviation of the Gaussian policy: a function of the state, or one parameter per action"""
     particles: Several = 35
@@ -68,7 +68,7 @@ class Args(ParallelFlags):
     """weight that decides: the mean over the recorded steps, or the largest (Eq. 8)"""
 
     horizon: Count = 32
-    """control steps of a rollout, of 1/60 s each (per task)"""
+    """control steps of a rollout (per task)"""
     hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers, which policy and value share (per task)"""
     lr: Positive = 3e-4
@@ -94,8 +94,9 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        if self.lr_bounds[0] > self.lr_bounds[1]:
-            fail(f"--lr-bounds {self.lr_bounds}: the first must not exceed the second")
+        least, largest = self.lr_bounds
+        if least > largest:
+            fail(f"--lr-bounds {least} {largest}: the first must not exceed the second")
         if not LOG_STD[0] <= (self.initial_log_std or 0.0) <= LOG_STD[1]:
             fail(f"--initial-log-std must be from {LOG_STD[0]:g} to {LOG_STD[1]:g}, not {self.initial_log_std}")
 
@@ -313,7 +314,7 @@ class Resampling(nn.Module):
 
 
 class Rollout(NamedTuple):
-    """What happened in a window, time first: (H, N, ...)."""
+    """What happened in a rollout, time first: (H, N, ...)."""
 
     obs: Tensor  # s_t, on which the policy acted
     next_obs: Tensor  # s_{t+1}, before any reset
@@ -326,7 +327,7 @@ class Rollout(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What the update needs of a window's samples, or of some of them: (B, ...)."""
+    """What the update needs of a rollout's samples, or of some of them: (B, ...)."""
 
     obs: Tensor  # normalized
     action: Tensor
@@ -354,7 +355,7 @@ class PPO:
 
     @torch.no_grad()
     def interact(self) -> dict[str, Tensor]:
-        """Act for a window, and keep its samples with their advantages and value targets."""
+        """Act for a rollout, and keep its samples with their advantages and value targets."""
         args, normalizer, steps, obs = self.args, self.actor.normalizer, [], self.env.detach()
         for _ in range(args.horizon):
             mixture, value = self.actor(normalizer(obs))
@@ -364,19 +365,19 @@ class PPO:
             ends = terminated, terminated | truncated
             steps.append((obs, info["final_obs"], action, mixture.log_prob(action), value, reward, *ends))
             obs = next_obs
-        window = Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
-        mixture, next_value = self.actor(normalizer(window.next_obs))
-        next_value = self.return_normalizer.inverse(next_value).masked_fill(window.terminated, 0.0)
-        target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
-        advantage = target - self.return_normalizer.inverse(window.value)
+        rollout = Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
+        mixture, next_value = self.actor(normalizer(rollout.next_obs))
+        next_value = self.return_normalizer.inverse(next_value).masked_fill(rollout.terminated, 0.0)
+        target = td_lambda(rollout.reward, next_value, rollout.done, args.gamma, args.trace_decay)
+        advantage = target - self.return_normalizer.inverse(rollout.value)
         explained = 1 - advantage.var() / target.var()
         self.return_normalizer.update(target)
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
-        samples = normalizer(window.obs), window.action, window.log_prob, advantage, self.return_normalizer(target)
+        samples = normalizer(rollout.obs), rollout.action, rollout.log_prob, advantage, self.return_normalizer(target)
         for buffer, tensor in zip(self.batch, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
-        normalizer.update(window.obs)
+        normalizer.update(rollout.obs)
         return {"losses/entropy": mixture.entropy().mean(), "losses/explained_variance": explained}
 
     def learn(self) -> dict[str, Tensor]:
@@ -414,7 +415,7 @@ class PPO:
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, to a done or the window's end: the value and the generalized advantage.
+    """TD(lambda) of (H, N) steps, to a done or the rollout's end: the value and the generalized advantage.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """

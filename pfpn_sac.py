@@ -1,7 +1,7 @@
 """PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301), by SAC.
 
-The policy is a mixture of particles: normal distributions, the same in all states, whose weights the network gives.
-Soft Actor-Critic trains it off-policy, as in section 4.4 of the paper; the gradient of the critics goes on through the
+The policy is a mixture of particles: normal distributions that are the same in all states, with weights from the
+network. Soft Actor-Critic trains it off-policy, as in section 4.4 of the paper: the critics' gradient goes through the
 sampled actions. pfpn.py trains it by PPO.
 
     python pfpn_sac.py --env ant --seed 1                    train; writes runs/ant__pfpn_sac__1__<time>/
@@ -65,7 +65,7 @@ class Args(ParallelFlags):
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
 
     horizon: Count = 32
-    """control steps of a rollout (1/60 s each)"""
+    """control steps of a rollout"""
     hidden: SomeWidths = (512, 256)
     """units of the policy's hidden layers (per task)"""
     critic_hidden: SomeWidths = (512, 256)
@@ -318,7 +318,7 @@ class SAC:
 
     @torch.no_grad()
     def interact(self) -> dict[str, Tensor]:
-        """Act for a window, into the buffer."""
+        """Act for a rollout, into the buffer."""
         steps, obs, normalizer = [], self.env.detach(), self.actor.normalizer
         for _ in range(self.args.horizon):
             mixture = self.actor(normalizer(obs))
@@ -327,9 +327,9 @@ class SAC:
             next_obs, reward, terminated, _, info = self.env.step(action)
             steps.append((obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
             obs = next_obs
-        window = Transition(*(torch.cat(tensors) for tensors in zip(*steps, strict=True)))
-        self.buffer.add(window)
-        normalizer.update(window.obs)
+        rollout = Transition(*(torch.cat(tensors) for tensors in zip(*steps, strict=True)))
+        self.buffer.add(rollout)
+        normalizer.update(rollout.obs)
         return {}
 
     def learn(self) -> dict[str, Tensor]:

@@ -54,7 +54,7 @@ class Args(Flags):
     num_envs: Count = 32
     """action sequences N of an iteration (per order)"""
     horizon: Count = 50
-    """control steps T of a sequence (1/60 s each); it must divide an episode (per task)"""
+    """control steps T of a sequence; an episode must be a multiple of them (per task)"""
     improvements: Count = 1
     """line-searched steps of each sequence in an iteration (per order)"""
     candidates: Repeats = 8
@@ -66,7 +66,7 @@ class Args(Flags):
     action_cost: NonNegative = 1e-2
     """second order: cost of the squared action before tanh, which bounds it where tanh is flat"""
     imitate: Literal["visited", "improved"] = "visited"
-    """states at which improved actions are taught: those that the policy visited, or they lead to (per order)"""
+    """states at which improved actions are taught: those visited by the policy, or by these actions (per order)"""
     epochs: Count = 4
     """passes of the imitation over the sequences (per order)"""
     batch_size: Count = 512

@@ -54,7 +54,7 @@ class Args(SymmetricFlags):
     num_envs: Count = 1024
     """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
     horizon: Count = 32
-    """control steps of a rollout, of 1/60 s each (per task)"""
+    """control steps of a rollout (per task)"""
     hidden: Widths = (256, 128, 64)
     """units of the hidden layers that policy and value share (per task)"""
     lr: Positive = 3e-4
@@ -237,7 +237,7 @@ def collect(env: DiffEnv, policy: ActorCritic, noise: Tensor) -> Rollout:
 
 
 def gae(reward: Tensor, value: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at the dones and at the window's end.
+    """Advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at the dones and at the rollout's end.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """
@@ -273,7 +273,7 @@ def entropy(log_std: Tensor) -> Tensor:
 
 @torch.no_grad()
 def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) -> None:
-    """Divides lr by 1.5 where kl is beyond twice the target, and multiplies it by 1.5 below half of it."""
+    """Divide lr by 1.5 where kl is beyond twice the target, and multiply it by 1.5 where kl is below half of it."""
     lr.mul_(1.5 ** ((kl < target / 2).to(lr.dtype) - (kl > 2 * target).to(lr.dtype))).clamp_(*bounds)
 
 

@@ -54,13 +54,13 @@ class Args(ParallelFlags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
     iterations: Count = 20_000
-    """learning iterations, `steps` control steps of all environments with their updates each (per task)"""
+    """learning iterations: --steps control steps of all environments, each followed by updates (per task)"""
     large_batch: bool = False
     """many environments, large batches, layer-normalized critics: hopper, ant and humanoid in minutes of a GPU"""
     num_envs: Count = 64
     """parallel environments N (per task)"""
     steps: Count = 32
-    """control steps of an iteration (1/60 s each)"""
+    """control steps of an iteration"""
     updates_per_step: Repeats = 1
     """gradient updates of the critics after each control step of all environments"""
     actor_updates: Repeats = 1
@@ -177,6 +177,7 @@ class SAC:
         return self.iterate(learning=True)
 
     def iterate(self, learning: bool) -> dict[str, Tensor]:
+        """Control steps of all environments; when learning, those of the policy, each followed by updates."""
         metrics = []
         obs = self.env.detach()
         for _ in range(self.args.steps):
@@ -221,10 +222,8 @@ class SAC:
             values = self.targets.value(next_obs, action)
             if args.critic_subset < args.critics:
                 values = values[torch.rand(args.critics, device=obs.device).argsort()[: args.critic_subset]]
-            entropy = -self.temperature["log"].exp() * density
-            target = batch.reward + args.gamma * (1 - batch.terminated) * (
-                values.amin(0) + entropy
-            )  # none after a fall
+            value = values.amin(0) - self.temperature["log"].exp() * density
+            target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
         values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
         norm = self.critic_optimizer.step(loss)

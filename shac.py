@@ -1,7 +1,7 @@
 """SHAC, Short-Horizon Actor-Critic (Xu et al. 2022, https://arxiv.org/abs/2204.07137).
 
-The actor descends the gradient of a short window of simulated steps, taken through the simulator, with a value function
-at the window's end (Eq. 5); the value function is fitted to the TD(lambda) returns of the same window (Eq. 6 and 7).
+The actor descends the gradient of a short rollout, taken through the simulator, with a value function at the rollout's
+end (Eq. 5). The value function is fitted to the TD(lambda) returns of the same rollout (Eq. 6 and 7).
 
     python shac.py --env ant --seed 1                                   train; writes runs/ant__shac__1__<time>/
     python shac.py --resume runs/ant__shac__1__<time>/checkpoint.pt     continue an interrupted run exactly
@@ -44,7 +44,7 @@ PER_TASK = {
     "humanoid_imitation": ((256, 128), (128, 128), 2e-3, 5e-4, 0.995, 64, 2000),
 }
 # fmt: on
-# Near the pose from which a robot learns to walk
+# Robots with servos begin near their standing pose: little noise, actions near zero.
 STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01, "adjoint_clip": 5.0}
 BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"), STANDING | {"horizon": 16})
 ELU = partial(nn.ELU, inplace=True)
@@ -56,7 +56,7 @@ class Args(WindowFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
     horizon: Count = 32
-    """control steps h of a rollout (1/60 s each)"""
+    """control steps h of a rollout"""
     general_hyperparameters: bool = False
     """one setting for all tasks (Table 5) instead of the per-task ones"""
     deterministic_policy: bool = False
@@ -90,7 +90,7 @@ class Args(WindowFlags):
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh (per task)"""
     initial_gain: Positive = 1.0
-    """initial factor of the actor's last layer; a small one begins with actions near zero (per task)"""
+    """initial factor of the actor's last layer; with a small one, actions begin near zero (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
@@ -144,7 +144,7 @@ class Actor(nn.Module):
 
 
 class Rollout(NamedTuple):
-    """What happened in one window, time first: (H, N, ...)."""
+    """What happened in one rollout, time first: (H, N, ...)."""
 
     obs: Tensor  # s_t, on which the policy acted
     next_obs: Tensor  # s_{t+1}, before any reset
@@ -179,7 +179,7 @@ class SHAC:
         self.critic_optimizer.lr.fill_(args.critic_lr + (args.final_lr - args.critic_lr) * done)
 
     def update_actor(self) -> dict[str, Tensor]:
-        """Descend the loss of a window of all environments (Eq. 5); keep the critic's samples of it."""
+        """Act for a rollout, descend its loss (Eq. 5), and keep its samples for the critic."""
         args, normalizer = self.args, self.actor.normalizer
         rollout = collect(self.env, self.actor, self.actor.sample_noise(args.horizon, self.env.num_envs))
         next_value = self.next_values(rollout)
@@ -193,7 +193,7 @@ class SHAC:
         return {"losses/actor": loss.detach(), "grad/norm": norm, "charts/actor_lr": self.actor_optimizer.lr}
 
     def update_critic(self) -> dict[str, Tensor]:
-        """Fit the critic to the window's TD(lambda) returns (Eq. 6), and let the target critic follow."""
+        """Fit the critic to the rollout's TD(lambda) returns (Eq. 6), and let the target critic follow."""
         args = self.args
         losses = [torch.zeros_like(self.critic_optimizer.skipped)]
         batches = list(zip(*(part.chunk(args.critic_minibatches) for part in (self.obs, self.value)), strict=True))
@@ -239,7 +239,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the window's end does."""
+    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the rollout's end does."""
     returns = torch.empty_like(reward)
     following = next_value[-1]
     for t in reversed(range(len(reward))):

@@ -24,8 +24,8 @@ ClipFile = Annotated[
     tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar="FILE",
-        instance_from_str=lambda words: read_clip(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, Clip),
+        instance_from_str=lambda words: words[0],  # which _cli reads: tyro's complaints have many lines
+        is_instance=lambda value: value is None or isinstance(value, Clip | str),
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
@@ -55,9 +55,9 @@ class RunFlags:
     stop_after: Natural = 0
     """stop and save at this iteration, as Ctrl-C would; schedules still run to --iterations (0: do not stop)"""
     resume: Path | None = None
-    """checkpoint to continue from, with its arguments unless the command line gives others"""
+    """checkpoint, or directory of a run, to continue with its arguments unless the command line gives others"""
     evaluate: Path | None = None
-    """checkpoint to evaluate without training, e.g. with other --substeps; writes evaluation.json to --run-dir"""
+    """checkpoint, or directory of a run, to evaluate, e.g. with more --substeps; writes evaluation.json to --run-dir"""
     finer: bool = True
     """with --evaluate, also measure the return at four times the substeps, explicitly integrated"""
     track: bool = False
@@ -86,7 +86,7 @@ class Flags(RunFlags):
     """with --integrator mujoco: residual that ends the passes (per --accuracy)"""
     touchdown: bool = True
     """with --integrator mujoco: gradients include the jump at which a contact begins (docs/adjoint.md)"""
-    contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
+    contact: Contact = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
     early_termination: bool = True
     """end episodes when the robot falls; otherwise they end only by time"""
@@ -254,4 +254,12 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
-    return tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
+    args = tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
+    try:
+        args.clip = read_clip(args.clip) if isinstance(args.clip, str) else args.clip
+    except ValueError as error:
+        fail(f"--clip: {error}")
+    for name in ("resume", "evaluate"):
+        if (path := getattr(args, name)) and path.is_dir():
+            setattr(args, name, path / "checkpoint.pt")
+    return args

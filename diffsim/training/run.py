@@ -385,7 +385,6 @@ class Run:
         return torch.default_generator
 
     def _own_state(self) -> dict[str, Any]:
-        """The state of this rank."""
         env = self._env.state_dict() if self._env is not None else None
         return {"env": env, "rng": self._random_numbers().get_state()}
 

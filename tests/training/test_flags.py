@@ -97,6 +97,7 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
         ("--resume {elsewhere} --device cpu --iterations 9", "{elsewhere} was trained on cuda:0, which cpu cannot"),
         ("--evaluate {trained}/checkpoint.pt --run-dir {file}", "cannot write to run directory {file}"),
         ("--resume {trained}/checkpoint.pt", "is at iteration 2 already"),
+        ("--resume {trained}", "{trained}/checkpoint.pt is at iteration 2 already"),
         ("--resume {trained}/checkpoint.pt --iterations 20 --stop-after 2", "is at iteration 2 already"),
         ("--resume {file} --evaluate {file}", "--resume and --evaluate exclude each other"),
     ],
