@@ -164,12 +164,12 @@ WRONG = [  # a value: what is done to one that is right
     (
         "factors",
         lambda x: x[:, 1:],
-        "factors is (2, 7) torch.float32 cpu, must be a tensor of (2, 8)",
+        "factors is (2, 7) torch.float32 cpu, must be a torch.Tensor of (2, 8)",
     ),
     ("factors", torch.Tensor.double, "factors is (2, 8) torch.float64 cpu, must be"),
     ("factors", torch.Tensor.numpy, "factors is ndarray, must be"),
-    ("forces", lambda x: x[:, 1:], "forces is (2, 2, 6) torch.float32 cpu, must be a tensor of (2, 3, 6)"),
-    ("forces", lambda x: x.flatten(1), "forces is (2, 18) torch.float32 cpu, must be a tensor of (2, 3, 6)"),
+    ("forces", lambda x: x[:, 1:], "forces is (2, 2, 6) torch.float32 cpu, must be a torch.Tensor of (2, 3, 6)"),
+    ("forces", lambda x: x.flatten(1), "forces is (2, 18) torch.float32 cpu, must be a torch.Tensor of (2, 3, 6)"),
     ("forces", torch.Tensor.double, "forces is (2, 3, 6) torch.float64 cpu, must be"),
     ("forces", torch.Tensor.numpy, "forces is ndarray, must be"),
 ]

@@ -278,7 +278,7 @@ class Simulator:
             found = tuple(value.shape), value.dtype, value.device
         if found != (wanted := ((self.num_envs, *size), self.dtype, self.device)):
             have, must = (" ".join(map(str, each)) for each in (found, wanted))
-            raise ValueError(f"{name} is {have}, must be a tensor of {must}")
+            raise ValueError(f"{name} is {have}, must be a torch.Tensor of {must}")
 
     def _check_given(self, name: str, value: torch.Tensor, *size: int) -> torch.Tensor:
         """Factors or forces; raises ValueError unless they are finite, and factors not negative, divisors positive."""
