@@ -223,7 +223,9 @@ class SHAC:
         """
         (through,) = torch.autograd.grad(loss, noise)
         obs, std = self.actor.normalizer(rollout.obs), self.actor.log_std.exp()
-        advantage = discounts(rollout.done, self.args.gamma)[0] * (value - self.target(obs).squeeze(-1)).detach()
+        advantage = (
+            discounts(rollout.done, self.args.gamma, value.dtype)[0] * (value - self.target(obs).squeeze(-1)).detach()
+        )
         advantage = (advantage - advantage.mean(1, keepdim=True)) / advantage.numel()
         density = -advantage.unsqueeze(-1) * noise / std.detach().square()
         off, other = (g.var(1, keepdim=True).sum(-1, keepdim=True) for g in (through, density))
@@ -268,17 +270,17 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
     """Eq. 5 of (H, N) steps: each environment's rollout is cut at its dones, and the discount restarts after them."""
-    discount, ends = discounts(done, gamma)
+    discount, ends = discounts(done, gamma, reward.dtype)
     return -(discount * reward + discount * gamma * ends * next_value).mean()
 
 
-def discounts(done: Tensor, gamma: float) -> tuple[Tensor, Tensor]:
+def discounts(done: Tensor, gamma: float, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Of (H, N) steps gamma to the power of those since the start or the last done, and which ones end a rollout."""
     t = torch.arange(len(done), device=done.device).unsqueeze(1)
     starts, ends = done.roll(1, 0), done.clone()
     starts[0] = ends[-1] = True
     age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values
-    return gamma ** age.float(), ends
+    return gamma ** age.to(dtype), ends
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
