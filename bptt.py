@@ -42,8 +42,6 @@ PER_TASK = {
 class Args(ParallelFlags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "final_lr", "betas", "max_grad_norm", "gamma")
-
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""
     horizon: Count = 128

@@ -64,8 +64,6 @@ EXAMPLES = ASSETS / "examples"  # by task; benchmarks/gps_examples.py records th
 class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
-    MAY_CHANGE = (*Flags.MAY_CHANGE, "active", "adaptive", "lbfgs_iterations")
-
     iterations: Count = 80
     """iterations K of the policy search"""
     horizon: Repeats = 500

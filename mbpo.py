@@ -57,8 +57,6 @@ HELD_OUT_BATCH = 1024
 class Args(ParallelFlags):
     """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "steps", "updates", "batch_size", "real_ratio", "gamma", "tau")
-
     steps: Count = 16
     """control steps of an iteration (1/60 s each)"""
     seed_steps: Natural = 64

@@ -48,8 +48,6 @@ MAX_GRAD_NORM, TARGET_KL, CLIP, VALUE_COEF, BOUND_COEF = 1.0, 0.008, 0.2, 2.0, 1
 class Args(ParallelFlags):
     """The policy, and PPO. Defaults are the humanoid's."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "entropy_coef")
-
     policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
     """particles; one Gaussian; a mixture whose locations and scales depend on the state too; fixed bins"""
     std: Literal["state", "own"] = "state"

@@ -51,8 +51,6 @@ DENSITY = 0.01  # of an action, at least, in the implicit gradient
 class Args(ParallelFlags):
     """The policy, and SAC. Defaults are the humanoid's."""
 
-    MAY_CHANGE = (*ParallelFlags.MAY_CHANGE, "horizon", "lr", "temperature_lr")
-
     policy: Literal["pfpn", "gaussian"] = "pfpn"
     """particles, or one Gaussian"""
     particles: Several = 35

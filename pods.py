@@ -47,8 +47,6 @@ PER_ORDER = {
 class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
-    MAY_CHANGE = (*Flags.MAY_CHANGE, "improvements", "candidates", "max_step", "imitate", "epochs", "batch_size")
-
     iterations: Count = 120
     """learning iterations (per order)"""
     order: Literal[1, 2] = 1

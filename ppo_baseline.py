@@ -48,12 +48,6 @@ CPU = {"num_envs": 256, "minibatch_size": 2048}  # at most: where samples cost m
 class Args(SymmetricFlags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
-    MAY_CHANGE = (
-        *SymmetricFlags.MAY_CHANGE,
-        *("horizon", "epochs", "minibatch_size", "target_kl", "lr_bounds", "max_grad_norm", "gamma", "gae_lambda"),
-        *("clip_coef", "value_coef", "entropy_coef", "bound_coef"),
-    )
-
     iterations: Count = 5000
     """learning iterations, a rollout and its updates each (per task)"""
     num_envs: Count = 1024

@@ -53,12 +53,6 @@ LOG_STD = (-5.0, 2.0)  # bounds of the log standard deviation
 class Args(ParallelFlags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
-    MAY_CHANGE = (
-        *ParallelFlags.MAY_CHANGE,
-        *("steps", "updates_per_step", "actor_updates", "batch_size", "critic_subset"),
-        *("target_entropy", "gamma", "tau"),
-    )
-
     iterations: Count = 20_000
     """learning iterations, `steps` control steps of all environments with their updates each (per task)"""
     large_batch: bool = False

@@ -53,12 +53,6 @@ ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  
 class Args(WindowFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
-    MAY_CHANGE = (
-        *WindowFlags.MAY_CHANGE,
-        *("horizon", "actor_lr", "critic_lr", "final_lr", "betas", "max_grad_norm", "gamma", "td_lambda"),
-        *("target_alpha", "critic_iterations", "critic_minibatches"),
-    )
-
     horizon: Count = 32
     """control steps h of a rollout (1/60 s each)"""
     general_hyperparameters: bool = False

@@ -1,9 +1,8 @@
-"""Show the policy of any script's checkpoint, as a video or as a web page.
+"""Film the policy of any script's checkpoint: the beginning of the median one of several episodes.
 
-    python view.py runs/<run>/checkpoint.pt --video ant.mp4     a file for a talk or a web site; .gif as well
-    python view.py runs/<run> --web ant.html                    one page for any browser, without network access
+    python view.py runs/<run> --video ant.mp4                   .gif as well
 
-Video and page show the beginning of the median one of several episodes. `diffsim drive` shows a robot live.
+`diffsim drive` shows a robot live, in a browser.
 """
 
 from __future__ import annotations
@@ -20,17 +19,15 @@ import tyro
 from diffsim.tasks import find_task
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.evaluation import SEED, VIDEO_SECONDS, gait_lines
-from diffsim.view import render, web
+from diffsim.view import render
 
 
 @dataclass
 class Args:
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT")]
     """checkpoint of any script, or the directory of its run"""
-    video: Path | None = None
-    """write a video: .mp4 or .gif"""
-    web: Path | None = None
-    """write a page that plays the motion in a browser: .html"""
+    video: Path = Path("video.mp4")
+    """the file: .mp4 or .gif"""
     seconds: float = VIDEO_SECONDS
     """seconds of the episode to show"""
     episodes: int = 8
@@ -46,16 +43,11 @@ class Args:
 
     def check(self) -> None:
         """Refuse what the machine or the arguments forbid, before any work."""
-        if not (self.video or self.web):
-            fail("nothing to show: give --video or --web")
         if min(self.episodes, *self.size, self.substeps or 1) <= 0 or not 0 < self.seconds < math.inf:
             fail("--seconds, --episodes, --substeps and --size must be positive")
-        if self.web and self.web.suffix != ".html":
-            fail(f"--web: a page ends in .html, not {self.web.suffix!r}")
         try:
-            if self.video:
-                render.check_video(self.video, self.size)
-                render.check_opengl()
+            render.check_video(self.video, self.size)
+            render.check_opengl()
         except (ValueError, RuntimeError) as error:
             fail(f"--video: {error}")
 
@@ -81,11 +73,7 @@ def show(args: Args) -> None:
     if feet := evaluation.gait():
         print(gait_lines(feet))
     (qpos, action), ghost = evaluation.median_episode(args.seconds), evaluation.median_ghost()
-    if args.video:
-        print(f"video: {render.film(args.video, env.scene, qpos, env.control_dt, action, args.size, ghost)}")
-    if args.web:
-        caption = f"{name}\nreturn {evaluation.returns.median():.1f}"
-        print(f"page: {web.write_page(args.web, env.scene, qpos, env.control_dt, action, task, caption, ghost)}")
+    print(f"video: {render.film(args.video, env.scene, qpos, env.control_dt, action, args.size, ghost)}")
 
 
 if __name__ == "__main__":

@@ -23,9 +23,7 @@ import numpy as np
 import tables
 from tables import ROOT, Cells, read_csv
 
-import diffsim
 from diffsim.training import checkpoint, fail
-from diffsim.training.evaluation import FINER
 
 COLUMNS = ("iteration", "control_steps", "seconds", "return")  # of progress.csv, which a curve has
 Curve = dict[str, np.ndarray]
@@ -70,7 +68,7 @@ class Case(NamedTuple):
     folder: Path
     env: str
     seed: int
-    script: str
+    script: str  # without .py; "shac@2": two processes of torchrun
     flags: tuple[str, ...] = ()
 
 
@@ -90,24 +88,20 @@ class Runner:
         return self._call(case, *start, "--stop-after", until, *self.args.arguments)
 
     def evaluate(self, case: Case) -> bool:
-        """Evaluate the checkpoint in all ways in which that is not done; whether it is now."""
-        state = checkpoint.load(path := case.folder / "checkpoint.pt")
-        settings: dict[Path, list[object]] = {case.folder: ["--no-finer"]}
-        for substeps in checked(case.env, how := state["args"]):
-            law = "mujoco" if how["integrator"] == "mujoco" else "semi_implicit"
-            explicit = ["--integrator", law, "--theta", 0, "--substeps", FINER * substeps]
-            settings[finer(case.folder, substeps)] = ["--no-finer", *explicit]
-        return all(
-            evaluation(folder, state["iteration"]) or self._call(case, "--evaluate", path, "--run-dir", folder, *flags)
-            for folder, flags in settings.items()
-        )
+        """Evaluate the checkpoint, with finer steps as well, if that is not done; whether it is now."""
+        iteration = checkpoint.load(path := case.folder / "checkpoint.pt")["iteration"]
+        done = "finer" in evaluation(case.folder, iteration)
+        return done or self._call(case, "--evaluate", path, "--run-dir", case.folder)
 
     def _call(self, case: Case, *arguments: object) -> bool:
         """Whether the script came to its end. It is stopped, and saves, when the time is up."""
         left = self.stop_at - time.monotonic()
         if left <= 0:
             return False
-        command = [sys.executable, str(ROOT / f"{case.script}.py"), *map(str, arguments), "--device", self.args.device]
+        script, _, ranks = case.script.partition("@")
+        torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}", "--"] if ranks else []
+        command = [sys.executable, *torchrun, str(ROOT / f"{script}.py"), *map(str, arguments)]
+        command += ["--device", self.args.device]
         case.folder.mkdir(parents=True, exist_ok=True)
         with (case.folder / "output.txt").open("a") as output:
             process = subprocess.Popen(command, stdout=output, stderr=output)
@@ -179,15 +173,6 @@ def train(runner: Runner, cell: Cell) -> bool:
     return True
 
 
-def checked(env: str, how: Mapping[str, Any]) -> tuple[int, int]:
-    """Substeps of which the finer evaluations take multiples: a run's own, and the task's on that contact."""
-    return how["substeps"], diffsim.TASKS[env].integration("default", how.get("contact", "soft")).substeps
-
-
-def finer(folder: Path, substeps: int) -> Path:
-    return folder / f"explicit_{FINER * substeps}"
-
-
 def evaluation(folder: Path, iteration: int | None = None) -> dict[str, Any]:
     """What an evaluation left in a folder, of any or of that iteration's policy; empty if there is none."""
     path = folder / "evaluation.json"
@@ -208,7 +193,9 @@ def passing(run: Curve, target: float, x: str) -> float:
 
 
 def spread(values: Sequence[float]) -> str:
-    return f"{mean(values):.0f} ± {pstdev(values):.0f}" if len(values) > 1 else f"{values[0]:.0f}"
+    if len(values) == 1:
+        return f"{values[0]:.0f}"
+    return f"{mean(values):.0f} ± {pstdev(values):.{int(pstdev(values) < 0.5)}f}"
 
 
 # Results --------------------------------------------------------------------------------------------------------------

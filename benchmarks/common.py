@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -44,6 +42,7 @@ class CommonFlags:
     figures: Path | None = None  # directory of the pictures (default: that of the csv files)
     update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
     draw_only: bool = False  # measure nothing, read csv files
+    machine: str = ""  # whose results these are, a folder of results/ (default: that of --device)
     arguments: tyro.conf.Suppress[tuple[str, ...]] = ()  # what follows "--" on the command line
 
     @property
@@ -52,9 +51,13 @@ class CommonFlags:
         return () if self.draw_only else self.env
 
     @property
+    def place(self) -> str:
+        return self.machine or machine(self.device)
+
+    @property
     def directory(self) -> Path:
         tree = RESULTS if self.update_results else OUTPUT
-        return self.output.resolve() if self.output else tree / machine(self.device)
+        return self.output.resolve() if self.output else tree / self.place
 
     def csv(self, name: str) -> Path:
         return self.directory / f"{name}.csv"
@@ -236,23 +239,12 @@ class Panel(NamedTuple):
     log: str = ""  # the logarithmic axes: x, y or xy
 
 
-@functools.cache
-def can_draw() -> bool:
-    if importlib.util.find_spec("matplotlib"):
-        return True
-    print("pictures need matplotlib: pip install -e '.[test]'", file=sys.stderr)
-    return False
-
-
 WIDE = 3  # panels in a row: their text can be read where a page shows 800 pixels
 
 
 def plot(path: Path, grid: Sequence[Sequence[Panel]], size: tuple[float, float] = (3.4, 2.9)) -> None:
-    """Draw rows of panels, each of a size in inches, in blocks of WIDE columns below each other.
-
-    Without matplotlib it says so, once, and draws nothing.
-    """
-    if not grid[0] or not can_draw():
+    """Draw rows of panels, each of a size in inches, in blocks of WIDE columns below each other."""
+    if not grid[0]:
         return
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

@@ -26,32 +26,31 @@ from tables import ROOT
 
 from diffsim.training import fail
 
-# Spellings of a small training, the newest first: a revision runs the first that it takes.
-CASES: dict[str, tuple[str, ...]] = {
+CASES = {  # small trainings
     # each learner
-    "shac": ("shac --env hopper --num-envs 16",),
-    "sapo": ("sapo --env hopper --num-envs 16",),
-    "population": ("sapo --env hopper --population 2 --num-envs 16",),
-    "bptt": ("bptt --env hopper --num-envs 16",),
-    "pods": ("pods --env cartpole --num-envs 16",),
-    "ppo_baseline": ("ppo_baseline --env hopper --minibatch-size 512 --num-envs 16",),
-    "sac_baseline": ("sac_baseline --env hopper --num-envs 16",),
-    "mbpo": ("mbpo --env hopper --num-envs 16 --seed-steps 16 --model-updates 4 --updates 4 --sample-enhance 1",),
-    "pfpn": ("pfpn --env hopper --minibatch-size 512 --num-envs 16",),
-    "pfpn_sac": ("pfpn_sac --env hopper --num-envs 16", "pfpn --env hopper --algorithm sac --num-envs 16"),
-    "gps": ("gps --env cartpole --samples 4 --guiding-samples 4 --active 8 --horizon 20 --ilqr-iterations 2",),
+    "shac": "shac --env hopper --num-envs 16",
+    "sapo": "sapo --env hopper --num-envs 16",
+    "population": "sapo --env hopper --population 2 --num-envs 16",
+    "bptt": "bptt --env hopper --num-envs 16",
+    "pods": "pods --env cartpole --num-envs 16",
+    "ppo_baseline": "ppo_baseline --env hopper --minibatch-size 512 --num-envs 16",
+    "sac_baseline": "sac_baseline --env hopper --num-envs 16",
+    "mbpo": "mbpo --env hopper --num-envs 16 --seed-steps 16 --model-updates 4 --updates 4 --sample-enhance 1",
+    "pfpn": "pfpn --env hopper --minibatch-size 512 --num-envs 16",
+    "pfpn_sac": "pfpn_sac --env hopper --num-envs 16",
+    "gps": "gps --env cartpole --samples 4 --guiding-samples 4 --active 8 --horizon 20 --ilqr-iterations 2",
     # the physics and the tasks
-    "cartpole": ("shac --env cartpole --num-envs 16",),
-    "half_cheetah": ("shac --env half_cheetah --num-envs 16",),
-    "ant": ("shac --env ant --num-envs 16",),
-    "humanoid": ("shac --env humanoid --num-envs 16",),
-    "humanoid_mtu": ("shac --env humanoid_mtu --num-envs 16",),
-    "sapo_humanoid_mtu": ("sapo --env humanoid_mtu --num-envs 16",),
-    "humanoid_imitation": ("shac --env humanoid_imitation --num-envs 16",),
-    "mujoco": ("shac --env ant --contact mujoco --num-envs 16",),
-    "joystick": ("shac --env go2 --num-envs 16",),
-    "fast": ("shac --env half_cheetah --integrator implicit --substeps 8 --num-envs 16",),
-    "accurate": ("shac --env half_cheetah --integrator extrapolated --substeps 16 --num-envs 16",),
+    "cartpole": "shac --env cartpole --num-envs 16",
+    "half_cheetah": "shac --env half_cheetah --num-envs 16",
+    "ant": "shac --env ant --num-envs 16",
+    "humanoid": "shac --env humanoid --num-envs 16",
+    "humanoid_mtu": "shac --env humanoid_mtu --num-envs 16",
+    "sapo_humanoid_mtu": "sapo --env humanoid_mtu --num-envs 16",
+    "humanoid_imitation": "shac --env humanoid_imitation --num-envs 16",
+    "mujoco": "shac --env ant --contact mujoco --num-envs 16",
+    "joystick": "shac --env go2 --num-envs 16",
+    "fast": "shac --env half_cheetah --integrator implicit --substeps 8 --num-envs 16",
+    "accurate": "shac --env half_cheetah --integrator extrapolated --substeps 16 --num-envs 16",
 }
 SMALL = "--device {} --threads 1 --iterations 4 --stop-after 3 --eval-every 0 --quiet"
 TRAIN_AND_HASH = """
@@ -80,17 +79,15 @@ def depends(command: str) -> set[str]:
 
 
 def fingerprint(checkout: Path, name: str, device: str = "cpu") -> str:
-    """The hash of a case's policy, trained by the scripts of a checkout; empty if it takes no spelling."""
-    errors = list[str]()
-    for script, *flags in map(str.split, CASES[name]):
-        with TemporaryDirectory() as folder:
-            words = [str(checkout / f"{script}.py"), *flags, *SMALL.format(device).split(), "--run-dir", folder]
-            call, paths = [sys.executable, "-c", TRAIN_AND_HASH, *words], {"PYTHONPATH": str(checkout)}
-            done = subprocess.run(call, cwd=folder, env=os.environ | paths, capture_output=True, text=True)
-        if done.returncode == 0:
-            return done.stdout.split()[-1]
-        errors.append((done.stderr.strip() or "failed").splitlines()[-1])
-    print(f"{name} does not run in {checkout}: {errors[0]}", flush=True)
+    """The hash of a case's policy, trained by the scripts of a checkout; empty if they do not train it."""
+    script, *flags = CASES[name].split()
+    with TemporaryDirectory() as folder:
+        words = [str(checkout / f"{script}.py"), *flags, *SMALL.format(device).split(), "--run-dir", folder]
+        call, paths = [sys.executable, "-c", TRAIN_AND_HASH, *words], {"PYTHONPATH": str(checkout)}
+        done = subprocess.run(call, cwd=folder, env=os.environ | paths, capture_output=True, text=True)
+    if done.returncode == 0:
+        return done.stdout.split()[-1]
+    print(f"{name} does not run in {checkout}: {(done.stderr.strip() or 'failed').splitlines()[-1]}", flush=True)
     return ""
 
 

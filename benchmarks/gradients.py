@@ -1,11 +1,10 @@
-"""What hard contact does to gradients: their size, and whether they point where the mean return rises.
+"""What hard contact does to gradients: whether they point where the mean return rises.
 
     python benchmarks/gradients.py runs/learning/ppo_mujoco/*__1        policies of tasks with ground, one of each
 
 A policy acts with noise from states that it visits. The reward of a window is differentiated with respect to a shift
-of all of the window's actions, in each environment: how long these gradients are, and how well their mean agrees with
-differences of the mean reward, which see jumps that no derivative sees; also after each gradient was clipped to the
-length that one in a hundred exceeds. Differences of two sizes must agree, or the mean reward has no slope to compare
+of all of the window's actions: how well its mean over the environments agrees with differences of the mean reward,
+which see jumps that no derivative sees. Differences of two sizes must agree, or the mean reward has no slope to compare
 with. The grounds are the paper's springs and MuJoCo's own contact, whose gradients count that it begins with a jump, or
 not. Writes gradients.csv.
 """
@@ -70,12 +69,6 @@ def differences(env: DiffEnv, policy: torch.nn.Module, horizon: int, noise: Tens
     return torch.stack(slopes)
 
 
-def clip(each: Tensor) -> Tensor:
-    """Gradients (N, nu), none longer than the length that one in a hundred exceeds."""
-    norms = each.norm(dim=1, keepdim=True)
-    return each * (norms.quantile(0.99) / norms).clamp(max=1.0)
-
-
 def measure(args: Args, path: Path) -> Iterator[Row]:
     """Rows of one policy."""
     case = common.load_case(path, 1, "cpu")
@@ -97,12 +90,10 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
             slopes, finer = (differences(env, policy, horizon, noise, size) for size in (SHIFT, SHIFT / 2))
             shift = torch.zeros(n, env.scene.nu, requires_grad=True)
             (each,) = torch.autograd.grad(window(env, policy, horizon, shift, noise).sum(), shift)
-            norms = each.norm(dim=1)
             row = {"task": task, "learner": case.saved.script, "horizon": horizon, "ground": ground}
-            row |= {"norm": float(norms.median()), "norm 95 %": float(norms.quantile(0.95)), "most": float(norms.max())}
-            vectors = {"cosine": each.mean(0), "clipped": clip(each).mean(0), "differences": finer}
+            vectors = {"cosine": each.mean(0), "differences": finer}
             row |= {name: float(torch.cosine_similarity(x, slopes, dim=0)) for name, x in vectors.items()}
-            yield row | {"environments": n}
+            yield row | {"norm": float(each.norm(dim=1).median()), "environments": n}
 
 
 def shown(rows: list[dict[str, str]]) -> list[Row]:

@@ -1,6 +1,6 @@
 """The results of docs/experiments.md as one list of cells: a learner on a task with a seed, trained to its end, alone.
 
-    python benchmarks/paper.py --check                             what is missing, and results of no known origin
+    python benchmarks/paper.py --check                             what is missing
     python benchmarks/paper.py --only headline --update-results    this machine's missing cells, then the tables
     python benchmarks/paper.py --learners sapo --train-only        on a machine that is lent: bring runs/paper home
     python benchmarks/paper.py --pace 100                          there, alone: the seconds of an iteration
@@ -30,14 +30,12 @@ import common
 import fingerprints
 import numpy as np
 import tables
-import transfer
 from cells import GROUPS, LEARNERS, RETURNS, Cell, Curve, Group, Runner, ScriptFlags, curve, evaluation, read_cells
-from common import LEARNT, TASKS, Line, Panel, Tasks, check_names, load_case, plot, run
+from common import LEARNT, TASKS, Line, Panel, Tasks, check_names, plot, run
 from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, read_csv
 
 import diffsim
 from diffsim.training import Natural, checkpoint
-from diffsim.training.evaluation import kept
 
 KEY = ("learner", "task", "seed")
 POINTS = 50  # of a curve
@@ -52,7 +50,6 @@ class Args(ScriptFlags):
     only: tuple[str, ...] = tuple(name for name in GROUPS if not GROUPS[name].older)  # groups
     learners: tuple[str, ...] = ()  # learners (default: all of a group)
     seeds: tuple[int, ...] = ()  # seeds (default: all of a group)
-    machine: str = ""  # whose cells these are (default: that of --device)
     check: bool = False  # only say what is missing
     train_only: bool = False  # evaluate nothing
     evaluate_only: bool = False  # train nothing
@@ -65,14 +62,6 @@ class Args(ScriptFlags):
     def alone(self, cell: Cell) -> bool:
         """Whether a cell's seconds mean something."""
         return cell.timed and not self.shared
-
-    @property
-    def place(self) -> str:
-        return self.machine or common.machine(self.device)
-
-    @property
-    def directory(self) -> Path:
-        return self.output or (common.RESULTS if self.update_results else common.OUTPUT) / self.place
 
 
 def wanted(args: Args) -> Iterator[Cell]:
@@ -104,29 +93,26 @@ def measure_pace(args: Args, runner: Runner, cell: Cell) -> Row:
 
 
 def measure(args: Args, runner: Runner, cell: Cell) -> Row:
-    """A cell's line: what its training and all its evaluations say; empty if it is not whole."""
+    """A cell's line: what its training and its evaluation say; empty if it is not whole."""
     case = cell.case(args.runs)
     path = case.folder / "checkpoint.pt"
     if not path.is_file() or not (case.folder / "cell.json").is_file():
         return {}
     state = checkpoint.load(path)
-    how, begun = state["args"], json.loads((case.folder / "cell.json").read_text())
-    if state["iteration"] < how["iterations"] or not runner.evaluate(case):
+    begun = json.loads((case.folder / "cell.json").read_text())
+    if state["iteration"] < state["args"]["iterations"] or not runner.evaluate(case):
         return {}
-    folders = case.folder, *(cells.finer(case.folder, n) for n in cells.checked(cell.task, how))
-    own, finest, reference = map(evaluation, folders)
+    own = evaluation(case.folder)
     progress, returns = read_csv(case.folder / "progress.csv"), RETURNS[cell.task]
     row: dict[str, object] = dict(zip(KEY, cell[1:], strict=True)) | begun
     row |= {"iterations": state["iteration"], "control steps": float(progress[-1]["control_steps"])}
     row |= {"training (s)": float(progress[-1]["seconds"]), "return": own["return"]}
     row |= {"speed": "" if own["speed"] is None else own["speed"]}
     row |= {"falls": mean(length < diffsim.TASKS[cell.task].episode_length for length in own["lengths"])}
-    row |= {"kept": kept(own["return"], finest["return"]), "in the reference": reference["return"]}
+    row |= {"kept": own["finer"]["kept"]}
     for target in returns.timed or (returns.target,):
         for x in ("control_steps", "seconds"):
             row[f"{x} to {target}"] = cells.passing(curve(progress), target, x)
-    found = transfer.in_mujoco(load_case(path, len(own["lengths"]), "cpu"))
-    row |= {f"{name} in MuJoCo": found[name] for name in ("return", "speed") if found}
     if not args.alone(cell):
         row |= dict.fromkeys([name for name in row if "(s)" in name or name.startswith("seconds")], "")
     return row
@@ -212,9 +198,7 @@ def line(rows: Sequence[Cells]) -> Row:
     shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"]}
     shown["return"] = f"{median(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
     shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
-    shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}", "kept": middle(rows, "kept", ".3f")}
-    shown |= {"in the reference": middle(rows, "in the reference", ".0f")}
-    shown |= {name: middle(rows, name, ".2f") for name in ("speed", "speed in MuJoCo")}
+    shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}"}
     target = RETURNS[task].target
     time, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
     shown |= {"paced": max(row.get("paced", "") for row in rows)}
@@ -267,7 +251,7 @@ def printed(args: Args, name: str) -> str:
 
 
 def check(args: Args) -> str:
-    """What is missing, a line for each learner and task; then csv files whose origin is unknown, or not in history."""
+    """What is missing, a line for each learner and task."""
     lines, missing, count = list[str](), dict[tuple[str, str, str], list[Cell]](), 0
     known = {name: read_cells(common.RESULTS / name) for name in {GROUPS[g].machine for g in args.only}}
     for cell in wanted(args):
@@ -279,9 +263,6 @@ def check(args: Args) -> str:
         lines.append(f"{each[0].machine}: {each[0].command.replace(f'--seed {each[0].seed}', f'--seed {{{seeds}}}')}")
     lines.append(f"{sum(map(len, missing.values()))} of {count} cells are missing")
     lines += [unrecorded] if (unrecorded := fingerprints.open_end()) else []
-    for path in sorted(common.RESULTS.glob("*/*.csv")):
-        if found := next((bad for origin in tables.origins(path) if (bad := tables.unknown(origin))), ""):
-            lines.append(f"{path.relative_to(common.RESULTS.parent)}: {found}")
     return "\n".join(lines)
 
 

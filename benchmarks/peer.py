@@ -3,6 +3,7 @@
     python benchmarks/peer.py                                            control steps per second of all
     python benchmarks/peer.py --parts train --env ant --seconds 100      ppo_baseline.py, trained in mujoco_warp
     python benchmarks/transfer.py runs/learning/ppo_mujoco_warp/ant__1   judges its policy here and in MuJoCo
+    python benchmarks/peer.py --parts train --env g1_track -- --clip g1_jazz_walk
 
 What follows "--" goes to ppo_baseline.py. mujoco_warp has at most 10 iterations of Newton's method and 20 of the line
 search, as in its own benchmark of a humanoid; this simulator passes until it has converged to its tolerance.
@@ -32,11 +33,11 @@ import ppo_baseline
 from diffsim.training import Count, Positive, Run, fail, graph, parse
 
 PartName = Literal["speed", "train"]
-Name = Literal["hopper", "half_cheetah", "ant", "humanoid", "go1", "go2", "g1"]
+Name = Literal["hopper", "half_cheetah", "ant", "humanoid", "go1", "go2", "g1", "g1_track"]
 # Contacts and rows of constraints for which mujoco_warp has room in a world; `lost` tells whether they are too few.
 # With 320 rows mujoco_warp 4.0.0 reads outside of its memory.
 ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64)}
-ROOM |= {"humanoid": (64, 256), "go1": (16, 96), "go2": (16, 96), "g1": (24, 192)}
+ROOM |= {"humanoid": (64, 256), "go1": (16, 96), "go2": (16, 96), "g1": (24, 192), "g1_track": (24, 192)}
 PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
 HORIZON = 32  # control steps of a timed window
 
@@ -160,16 +161,17 @@ def train(args: Args, name: Name) -> Iterator[Row]:
 
 
 KEY = ("task", "environments")
+SPEED = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward", "lost"  # of the columns those that a page shows
+TRAIN = "task", "seed", "control steps", "training (s)", "control steps/s", "return", "lost"
 
 
-def shown(rows: list[Cells]) -> list[Row]:
-    columns = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward", "lost"
+def shown(columns: tuple[str, ...], rows: list[Cells]) -> list[Row]:
     return [{name: row.get(name, "") for name in columns} for row in rows]
 
 
 PARTS = {
-    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", shown),
-    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md"),
+    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", partial(shown, SPEED)),
+    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", partial(shown, TRAIN)),
 }
 
 

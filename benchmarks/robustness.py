@@ -1,12 +1,11 @@
 """What a policy's gait withstands: the smallest push that fells it.
 
     python benchmarks/robustness.py runs/learning/shac/ant__1          a run, or a checkpoint of any learner's script
-    python benchmarks/robustness.py runs/*/* --body torso --after 5
 
 Robots walk for 2 to 4 s, each for a time of its own, so that they are in any phase of their gait. Then each is pushed
 at its trunk, as in Table 1 of the PFPN paper (Xu and Karamouzas 2021). To fall is to end an episode of the task.
 
-Writes robustness.csv, a row for each policy, and prints its table; docs/pfpn.md quotes means.
+Writes robustness.csv, a row for each policy. docs/pfpn.md quotes means.
 """
 
 from __future__ import annotations
@@ -19,17 +18,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import common
-import mujoco
 import torch
-from common import ABOUT, Case, load_case, run
-from tables import Row, grouped, markdown
+from common import ABOUT, Case, Part, load_case, measured, run
+from tables import Row
 from torch import Tensor
 from worlds import Here, State, Step, rollout, starts
 
-import diffsim
 from diffsim import DiffEnv, Simulator
 from diffsim.tasks import HumanoidImitation
-from diffsim.training import Count, Positive, fail
+from diffsim.training import Count, fail
 from diffsim.training.evaluation import SEED
 
 WALK = (2.0, 4.0)  # s before the push
@@ -38,23 +35,20 @@ DIRECTIONS = {"forward": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0)}
 FIRST = 1 / 16  # the first push, as a share of the weight
 MOST = 2**10  # the search ends at this multiple of the first push
 TOLERANCE = 0.02  # relative error of the smallest push
-GROUP = ("task", "learner", "contact", "mass")  # columns in which the seeds of a table's row agree
-EACH = ("seed", *(f"{way} {unit}" for unit in ("N", "m/s") for way in DIRECTIONS))  # which it has of each seed
+AFTER = 3.0  # s from the beginning of the push in which a robot falls, or has survived
+TRUNK = 1  # the pushed body: the robot's first
 
 
 @dataclass
 class Args(common.CheckpointFlags):
     num_envs: Count = 64  # robots that begin to walk
-    body: str = ""  # the pushed one, by its name in the MJCF (default: the robot's first)
-    after: Positive = 3.0  # s from the beginning of the push in which a robot falls, or has survived
 
 
 class Walkers(NamedTuple):
-    """Robots under their policy, which forces may push at a body; of env the task and the simulator are taken over."""
+    """Robots under their policy, which forces may push at the trunk; env gives the task and the simulator."""
 
     env: DiffEnv
     policy: Callable[[Tensor], Tensor]
-    body: int
     start: State
 
     def steps(self, seconds: float) -> int:
@@ -67,7 +61,7 @@ class Walkers(NamedTuple):
         sim = Simulator(env.scene, len(self.start.qpos), control_dt=env.control_dt, **placed._asdict())
 
         def push(step: int, state: State) -> State:
-            sim.forces[:, self.body, :3] = force if force is not None and step < pushed else 0.0
+            sim.forces[:, TRUNK, :3] = force if force is not None and step < pushed else 0.0
             return state
 
         return rollout(Here(sim), env.task, self.policy, self.start, self.steps(seconds), push)
@@ -81,9 +75,9 @@ class Walkers(NamedTuple):
         return step.fallen
 
 
-def walking(env: DiffEnv, policy: Callable[[Tensor], Tensor], body: int) -> Walkers:
+def walking(env: DiffEnv, policy: Callable[[Tensor], Tensor]) -> Walkers:
     """The robots that still walk after a time, drawn for each, within WALK."""
-    walkers = Walkers(env, policy, body, starts(env))
+    walkers = Walkers(env, policy, starts(env))
     first, last = map(walkers.steps, WALK)
     at = torch.randint(first, last + 1, (env.num_envs,), generator=torch.Generator().manual_seed(SEED)).to(env.device)
     found, standing = State(*(part.clone() for part in walkers.start)), torch.zeros_like(at, dtype=torch.bool)
@@ -111,56 +105,36 @@ def smallest(share: Callable[[float], float], first: float) -> float:
     return high
 
 
-def load(path: Path, args: Args) -> tuple[Case, int]:
-    """The policy and the body to push; what cannot be pushed over ends the benchmark with one line."""
+def load(args: Args, path: Path) -> Case:
+    """The policy; one that cannot be pushed over ends the benchmark with one line."""
     case = load_case(path, args.num_envs, args.device)
-    scene, name = case.env.scene, case.env.task.name
     if not case.env.task.falls():
-        fail(f"{case.path} was trained on {name}, whose episodes do not end with a fall")
+        fail(f"{case.path} was trained on {case.env.task.name}, whose episodes do not end with a fall")
     if isinstance(case.env.task, HumanoidImitation) and not case.env.task.clip.loop:
         fail(f"{case.path} tracks a motion that ends, and with it the episode: train with a loop")
-    body = mujoco.mj_name2id(scene.mj_model, mujoco.mjtObj.mjOBJ_BODY, args.body) if args.body else 1
-    if body < 1:
-        names = ", ".join(scene.mj_model.body(k).name for k in range(1, scene.nbody))
-        fail(f"--body: the robot has no {args.body!r}; choose from {names}")
-    return case, body
+    return case
 
 
-def measure(case: Case, body: int, args: Args) -> Row:
-    env, scene = case.env, case.env.scene
-    walkers, mass = walking(env, case.saved.network.to(env.device), body), float(scene.mass.sum())
+def measure(args: Args, path: Path) -> Iterator[Row]:
+    case = load(args, path)
+    env, scene, mass = case.env, case.env.scene, float(case.env.scene.mass.sum())
+    walkers = walking(env, case.saved.network.to(env.device))
     if 2 * (count := len(walkers.start.qpos)) < env.num_envs:
         fail(f"only {count} of {env.num_envs} walk for {WALK[0]:g} to {WALK[1]:g} s without a push")
 
     def fallen(direction: str, newtons: float) -> float:
-        return float(walkers.felled(args.after, direction, newtons).double().mean())
+        return float(walkers.felled(AFTER, direction, newtons).double().mean())
 
     if (unpushed := fallen("forward", 0.0)) >= 0.5:
         fail(f"{unpushed:.0%} fall without a push")
-    row = case.about | {"body": scene.mj_model.body(body).name, "after": args.after}
-    row |= {"robots": count, "unpushed": unpushed, "mass": mass}
+    row = case.about | {"robots": count, "unpushed": unpushed, "mass": mass}
     for direction in DIRECTIONS if scene.floating else ("forward",):  # what is planar does not feel the other
-        least = smallest(partial(fallen, direction), FIRST * 9.81 * mass)
-        row |= {f"{direction} N": least, f"{direction} m/s": least * walkers.steps(PUSH) * env.control_dt / mass}
-    return row
-
-
-def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each learner on a task: each seed's smallest pushes, and the change of speed that they would cause."""
-    tasks = [*diffsim.TASKS, *(row["task"] for row in rows)]
-    rows = sorted(rows, key=lambda row: (tasks.index(row["task"]), row["checkpoint"]))
-    each = {
-        group: {name: ", ".join(row.get(name, "") for row in seeds) for name in EACH}
-        for group, seeds in grouped(rows, *GROUP).items()
-    }
-    return [dict(zip(GROUP, group, strict=True)) | cells for group, cells in each.items()]
+        row[f"{direction} N"] = smallest(partial(fallen, direction), FIRST * 9.81 * mass)
+    yield row
 
 
 def main(args: Args) -> None:
-    for case, body in [load(path, args) for path in args.measured]:
-        print(f"{case.label}: {case.env.task.name}, {case.saved.script}.py", flush=True)
-        args.keep("robustness", measure(case, body, args), ABOUT[:-1])
-    args.publish("robustness", markdown(table(args.read("robustness")), ("task", "learner", *EACH)), "pfpn.md")
+    measured(args, Part("robustness", measure, ABOUT[:-1]))
 
 
 if __name__ == "__main__":

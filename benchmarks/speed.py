@@ -1,8 +1,7 @@
 """How fast the simulator is, against MuJoCo's C step on the same model in the same run.
 
-    python benchmarks/speed.py                                every task, 64 and 256 environments
-    python benchmarks/speed.py --device cuda                  on a GPU: as CUDA graphs and operation by operation
-    python benchmarks/speed.py --parts scaling --env ant      cost against environments (64 to 65,536) and horizon
+    python benchmarks/speed.py                                every task on a core, 64 and 256 environments
+    python benchmarks/speed.py --device cuda --parts scaling --env ant    64 to 65,536 environments, as CUDA graphs
 
 Prints markdown tables and writes their rows to speed_*.csv, in place of older rows of the same setting, and speed.png.
 A machine that does something else meanwhile gives wrong numbers.
@@ -13,11 +12,11 @@ from __future__ import annotations
 import dataclasses
 import gc
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from statistics import median
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import mujoco
 import torch
@@ -28,14 +27,13 @@ from tables import Row
 import diffsim
 from diffsim import Scene, Simulator
 from diffsim.kernels.lanes import divide
-from diffsim.sim.launcher import TooLargeError, available_cores
+from diffsim.sim.launcher import TooLargeError
 from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
 from diffsim.tune.front import clock
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
-THREADS = {"cpu, 1 thread": 1, "cpu, all cores": available_cores()}  # techniques of a CPU
-GRAPHS = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"  # of a GPU
+TECHNIQUES = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"
 PartName = Literal["physics", "scaling"]
 SCALING = (64, 256, 1024, 4096, 16384, 65536)  # environments of the scaling table, at a horizon of 32
 HORIZONS = (1, 4, 8, 16, 32, 64, 128)  # its horizons, at 64 environments
@@ -54,7 +52,6 @@ class Args(CommonFlags):
 
 State = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 Times = dict[str, float]  # microseconds
-K = TypeVar("K", bound=Hashable)
 
 
 @torch.no_grad()
@@ -105,12 +102,14 @@ def mujoco_timer(scene: Scene, num_envs: int, timestep: float, substeps: int) ->
     return time_step
 
 
-def race(competitors: Mapping[K, Callable[[State], Times]], states: Sequence[State], repeats: int) -> dict[K, Times]:
+def race(
+    competitors: Mapping[str, Callable[[State], Times]], states: Sequence[State], repeats: int
+) -> dict[str, Times]:
     """In each state all take their turn, many times, and each one's fastest counts; medians over the states.
 
     The first state compiles and fills caches, and does not count.
     """
-    found: dict[K, list[Times]] = {key: [] for key in competitors}
+    found: dict[str, list[Times]] = {key: [] for key in competitors}
     for call in competitors.values():
         call(states[0])
     for state in states[1:]:
@@ -126,11 +125,7 @@ def without_muscles(scene: Scene) -> Scene:
 
 
 def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
-    """Beside MuJoCo: without its muscles, if a task has any; the hopper also on rough ground.
-
-    On a CPU in blocks of environments, and one environment at a time.
-    """
-    threads, kernels = (THREADS, ("blocks", "scalar")) if args.device == "cpu" else ({args.device: 1}, ("blocks",))
+    """On one thread beside MuJoCo: without its muscles, if a task has any; the hopper also on rough ground."""
     task, whole = diffsim.TASKS[name], diffsim.make(name, num_envs=1).scene
     default, options = task.integration("default"), dict[str, Any](device=args.device, control_dt=task.control_dt)
     scenes = {"": whole}
@@ -140,20 +135,15 @@ def measure_physics(args: Args, name: TaskName | Robot) -> Iterator[Row]:
         scenes["rough ground"] = whole.with_terrain(rough(0))
     for num_envs in args.num_envs:
         substeps = num_envs * default.substeps  # of all
-        reference = "", "", "mj_step"
-        competitors = {reference: mujoco_timer(whole, num_envs, task.control_dt / default.substeps, default.substeps)}
-        for (scene_name, scene), kernel, (place, count) in product(scenes.items(), kernels, threads.items()):
-            block = {"block": 1} if kernel == "scalar" else {}
-            sim = Simulator(scene, num_envs, default, threads=count, **options, **block)
-            competitors[scene_name, kernel, place] = timer(sim)
+        mujoco_step = mujoco_timer(whole, num_envs, task.control_dt / default.substeps, default.substeps)
+        sims = {kind: Simulator(scene, num_envs, default, threads=1, **options) for kind, scene in scenes.items()}
+        competitors = {"mj_step": mujoco_step} | {kind: timer(sim) for kind, sim in sims.items()}
         times = race(competitors, random_states(name, num_envs, args.states + 1), args.repeats)
-        mj = times.pop(reference)["mj_step"]
-        for (scene_name, kernel, place), t in times.items():
-            scalar = times.get((scene_name, "scalar", place), {})
-            row: dict[str, object] = {"task": name, "environments": num_envs, "scene": scene_name}
-            row |= {"kernel": kernel, "device": place}
+        mj = times.pop("mj_step")["mj_step"]
+        for kind, t in times.items():
+            row: dict[str, object] = {"task": name, "environments": num_envs, "scene": kind, "kernel": "blocks"}
+            row |= {"device": "cpu, 1 thread" if args.device == "cpu" else args.device}
             row |= {f"{way} (us/substep)": microseconds / substeps for way, microseconds in t.items()}
-            row |= {f"{way}/scalar": t[way] / scalar[way] for way in scalar}
             yield row | {"mj_step, one core (us/substep)": mj / substeps, "mj_step/forward": mj / t["forward"]}
 
 
@@ -190,7 +180,9 @@ def windows(
 def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
     """A window of control steps differentiably, and with its backward pass; without what needs too much memory."""
     settings = dict.fromkeys([(n, 32) for n in SCALING] + [(64, h) for h in HORIZONS])
-    for (num_envs, horizon), technique in product(settings, GRAPHS if args.device != "cpu" else THREADS):
+    if args.device == "cpu":
+        fail("--parts scaling needs a GPU: --device cuda")
+    for (num_envs, horizon), technique in product(settings, TECHNIQUES):
         try:
             yield scaling_row(args.device, name, num_envs, horizon, technique)
         except (TooLargeError, torch.OutOfMemoryError) as error:
@@ -199,15 +191,13 @@ def measure_scaling(args: Args, name: TaskName) -> Iterator[Row]:
 
 def scaling_row(device: str, name: TaskName, num_envs: int, horizon: int, technique: str) -> Row:
     """Its locals end with it, so that the next row's memory is without this one's."""
-    if cuda := device != "cpu":
-        gc.collect()  # the graphs of the row before
-        torch.cuda.empty_cache()
-        torch.cuda.synchronize()
-        free = torch.cuda.mem_get_info()[0]
+    gc.collect()  # the graphs of the row before
+    torch.cuda.empty_cache()
+    torch.cuda.synchronize()
+    free = torch.cuda.mem_get_info()[0]
     default, env = diffsim.TASKS[name].integration("default"), diffsim.make(name, num_envs, device, seed=0)
-    options = dict[str, Any](device=device, threads=THREADS.get(technique))
-    options["division"] = divide(env.scene) if "one thread" in technique else None
-    sim = Simulator(env.scene, num_envs, default, horizon=horizon, **options)
+    division = divide(env.scene) if "one thread" in technique else None
+    sim = Simulator(env.scene, num_envs, default, horizon=horizon, device=device, division=division)
     actions = (torch.rand(horizon, num_envs, sim.nu, device=env.device) * 2 - 1).requires_grad_()
     calls = windows(sim, env.qpos.clone(), env.qvel.clone(), actions)[1:]
     captured = [graph.capture(call, env.device) if "graph" in technique else call for call in calls]
@@ -216,7 +206,7 @@ def scaling_row(device: str, name: TaskName, num_envs: int, horizon: int, techni
     for way, seconds in {"forward": one_way, "backward": both - one_way}.items():
         row[f"{way} (us/substep of all)"] = 1e6 * seconds / horizon / default.substeps
     row["differentiated control steps/s"] = num_envs * horizon / both
-    return row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30 if cuda else ""}
+    return row | {"memory (GiB)": (free - torch.cuda.mem_get_info()[0]) / 2**30}
 
 
 def draw(args: Args, rows: Sequence[Mapping[str, str]]) -> None:

@@ -1,4 +1,4 @@
-"""Trainings that are compared by what their progress says: of PFPN's dog, and of guided policy search.
+"""Trainings that are compared by what their progress says: PFPN's dog, guided policy search, trials of PPO, two GPUs.
 
     python benchmarks/suites.py                                  all of cases.json; what has finished is kept
     python benchmarks/suites.py --only walker --cells full adaptive --seeds 1
@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from typing import NamedTuple
 
 from cells import Case, Runner, ScriptFlags, spread
@@ -27,11 +27,14 @@ READ: dict[str, Callable[[Sequence[float]], float]] = {
     "first": lambda values: values[0],
     "last": lambda values: values[-1],
     "mean": mean,
+    "middle": median,
     "most": max,
     "sum": sum,
+    "count": len,
 }
 SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "mean": lambda values: f"{mean(values):.0f}",
+    "thousandths": lambda values: f"{1e3 * mean(values):.0f}",
     "tenth": lambda values: f"{mean(values):.1f}",
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",
@@ -50,6 +53,7 @@ class Suite(NamedTuple):
     cells: dict[str, str]  # flags by the cells' names
     groups: dict[str, list[tuple[list[str], list[int], str]]]  # cells, seeds, and their script, task and other flags
     across: bool = False  # one table of all groups
+    machine: str = "cpu"  # the folder of results/ that has the csv file
 
 
 SUITES = {
@@ -141,7 +145,8 @@ def main(args: Args) -> None:
             runner.train(case)
             if not args.train_only and (found := line(suite, case.folder)):
                 args.keep(suite.csv, {"group": group, "cell": cell, "seed": case.seed} | found, KEY)
-        args.publish(*shown(group, args.read(suite.csv)), suite.page, everywhere=True)
+        rows = replace(args, machine=args.machine or suite.machine).read(suite.csv)
+        args.publish(*shown(group, rows), suite.page, everywhere=True)
 
 
 if __name__ == "__main__":

@@ -109,12 +109,9 @@ def markdown(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
 
 
 def fill(page: Path, name: str, text: str) -> None:
-    """Put text between the page's comments <!-- name --> and <!-- /name -->, at its end if it does not have them."""
+    """Put text between the page's comments <!-- name --> and <!-- /name -->."""
     begin, end = f"<!-- {name} -->\n", f"<!-- /{name} -->\n"
-    before = page.read_text() if page.is_file() else ""
-    if begin not in before:
-        before += begin + end
-    head, _, tail = before.partition(begin)
+    head, _, tail = page.read_text().partition(begin)
     page.write_text(f"{head}{begin}{text}{end}{tail.partition(end)[2]}")
 
 

@@ -3,17 +3,22 @@
     python benchmarks/tracking.py runs/g1_track__sapo__1 --file path/to/unitree_g1/scene.xml
     python benchmarks/tracking.py runs/h100/* --push 0.5
     python benchmarks/tracking.py runs/h100/many --clip folder/of/unseen/clips
+    python benchmarks/tracking.py runs/race/sapo__1/at_*.pt --race --friction 1
 
 Each motion is tracked several times from its first frame to its end, from joints that are up to 0.05 rad off. An
 episode succeeds if the root is never 0.5 m or 1 rad away from the clip's: mjlab's and BeyondMimic's criterion, of which
 a fall is one case. Errors are means over the time until then. Servos get the policy's targets within the range of its
 training, and a motor the torque that the task's servo would have. Nothing else of the file is changed.
 
-Writes tracking.csv, a row for each policy and world, and with --update-results the table of docs/tracking.md.
+Writes tracking.csv, a row for each policy and world, or with --race tracking_race.csv, of checkpoints that were copied
+beside their run's progress.csv while it trained; with --update-results also the tables of docs/tracking.md. Trainings
+that shared a GPU have a folder whose name ends with _shared: their seconds do not count. What lies in a folder named
+ablation has a table of its own, by the runs' names.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,14 +28,17 @@ import numpy as np
 import torch
 from common import ABOUT, Part, load_case, measured, run
 from joystick import training
-from tables import Row, grouped, middle, numbers
+from tables import Row, grouped, markdown, middle, numbers
 from worlds import Array, OtherFile, State, pushes, rollout
 
 from diffsim import read_clip
 from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.training import Count, NonNegative, Positive, SavedPolicy, fail
+from diffsim.training.checkpoint import HOME
 
 OFF = 0.05  # rad, of the joints at the start
+ENOUGH = 0.95  # share of episodes that succeed, to which learners race
+PAGE = "tracking.md"
 
 
 @dataclass
@@ -40,6 +48,7 @@ class Args(common.CheckpointFlags):
     episodes: Count = 16  # of each motion
     friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
     push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
+    race: bool = False  # checkpoints are those along the way of runs: seconds of training to enough success
 
 
 def track(saved: SavedPolicy, task: Tracking, world: OtherFile, args: Args) -> tuple[Array, Array]:
@@ -75,45 +84,103 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     clip = own.clip if args.clip is None else read_clip(args.clip)
     task = type(own)(dtype=torch.float64, clip=clip)
     task.bind(case.env.scene)
-    count = len(task.motions[0])
+    count, about = len(task.motions[0]), case.about
+    if case.saved.simulator != HOME:
+        about["learner"] = f"{about['learner']} in {case.saved.simulator}"
     for friction in args.friction:
         world = OtherFile(case.env, count * args.episodes, args.file, friction)
         success, (root, turn, joints) = track(case.saved, task, world, args)
+        each = success.reshape(count, -1).mean(1)
         if count > 1:
-            print("  " + " ".join(f"{share:.0%}" for share in success.reshape(count, -1).mean(1)))
+            print("  " + " ".join(f"{share:.0%}" for share in each))
         row = {"clip": str(clip), "motions": count, "clip s": float(task.motions[1].sum()) * task.control_dt}
         row |= {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
-        row |= {"success": success.mean(), "joint error": joints.mean(), "root error": root.mean()}
-        yield case.about | training(case) | row | {"root turn": turn.mean(), "episodes": args.episodes}
+        row |= {"success": success.mean(), "whole motions": np.sum(each >= ENOUGH)}
+        row |= {"joint error": joints.mean(), "root error": root.mean(), "root turn": turn.mean()}
+        yield about | training(case) | row | {"episodes": args.episodes}
+
+
+def least(rows: list[dict[str, str]]) -> str:
+    return f"{min(found):.0%}" if (found := numbers(rows, "success")) else ""
+
+
+def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str]], list[dict[str, str]]]]:
+    """A policy's name for each clip, learner and machine, over seeds; its rows, and those with the file's friction and
+    no push."""
+    rows = [row | {"machine": row["checkpoint"].partition("/")[0].removesuffix("_shared")} for row in rows]
+    for (clip, learner, machine), group in grouped(rows, "clip", "learner", "machine").items():
+        name, drawn, _ = learner.partition(" --randomise")
+        plain = [row for row in group if float(row["friction"]) == 1 and float(row["push"]) == 0]
+        yield f"{clip}, {name}, {machine}{'' if drawn else ', not randomised'}", group, plain
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each clip, learner and machine, over seeds: medians on the file's friction. In brackets and of pushes
-    the least share over seeds and frictions."""
-    rows = [row | {"machine": row["checkpoint"].partition("/")[0]} for row in rows]
+    """A line for each policy of one motion: medians over seeds on the file's friction. In brackets and of pushes the
+    least share over seeds and frictions."""
     lines = list[Row]()
-    for (clip, learner, machine), group in grouped(rows, "clip", "learner", "machine").items():
-        name, drawn, _ = learner.partition(" --randomise")
-        policy = f"{clip}, {name}, {machine}{'' if drawn else ', not randomised'}"
-        calm = [row for row in group if float(row["push"]) == 0]
-        plain = [row for row in calm if float(row["friction"]) == 1]
-        least, pushed = (
-            min(numbers(part, "success"), default=None)
-            for part in (calm, [row for row in group if float(row["push"]) > 0])
-        )
+    for policy, group, plain in groups([row for row in rows if row["motions"] == "1" and not is_ablation(row)]):
+        alone = [row for row in plain if "_shared/" not in row["checkpoint"]]
+        calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
         lines.append(
             {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
-            | {"training (s)": middle(plain, "training s", ".0f")}
-            | {"success": f"{middle(plain, 'success', '.0%')}{'' if least is None else f' ({least:.0%})'}"}
-            | {"pushed": "" if pushed is None else f"{pushed:.0%}"}
+            | {"training (s)": middle(alone, "training s", ".0f")}
+            | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
             | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
+        )
+    return lines
+
+
+def is_ablation(row: dict[str, str]) -> bool:
+    return row["checkpoint"].startswith("ablation/")
+
+
+def ablation(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each variant: success by friction, with and without pushes, and errors on the file's friction."""
+    lines = list[Row]()
+    for (name,), group in grouped(filter(is_ablation, rows), "checkpoint").items():
+        calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
+        plain = [row for row in calm if float(row["friction"]) == 1]
+        lines.append(
+            {"variant": name.removeprefix("ablation/").replace("_", " "), "iterations": group[0]["iteration"]}
+            | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
+            | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
+        )
+    return lines
+
+
+def many(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each policy of several motions and what it was judged by, on the file's friction without pushes."""
+    return [
+        {"policy": policy, "motions": row["motions"], "success": f"{float(row['success']):.0%}"}
+        | {f"motions with {ENOUGH:.0%}": row["whole motions"], "training (s)": f"{float(row['training s']):.0f}"}
+        | {"joints (rad)": row["joint error"], "root (m)": row["root error"]}
+        for policy, _, plain in groups([row for row in rows if row["motions"] != "1"])
+        for row in plain
+    ]
+
+
+def race(rows: list[dict[str, str]]) -> list[Row]:
+    """Seconds of training until enough episodes succeed, from checkpoints along the way."""
+    lines = list[Row]()
+    for (clip, learner, seed), group in grouped(rows, "clip", "learner", "seed").items():
+        group.sort(key=lambda row: float(row["training s"]))
+        reached = (row["training s"] for row in group if float(row["success"]) >= ENOUGH)
+        lines.append(
+            {"clip": clip, "learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner), "seed": seed}
+            | {f"s to {ENOUGH:.0%}": next(reached, "never"), "in all (s)": group[-1]["training s"]}
+            | {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
         )
     return lines
 
 
 def main(args: Args) -> None:
     key = (*ABOUT[:-1], "clip", "file", "friction", "push")
-    measured(args, Part("tracking", measure, key, "tracking", "tracking.md", table))
+    if args.race:
+        measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
+        return
+    rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
+    args.publish("many", markdown(many(rows)), PAGE)
+    args.publish("ablation", markdown(ablation(rows)), PAGE)
 
 
 if __name__ == "__main__":

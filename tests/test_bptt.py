@@ -68,13 +68,6 @@ def test_large_gradients_are_followed():
     assert optimizer.max_norm == 1.0 and optimizer.betas == (0.7, 0.95)
 
 
-def test_the_learning_rate_decays_linearly():
-    learner = build("cartpole", "--iterations", "10")
-    for iteration in (1, 4, 10):
-        learner.set_learning_rate(iteration)
-        assert learner.optimizer.lr.item() == pytest.approx(1e-5 + (1e-2 - 1e-5) * (11 - iteration) / 10)
-
-
 @pytest.mark.parametrize("flag", ["--normalize-obs", "--no-normalize-obs"])
 def test_observations_are_normalized_on_request(flag, tmp_path):
     arguments = f"--env cartpole --num-envs 2 --horizon 8 --iterations 2 {flag} --eval-episodes 1 --quiet"

@@ -48,18 +48,10 @@ class Table(NamedTuple):
 def tables(page: Path) -> Iterator[Table]:
     parts = re.split(r"((?:^\|.*\n)+)", page.read_text(), flags=re.MULTILINE)
     for block, text in zip(parts[1::2], parts[2::2], strict=True):
-        header, _, *joined = ([plain(cell) for cell in line.strip()[1:-1].split("|")] for line in block.splitlines())
-        rows = [row for cells in joined for row in seeds(header, cells)]
+        header, _, *rows = ([plain(cell) for cell in line.strip()[1:-1].split("|")] for line in block.splitlines())
         below = re.split(r"^#", text, flags=re.MULTILINE)[0]
         source = re.search(r"results/\w+/(?!cells|curves)\w+\.csv", below)  # these: tests/benchmarks/test_paper.py
         yield Table(header, rows, ROOT / source[0] if source else None)
-
-
-def seeds(header: list[str], cells: list[str]) -> list[list[str]]:
-    """A row for each seed of one that holds several, "1, 2" with "97, 98" and the like."""
-    count = len(cells[header.index("seed")].split(", ")) if "seed" in header else 1
-    parts = [each if len(each := cell.split(", ")) == count else [cell] * count for cell in cells]
-    return [list(row) for row in zip(*parts, strict=True)]
 
 
 def plain(cell: str) -> str:

@@ -16,7 +16,7 @@ from scenes import task_scene
 from torch.autograd import forward_ad
 
 import diffsim
-from diffsim.sim.integration import INTEGRATORS, Integration
+from diffsim.sim.integration import INTEGRATORS
 from diffsim.tasks import TASKS
 
 
@@ -435,13 +435,3 @@ def test_control_steps_of_another_length():
         ends.append(env.qpos.clone())
     torch.testing.assert_close(ends[0], ends[1])
     assert env.control_dt == 0.05 and env.metadata["render_fps"] == 20
-
-
-def test_what_is_given_replaces_a_presets():
-    env = diffsim.make("cartpole", 2, integrator="implicit", theta=0.5)
-    assert env.sim.integration == Integration("implicit", TASKS["cartpole"].substeps, 0.5)
-    preset = Integration("implicit", 8, 0.5)
-    assert preset.replaced(None, substeps=None, theta=None) == preset.replaced("implicit") == preset
-    assert preset.replaced(substeps=4, theta=0.0) == Integration("implicit", 4, 0.0)
-    assert preset.replaced("semi_implicit") == Integration("semi_implicit", 8)  # theta is the implicit's own
-    assert preset.replaced("semi_implicit", theta=0.5).theta == 0.5  # asked for: an error, not dropped

@@ -47,11 +47,6 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     torch.set_rng_state(state)
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_examples_are_short(path: Path) -> None:
-    assert path.read_text().count("\n") < 80
-
-
 # The simulator on its own ---------------------------------------------------------------------------------------------
 
 

@@ -72,7 +72,7 @@ def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     diffsim_main(check[2:])
     assert "own_robot: can be simulated" in capsys.readouterr().out
     view.main(small(watch, run))
-    assert "run_forward, ppo_baseline.py, iteration 2" in capsys.readouterr().out and (home / "run.html").is_file()
+    assert "run_forward, ppo_baseline.py, iteration 2" in capsys.readouterr().out and (home / "run.mp4").is_file()
     ppo_baseline.main(small(judge, run))
     written = json.loads((run / "evaluation.json").read_text())
     assert len(written["returns"]) == 2 and written["speed"] is not None
@@ -107,12 +107,12 @@ def test_from_another_directory(
         assert (
             refusal(lambda words=words: ppo_baseline.main([*map(str, words), *FEW]), capsys) == f"script.py: {missing}"
         )
-    web = [str(run), "--web", "a.html", "--env"]
-    assert refusal(lambda: view.main([*web, "examples/own_robot.py"]), capsys) == f"script.py: {missing}"
+    film = [str(run), "--video", "a.mp4", "--seconds", "0.1", "--env"]
+    assert refusal(lambda: view.main([*film, "examples/own_robot.py"]), capsys) == f"script.py: {missing}"
     ppo_baseline.main(["--evaluate", str(path), "--env", there, "--run-dir", str(tmp_path), *FEW])
     assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["env"] == there
-    view.main([*web, there])
-    assert (tmp_path / "a.html").is_file()
+    view.main([*film, there])
+    assert (tmp_path / "a.mp4").is_file()
     line = refusal(lambda: ppo_baseline.main(["--evaluate", str(path), "--env", "ant"]), capsys)
     assert "has --env examples/own_robot.py, not ant" in line
 

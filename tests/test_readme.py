@@ -1,4 +1,4 @@
-"""The Python snippets of README and of the page on gymnasium run as they are printed."""
+"""The Python snippets of README and of the pages on gymnasium and physics run as they are printed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from diffsim.tasks import TASKS
 ROOT = Path(__file__).resolve().parents[1]
 SNIPPETS = [
     pytest.param(code, id=f"{page.stem}-{k}")
-    for page in (ROOT / "README.md", ROOT / "docs" / "gymnasium.md")
+    for page in (ROOT / "README.md", ROOT / "docs" / "gymnasium.md", ROOT / "docs" / "physics.md")
     for k, code in enumerate(re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL))
 ]
 

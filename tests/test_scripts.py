@@ -126,6 +126,11 @@ def test_files_of_a_run(script, trained, checkpoint):
     assert [bool(row["eval_return"]) for row in rows] == [k in (4, 8, 10) for k in range(1, 11)]
     assert [row["length"] for row in rows] == [""] * 7 + ["240.0"] * 3
     assert all(float(row["grad_skipped"]) == float(row["sim_nonfinite"]) == 0 for row in rows)
+    if "final_lr" in arguments:  # from the first rate to the last one, linearly
+        for name in {"charts_actor_lr", "charts_critic_lr", "charts_learning_rate"} & rows[0].keys():
+            first = arguments[{"charts_learning_rate": "lr"}.get(name, name.removeprefix("charts_"))]
+            rates = [first + (arguments["final_lr"] - first) * k / 10 for k in range(10)]
+            assert [float(row[name]) for row in rows] == pytest.approx(rates, rel=1e-5)
     late = {name for name in rows[0] if name.startswith("eval")} | {"return", "length"}
     assert all(row[name] for row in rows for name in row.keys() - late)
 

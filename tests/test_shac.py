@@ -148,15 +148,6 @@ def test_the_critic_is_fitted_to_the_returns_and_the_target_follows_slowly() -> 
     assert losses[-1] < 0.2 * losses[0]
 
 
-def test_learning_rates_decay_linearly() -> None:
-    learner = build("cartpole", "--iterations", "10", "--critic-lr", "5e-4", "--final-lr", "1e-5")
-    for iteration in (1, 4, 10):
-        learner.set_learning_rates(iteration)
-        left = (11 - iteration) / 10
-        assert learner.actor_optimizer.lr.item() == pytest.approx(1e-5 + (1e-2 - 1e-5) * left)
-        assert learner.critic_optimizer.lr.item() == pytest.approx(1e-5 + (5e-4 - 1e-5) * left)
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -168,9 +159,7 @@ def test_learning_rates_decay_linearly() -> None:
 def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
     words = "--env-id", "cartpole", *arguments.split(), "--iterations", 3, "--eval-episodes", 1
     checkpoint = run(shac, tmp_path, *words)
-    modules, args = checkpoint["modules"], checkpoint["args"]
-    lr = args["actor_lr"] + (args["final_lr"] - args["actor_lr"]) * 2 / 3  # of the last of three iterations
-    assert modules["actor_optimizer"]["lr"].item() == pytest.approx(lr)
+    modules = checkpoint["modules"]
     assert modules["actor_optimizer"]["skipped"] == 0
     assert all(weight.isfinite().all() for weight in modules["critic"].values())
 

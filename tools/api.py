@@ -12,11 +12,11 @@ import diffsim
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 HEAD = """# API
 
-`python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. Errors of
-files and tasks (`SceneError`, `TaskError`) are `ValueError`s.
+`python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. `NumpyEnv`
+and `NumpyVectorEnv`: [gymnasium.md](gymnasium.md). `read_clip`: [tracking.md](tracking.md#clips). `SceneError` and
+`TaskError` are `ValueError`s.
 """
-NAMES = "make DiffEnv NumpyEnv Simulator Integration Task load_scene Scene read_clip".split()
-BRIEF = "NumpyEnv Scene".split()  # their first paragraph
+NAMES = "make DiffEnv Simulator Integration Task load_scene Scene".split()
 # Methods that few programs need
 INTERNAL = """pin carry_over take_statistics advance check_tensor rewind tangent explicit replaced check load_robot
 scene bind presets integration falls metadata over ghost program disturb observe_with""".split()
@@ -49,9 +49,9 @@ def page() -> str:
     parts = [HEAD]
     for name in NAMES:
         thing, kind = getattr(diffsim, name), isinstance(getattr(diffsim, name), type)
-        doc = inspect.getdoc(thing) or ""
+        doc = re.sub(r"\n\nExample:\n.*?(?=\n\n\w)", "", inspect.getdoc(thing) or "", flags=re.DOTALL)
         doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
-        doc = doc.split("\n\n")[0] if name in BRIEF else doc
+        doc = doc.split("\n\n")[0] if name == "Scene" else doc
         call = "" if isinstance(thing, type) and name != "Integration" else f"({signature(thing)})"
         parts.append(f"## {name}\n\n```python\ndiffsim.{name}{call}\n```\n\n```text\n{doc}\n```\n")
         if kind and (rows := [*members(thing)]):

@@ -243,7 +243,7 @@ def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any]
             env[0].load_state_dict(env[1])
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         why = f"{type(error).__name__} {' '.join(str(error).split())}"
-        fail(f"the checkpoint does not fit the script as it is now: {why}")
+        fail(f"the checkpoint does not fit the flags, or the script as it is now: {why}")
 
 
 def _describe(policy: nn.Sequential) -> list[list[Any]]:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -29,6 +29,7 @@ ClipFile = Annotated[
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
+FIXED = ("env", "seed", "num_envs")  # of a run that goes on or is evaluated; what else must fit, `restore` tells
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -69,13 +70,6 @@ class RunFlags:
 @dataclass
 class Flags(RunFlags):
     """What every script takes: the task and how it is simulated as well. Each extends it by its hyperparameters."""
-
-    # What may change when a run goes on or is evaluated; the checkpoint decides everything else.
-    MAY_CHANGE: ClassVar[tuple[str, ...]] = (
-        *("accuracy", "integrator", "substeps", "theta", "passes", "tolerance", "touchdown", "contact", "penalty"),
-        *("early_termination", "threads"),
-        *(field.name for field in dataclasses.fields(RunFlags) if field.name != "seed"),
-    )
 
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
     """task: one of diffsim.TASKS, or a file with your own, my_task.py or my_task.py:Class (docs/own_robot.md)"""
@@ -123,8 +117,6 @@ class Flags(RunFlags):
 class ParallelFlags(Flags):
     """Many environments at once."""
 
-    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*Flags.MAY_CHANGE, "cuda_graph", "randomise", "redraw", "monitor")
-
     num_envs: Count = 64
     """parallel environments N, over all processes of torchrun (per task)"""
     cuda_graph: bool = True
@@ -141,8 +133,9 @@ class ParallelFlags(Flags):
 
     def check(self) -> None:
         super().check()
+        task = find_task(self.env)
         try:
-            parse_ranges(self.randomise, find_task(self.env))
+            parse_ranges(self.randomise, task)
         except ValueError as error:
             fail(f"--randomise: {error}")
         if self.num_envs % distributed.size():
@@ -168,8 +161,6 @@ class SymmetricFlags(ParallelFlags):
 @dataclass
 class WindowFlags(SymmetricFlags):
     """Flags of learners that descend the gradient of short rollouts."""
-
-    MAY_CHANGE: ClassVar[tuple[str, ...]] = (*SymmetricFlags.MAY_CHANGE, "adjoint_clip")
 
     adjoint_clip: NonNegative = 0.0
     """clip gradients with respect to a state to this many times the batch's median (0: do not clip)"""
@@ -259,11 +250,10 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
-    for field in dataclasses.fields(kind):
-        own, wanted = getattr(defaults, field.name), getattr(args, field.name)
-        if own != wanted and field.name not in kind.MAY_CHANGE:
-            free = ", ".join(map(flag, kind.MAY_CHANGE))
-            fail(f"{path} has {flag(field.name)} {own}, not {wanted}; only these may change: {free}")
+    for name in FIXED:
+        own, wanted = (getattr(each, name, None) for each in (defaults, args))
+        if own != wanted:
+            fail(f"{path} has {flag(name)} {own}, which cannot change to {wanted}")
     if args.resume:
         last = min(args.iterations, args.stop_after or args.iterations)
         if saved["iteration"] >= last:

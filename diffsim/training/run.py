@@ -252,9 +252,11 @@ class Run:
 
     def evaluate(self, policy: nn.Module) -> None:
         """Evaluate the deterministic policy, always of one architecture, in the iteration that was logged last."""
+        begin = Mark(self.device)
         self._player = self._player or Player(self.eval_env, policy, self._graphs)
         self._player.take(policy)
         self.log_evaluation(self._player.evaluate())
+        self._records[-1].times["time/evaluation"] = begin, Mark(self.device)
 
     def log_evaluation(self, evaluation: Evaluation) -> None:
         """Take the evaluation of the iteration that was logged last."""

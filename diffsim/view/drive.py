@@ -30,16 +30,18 @@ from torch import Tensor
 
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Array
+from diffsim.tasks import Task
 from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.tasks.joystick import Joystick
 from diffsim.tasks.locomotion import Locomotion
 from diffsim.view import web
 
-KEYS = {  # of the tasks that can be driven
-    Joystick: "arrows or gamepad: walk, turn · Q, E: sideways · shift + drag: pull · enter: restart",
-    Tracking: "shift + drag: pull · enter: restart",
-    Locomotion: "left, right or gamepad: turn · shift + drag: pull · enter: restart",
+KEYS = {
+    Joystick: "arrows or gamepad: walk, turn · Q, E: sideways · ",
+    Locomotion: "left, right or gamepad: turn · ",
+    Task: "",
 }
+ALWAYS = "shift + drag: pull · enter: restart"
 TURN = 0.3  # rad/s by which a key turns the way of a robot that otherwise runs straight on; at 1 rad/s the ant falls
 STIFFNESS, MAX_PULL = 20.0, 19.62  # N/kg per m of the mouse's pull, and N/kg: twice the weight
 SILENCE = 10.0  # s after which a page that takes no more pictures is given up
@@ -86,16 +88,18 @@ class Pilot:
 
     @torch.no_grad()
     def step(self, wishes: Sequence[Wish]) -> dict[str, str]:
-        """A control step; what it changes in the picture, see web.encode."""
+        """A control step; the picture of it, see web.encode."""
         env, move = self.env, np.sum([wish.move for wish in wishes], axis=0).clip(-1.0, 1.0)
         env.sim.forces = torch.as_tensor(self._forces(wishes), dtype=env.dtype)[None]
         action = self._action = self._policy(self._see(move)).clamp(-1.0, 1.0)
         _, _, terminated, truncated, _ = env.step(action)
-        poses, track = web.poses(env.scene.mj_model, *shown(env))
+        states = env.qpos, env.task.ghost(env.memory)
+        shown = [state[0].double().numpy() for state in states if state is not None]
+        poses, track = web.poses(env.scene.mj_model, *shown)
         self._places = poses[0, :, :3]
         if bool(terminated | truncated):
             self._heading, self._action = 0.0, torch.zeros_like(self._action)
-        return web.encode(env.scene.mj_model, poses, track, action.numpy())
+        return web.encode(env.scene.mj_model, poses, track, action[0].numpy())
 
     def _see(self, move: Array) -> Tensor:
         env, task = self.env, self.env.task
@@ -115,12 +119,6 @@ class Pilot:
             strength = min(STIFFNESS, MAX_PULL / max(float(np.linalg.norm(way)), 1e-9))
             forces[int(body), :3] += self._mass * strength * way
         return forces
-
-
-def shown(env: DiffEnv) -> list[Array]:
-    """qpos (1, nq) of the robot, and that of a ghost if there is one."""
-    states = env.qpos, env.task.ghost(env.memory)
-    return [state.double().numpy() for state in states if state is not None]
 
 
 def turned(angle: float, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
@@ -250,9 +248,8 @@ def serve(env: DiffEnv, policy: Callable[[Tensor], Tensor], caption: str, host: 
         OSError: nothing can listen at host and port, in one line.
     """
     stage, scene, name, restarts, due = Stage(), env.scene, env.task.name, 0, 0.0
-    qpos, *ghost = (np.repeat(state, 2, 0) for state in shown(env))
-    motion = web.describe(scene, qpos, env.control_dt, None, *ghost)
-    motion["live"] = next(text for kind, text in KEYS.items() if isinstance(env.task, kind))
+    motion = web.describe(scene, env.control_dt, env.task.ghost(env.memory) is not None)
+    motion["live"] = next(text for kind, text in KEYS.items() if isinstance(env.task, kind)) + ALWAYS
     try:
         page = web.fill_page(motion, name, caption).encode()
         server = Server((host, port), functools.partial(Handler, stage, page, scene.nbody, host))

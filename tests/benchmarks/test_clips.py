@@ -41,17 +41,25 @@ def test_who_stands_succeeds_and_who_is_to_fly_fails() -> None:
     assert (root[:3] < 0.05).all() and (root[3:] > 0.1).all() and (turn[:3] < 0.1).all() and (joints < 0.1).all()
 
 
-def test_a_row_for_each_friction_and_a_line_for_each_clip() -> None:
-    row = dict(task="g1_track", clip="walk", learner="sapo --randomise", file="g1", push="0", success="1")
-    row |= {"training s": "100", "joint error": "0.06", "root error": "0.04"}
-    rows = [row | dict(checkpoint=f"h100/{k}", friction=str(f)) for k in (1, 2) for f in (0.7, 1, 1.3)]
-    rows[0]["success"], rows[-2]["success"] = "0.5", "0.8"
-    (line,) = tracking.table([*rows, row | dict(checkpoint="h100/1", friction="1", push="0.5", success="0.25")])
+def test_tables_of_policies_variants_and_races() -> None:
+    row = {"clip": "walk", "motions": "1", "seed": "1", "checkpoint": "h100/1", "push": "0", "success": "1"}
+    row |= {"learner": "sapo --randomise", "training s": "100", "joint error": "0.06", "root error": "0.04"}
+    rows = [row | {"friction": f, "success": s} for f, s in (("0.7", "0.5"), ("1", "0.9"))]
+    shared = row | {"checkpoint": "h100_shared/2", "friction": "1", "training s": "300"}
+    several = row | {"checkpoint": "h100/all", "friction": "1", "motions": "44", "whole motions": "40"}
+    variant = row | {"checkpoint": "ablation/horizon_8", "friction": "1", "iteration": "600"}
+    (line,) = tracking.table([*rows, shared, several, variant])
     assert (line["policy"], line["seeds"], line["training (s)"]) == ("walk, sapo, h100", 2, "100")
-    assert (line["success"], line["pushed"]) == ("90% (50%)", "25%")
-    assert (line["joints (rad)"], line["root (m)"]) == ("0.060", "0.040")
-    (line,) = tracking.table([row | dict(checkpoint="h100/1", friction="1", learner="sapo")])
-    assert (line["policy"], line["success"], line["pushed"]) == ("walk, sapo, h100, not randomised", "100% (100%)", "")
+    assert (line["success"], line["pushed"]) == ("95% (50%)", "")
+    (line,) = tracking.many([*rows, several, several | {"friction": "1.3"}])
+    assert (line["motions"], line["motions with 95%"]) == ("44", "40")
+    (line,) = tracking.ablation([*rows, variant, variant | {"push": "0.5", "success": "0.5"}])
+    assert (line["variant"], line["success"], line["pushed"]) == ("horizon 8", "100% (100%)", "50%")
+    way = [row | {"training s": str(s), "success": share} for s, share in ((90, "1"), (20, "0.5"), (60, "0.96"))]
+    other = row | {"learner": "ppo --initial-log-std -1 in mujoco_warp", "success": "0.1"}
+    sapo, ppo = tracking.race([*way, other])
+    assert (sapo["learner"], sapo["s to 95%"], sapo["in all (s)"]) == ("sapo", "60", "90")
+    assert (ppo["learner"], ppo["s to 95%"], ppo["last success"]) == ("ppo in mujoco_warp", "never", "10%")
 
 
 def test_what_cannot_be_judged(capsys: pytest.CaptureFixture[str]) -> None:

@@ -58,24 +58,6 @@ def test_tables_have_worlds_and_gaits_of_each_policy(tmp_path: Path, capsys: pyt
         assert 0 <= float(calm[column]) < most
 
 
-def test_worlds_and_worst_seeds() -> None:
-    """Medians over seeds, and the worst; other files than the task's count alone."""
-    same = {"task": "g1", "learner": "sapo --symmetric", "friction": "1", "push": "0", "mass": "1", "gains": "1"}
-    same |= {"latency": "0", "file": "unitree_g1", "training s": "9", "yaw error": "0"}
-    rows = [
-        same | {"checkpoint": f"h100/{k}", "error": f"0.0{k}", "worst error": "1", "whole": f"0.{k}"} for k in (1, 2, 6)
-    ]
-    rows += [rows[0] | {"file": "", "error": "7"}, rows[0] | {"gains": "0.8", "whole": "0.3"}]
-    (line,) = joystick.table(rows)
-    assert line["policy"] == "g1, sapo, h100" and line["seeds"] == 3 and line["error (m/s)"] == "0.020 (0.060)"
-    assert joystick.whole(rows) == [
-        {"world": "friction x 1", "g1, sapo, h100": "20% (10%)"},
-        {"world": "gains x 0.8", "g1, sapo, h100": "30% (30%)"},
-    ]
-    named = same | {"push": "1.0", "latency": "20.0", "mass": "0.85", "gains": "1.2"}
-    assert joystick.worlds(named) == ["pushes of 1 m/s", "20 ms late", "mass x 0.85", "gains x 1.2"]
-
-
 def test_a_race_is_won_by_the_first_checkpoint_that_is_good_enough(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

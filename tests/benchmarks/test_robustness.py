@@ -63,7 +63,7 @@ def resting() -> robustness.Walkers:
     env = DiffEnv(Puck(), scene_of(PUCK), 1, integration=Integration(substeps=4))
     qpos = torch.tensor(env.scene.qpos0).float().expand(3, -1)
     state = robustness.State(qpos, torch.zeros(3, 6), torch.zeros(3, 0), torch.zeros(3, 1))
-    return robustness.Walkers(env, idle, 1, state)
+    return robustness.Walkers(env, idle, state)
 
 
 def test_a_push_gives_a_free_body_its_impulse() -> None:
@@ -96,7 +96,7 @@ def test_a_task_keeps_its_memory() -> None:
         return idle(obs)
 
     first = env.reset(seed=SEED)[0][:, 0].long()
-    walkers = robustness.walking(env, policy, 1)
+    walkers = robustness.walking(env, policy)
     assert torch.equal(torch.stack(seen), first + torch.arange(240)[:, None])
     reached = first + torch.randint(120, 241, (7,), generator=torch.Generator().manual_seed(SEED))
     steps = walkers.start.memory[:, 0].long()
@@ -107,19 +107,12 @@ def test_a_task_keeps_its_memory() -> None:
         assert torch.equal(torch.stack(seen), steps + torch.arange(6)[:, None])
 
 
-def test_the_command_writes_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = "--num-envs 7 --after 1 --output".split()
+def test_the_command_writes_a_row(tmp_path: Path) -> None:
+    flags = "--num-envs 7 --output".split()
     robustness.main(parse(robustness.Args, None, [str(POLICIES / "hopper.pt"), *flags, str(tmp_path)]))
     (row,) = read_csv(tmp_path / "robustness.csv")
-    assert row["body"] == "torso" and row["robots"] == "7" and row["unpushed"] == "0"
-    force = float(row["forward N"])
-    assert "sideways N" not in row and float(row["forward m/s"]) == pytest.approx(force * 0.1 / 15.8, rel=0.01)
-    line = f"| hopper | shac | 1 | {row['forward N']} |  | {row['forward m/s']} |  |"
-    assert line in capsys.readouterr().out
-    other = row | {"checkpoint": "policies/hopper__2", "seed": "2", "forward N": "7", "learner": "shac"}
-    (joined,) = robustness.table([other, row])
-    assert (joined["seed"], joined["forward N"]) == ("1, 2", f"{row['forward N']}, 7")
-    assert len(robustness.table([row | {"learner": "sapo"}, row])) == 2
+    assert row["robots"] == "7" and row["unpushed"] == "0"
+    assert "sideways N" not in row and 10 < float(row["forward N"]) < 500
 
 
 @pytest.mark.parametrize(
@@ -128,7 +121,6 @@ def test_the_command_writes_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[
         ("", "of what? give a checkpoint"),
         ("cartpole.pt", "was trained on cartpole, whose episodes do not end with a fall"),
         ("half_cheetah.pt", "was trained on half_cheetah, whose episodes do not end with a fall"),
-        ("hopper.pt --body hat", "--body: the robot has no 'hat'; choose from torso, thigh, leg, foot"),
     ],
 )
 def test_what_cannot_be_pushed_over(arguments: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -147,6 +139,6 @@ def test_a_motion_that_ends_is_refused(
         case = Case("run", Path("imitation.pt"), SavedPolicy(torch.nn.Sequential(), "shac", {}, 1), env)
         monkeypatch.setattr(robustness, "load_case", lambda *_, case=case: case)
         if clip.loop:
-            assert robustness.load(args.checkpoints[0], args) == (case, 1)
+            assert robustness.load(args, args.checkpoints[0]) == case
     line = refusal(lambda: robustness.main(args), capsys)
     assert "imitation.pt tracks a motion that ends, and with it the episode: train with a loop" in line

@@ -16,21 +16,6 @@ def test_distinct_robots_have_every_feature() -> None:
     assert some == every
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_features_of_the_tasks(name):
-    expected = {
-        "cartpole": {"hinge", "slide", "limit", "damping", "motor"},
-        "hopper": {"hinge", "slide", "limit", "damping", "motor", "contact"},
-        "half_cheetah": {"hinge", "slide", "limit", "damping", "motor", "contact", "stiffness"},
-        "ant": {"floating", "hinge", "limit", "damping", "motor", "contact"},
-        "humanoid": {"floating", "hinge", "limit", "damping", "motor", "contact", "stiffness"},
-        "swimmer": {"hinge", "slide", "limit", "motor", "drag"},
-        "walker": {"hinge", "slide", "limit", "damping", "motor", "contact"},
-        "humanoid_mtu": {"floating", "ball", "hinge", "limit", "damping", "contact", "stiffness", "muscle"},
-    }
-    assert task_scene(name).features == expected[name]
-
-
 def test_carrier_is_no_slide_that_a_muscle_of_the_world_could_notice():
     assert parse(CRANE).carrier == 0 and without(parse(CRANE), "muscle").carrier == 2
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import mujoco
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 import diffsim
 from diffsim import Scene, load_scene
-from diffsim.training import evaluate, evaluation, gait, load_policy
+from diffsim.training import evaluation, gait
 
 Array = NDArray[np.float64]
 PACKAGE = Path(diffsim.__file__).parent
@@ -149,25 +148,10 @@ def test_depth_is_that_of_mujocos_contacts(name: str, rng: np.random.Generator) 
     assert compared > 50
 
 
-@pytest.mark.parametrize(
-    ("name", "names"), [("half_cheetah", ["back_foot", "front_foot"]), ("humanoid", ["right_foot", "left_foot"])]
-)
-def test_gait_of_shipped_policies(name: str, names: list[str]) -> None:
-    env = diffsim.make(name, num_envs=2, horizon=1, max_episode_steps=180)
-    feet = evaluate(env, load_policy(PACKAGE / "policies" / f"{name}.pt").network).gait()
-    assert [*feet] == [*names, "robot"]
-    for name in names:
-        duty, steps, clearance, slip, depth = feet[name].values()
-        assert 0.1 < duty < 0.5 and 1.5 < steps < 5 and 0 < depth < 0.15 and 0.1 < clearance < 0.6 and 0 < slip < 2
-    unlike, diagonal, change, saturated, cost = feet["robot"].values()
-    assert diagonal == 0 and unlike < 0.2 and 0 < change < 1 and 0 <= saturated < 1 and 0.2 < cost < 20
-
-
 def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = str(PACKAGE / "policies" / "ant.pt")
     SCRIPTS["sapo"].main(["--evaluate", path, "--eval-episodes", "2", "--device", "cpu", "--run-dir", str(tmp_path)])
-    returns, finer, *table = capsys.readouterr().out.splitlines()
-    found = json.loads((tmp_path / "evaluation.json").read_text())
+    returns, _, *table = capsys.readouterr().out.splitlines()
     parts = gait.Gait()
     with (tmp_path / "gait.csv").open() as file:
         for row in csv.DictReader(file):
@@ -176,9 +160,4 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
         parts
     )
     assert returns.startswith("ant, 2 episodes")
-    assert finer == f"semi_implicit with 32 substeps: return median {found['finer']['return']:.1f}, " + (
-        f"{found['finer']['kept']:.1%} retained"
-    )
-    assert found["finer"]["kept"] == pytest.approx(found["finer"]["return"] / found["return"])
-    assert found["finer"]["kept"] > evaluation.ENOUGH
     assert evaluation.kept(-2.0, -4.0) == 0.5 and evaluation.kept(-1.0, 0.0) == 1.0

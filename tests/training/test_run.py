@@ -309,19 +309,8 @@ def test_progress_and_messages(tmp_path, capsys):
     assert out.startswith("cartpole: 3 iterations, ") and "it/s" not in out
 
 
-def test_skipped_updates_are_told_when_they_have_doubled(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(bptt, "ClippedAdam", lambda *given, **named: ClippedAdam(*given, **named | {"skip_norm": 0.0}))
-    run(bptt, tmp_path, *TINY, "--iterations", 8)
-    words = "updates skipped so far because of their gradients"
-    assert re.findall(rf"iteration (\d): {words}: (\d)", capsys.readouterr().out) == [
-        ("1", "1"),
-        ("3", "3"),
-        ("7", "7"),
-    ]
-
-
-def test_steps_that_do_not_converge_are_told_when_they_have_doubled(tmp_path, monkeypatch, capsys):
-    """The simulator counts them; a line tells the sum over all environments and iterations."""
+def test_skipped_updates_and_steps_that_do_not_converge_are_told_when_they_have_doubled(tmp_path, monkeypatch, capsys):
+    """The simulator counts the latter; a line tells the sum over all environments and iterations."""
     collect = bptt.collect
 
     def counted(env: DiffEnv, *arguments: Any) -> bptt.Rollout:
@@ -330,11 +319,14 @@ def test_steps_that_do_not_converge_are_told_when_they_have_doubled(tmp_path, mo
 
     monkeypatch.setattr(bptt, "collect", counted)
     monkeypatch.setattr(diffsim.Simulator, "advance", lambda _, qpos, qvel, ctrl: (qpos, qvel + ctrl))  # no kernel
-    run(bptt, tmp_path, *TINY, "--contact", "mujoco", "--iterations", 7)
-    words = "control steps so far in which Newton's method did not converge"
-    told = re.findall(rf"iteration (\d): {words}: (\d+)", capsys.readouterr().out)
-    assert told == [("1", "2"), ("3", "6"), ("7", "14")]
-    assert [float(row["sim_unconverged"]) for row in read_progress(tmp_path)] == [2, 4, 6, 8, 10, 12, 14]
+    monkeypatch.setattr(bptt, "ClippedAdam", lambda *given, **named: ClippedAdam(*given, **named | {"skip_norm": 0.0}))
+    run(bptt, tmp_path, *TINY, "--contact", "mujoco", "--iterations", 8)
+    updates, steps = "updates skipped so far because of their gradients", "control steps so far in which Newton's"
+    out = capsys.readouterr().out
+    for words, count in ((updates, 1), (f"{steps} method did not converge", 2)):
+        told = re.findall(rf"iteration (\d): {words}: (\d+)", out)
+        assert told == [(f"{k}", f"{count * k}") for k in (1, 3, 7)]
+    assert [float(row["sim_unconverged"]) for row in read_progress(tmp_path)] == [2, 4, 6, 8, 10, 12, 14, 16]
 
 
 def test_runs_without_a_directory_have_one_of_their_own(tmp_path, monkeypatch):

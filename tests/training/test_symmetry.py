@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import assert_resumes, refusal, run
+from learners import refusal, run
 from torch import Tensor, nn
 
 import diffsim
@@ -105,35 +105,6 @@ def test_all_weights_have_gradients(script: str) -> None:
     for function, result in zip(functions, (policy(obs), values(learner, obs)), strict=True):
         weights = [p for name, p in function.named_parameters() if "mean" not in name and "log_std" not in name]
         assert all(g.abs().sum() > 0 for g in torch.autograd.grad(result.square().sum(), weights))
-
-
-@torch.no_grad()
-def test_a_mirrored_start_leads_to_the_mirrored_rollout() -> None:
-    learner = build("shac", "ant")
-    env, mirror, policy = learner.env, learner.env.task.mirror, learner.policy
-    rollouts = []
-    qpos, qvel = env.qpos, env.qvel
-    for start in ((qpos, qvel), (mirror.qpos(qpos), mirror.qvel(qvel))):
-        obs = env.set_state(*start)
-        steps = []
-        for _ in range(15):
-            obs, reward, *_ = env.step(policy(obs))
-            steps.append((obs, reward))
-        rollouts.append([torch.stack(part) for part in zip(*steps, strict=True)])
-    (obs, reward), (image, same) = rollouts
-    torch.testing.assert_close(image, mirror.obs(obs), rtol=0, atol=1e-3)
-    torch.testing.assert_close(same, reward, rtol=0, atol=1e-3)
-    assert not torch.allclose(image, obs, atol=0.1)
-
-
-def test_training_keeps_it_and_resumes(tmp_path: Path) -> None:
-    flags = "--env ant --symmetric --num-envs 2 --horizon 4 --iterations 4 --device cpu --quiet --eval-episodes 1"
-    whole = assert_resumes(shac, tmp_path, f"{flags} --actor-hidden 16 --critic-hidden 16 --eval-every 0", 2)
-    mirror, obs = TASKS["ant"]().mirror, torch.randn(20, 37)
-    policy = load_policy(tmp_path / "whole" / "checkpoint.pt").network
-    assert_alike(policy(mirror.obs(obs)), mirror.action(policy(obs)))
-    mean, var = (whole["modules"]["actor"][f"normalizer.{name}"] for name in ("mean", "var"))
-    assert torch.equal(mirror.obs(mean), mean) and torch.equal(var[mirror.obs.index], var) and mean.abs().max() > 0.1
 
 
 @pytest.mark.gpu

@@ -10,7 +10,6 @@ import torch
 from learners import assert_same, refusal, run
 
 import diffsim
-import ppo_baseline
 import shac
 from diffsim.robot.scene import FACTORS
 from diffsim.tasks import TASKS
@@ -112,20 +111,3 @@ def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(tmp_path: 
     assert whole["args"]["integrator"] == "mujoco"
     saved = str(tmp_path / "part" / "checkpoint.pt")
     assert parse(shac.Args, ["--evaluate", saved, "--accuracy", "accurate"]).substeps == 16
-
-
-def test_learners_without_gradient_vary_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-    original = Variation.set
-
-    def watch(self: Variation, iteration: int) -> None:
-        original(self, iteration)
-        seen.append(self.factors.clone())
-
-    monkeypatch.setattr(Variation, "set", watch)
-    flags = "--env hopper --randomise mass=0.5:2 --num-envs 16 --horizon 8 --iterations 2 --redraw 1 --quiet --epochs 1"
-    flags += " --contact mujoco"  # whose kernels with factors other tests compile
-    run(ppo_baseline, tmp_path, *flags.split(), "--device", "cpu", "--minibatch-size", "64", "--eval-episodes", "2")
-    assert len(seen) == 2 and not torch.equal(*seen)
-    mass = FACTORS.index("mass")
-    assert all((factors[:, mass] != 1).all() and (factors[:, :mass] == 1).all() for factors in seen)

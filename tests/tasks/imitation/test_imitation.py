@@ -27,7 +27,6 @@ from diffsim.training import export_policy, load_policy, make_policy_env, parse
 REAL = torch.float64
 NQ, NV, NU = 28, 27, 21
 NOTHING = torch.zeros(NU, dtype=REAL)
-TERMS = ("pose", "velocity", "end effectors", "centre of mass")
 
 
 @pytest.fixture(scope="module")
