@@ -127,7 +127,7 @@ def test_actions_come_late_and_the_robot_is_pushed() -> None:
     qvel, actions = torch.rand(400, 18, dtype=REAL), torch.rand(3, 400, n, dtype=REAL)
     same = task.disturb(qvel, action := actions[0], memory)
     assert same[0] is qvel and same[1] is action
-    task.disturbances = {"latency": (0.5, 2.0), "push": (0.2, 0.4)}
+    task.disturbances = {**task.disturbances, "latency": (0.5, 2.0), "push": (0.2, 0.4)}
     noise = torch.rand(3, 400, task.num_noise, dtype=REAL, generator=torch.Generator().manual_seed(1))
     noise[1, :, -3], noise[1, 0, -3] = 0.0, 1.0  # all are pushed, except one
     memory = task.begin(some(task, 400))
@@ -166,7 +166,7 @@ def test_robots_are_pulled_steadily() -> None:
 def test_gradients_pass_the_disturbances() -> None:
     """A command that comes a control step late moves the robot in the next one."""
     env = diffsim.make("go2", 4, seed=3, horizon=3)
-    env.task.disturbances = {"latency": (1.0, 1.0), "push": (0.5, 0.5)}
+    env.task.disturbances = {**env.task.disturbances, "latency": (1.0, 1.0), "push": (0.5, 0.5)}
     env.reset(seed=3)
     actions = torch.zeros(3, 4, 12).requires_grad_()
     states = [(env.step(action), env.qvel)[1] for action in actions.unbind()]
@@ -203,7 +203,7 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     qpos[:, 3:7] = np.sqrt(0.5) * torch.tensor([1.0, 0, 0, 1])
     velocity = torch.stack((qvel[:, 1], -qvel[:, 0], qvel[:, 2]), 1)
     memory = torch.rand(3, task.num_memory, dtype=REAL)
-    command, clock, last, before, noise, _ = memory.split((3, 1, n, n, 9 + 2 * n, 3), dim=-1)
+    command, clock, last, before, noise, _ = memory.split((3, 1, n, n, 9 + 2 * n, 6), dim=-1)
     obs = dict(zip(names, task.observe_with(qpos, qvel, last, memory).split(sizes, dim=-1), strict=True))
     down, joints = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3), qpos[:, 7:] - task._home
     sensed = dict(zip(names[:5], (velocity, qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
@@ -288,7 +288,7 @@ def test_the_image_follows_the_mirrored_command(name: str) -> None:
         torch.randn(n, 3, dtype=REAL, generator=generator),
         torch.rand(n, 1, dtype=REAL, generator=generator),
     )
-    noise, none = torch.randn(n, 9 + 2 * model.nu, dtype=REAL, generator=generator), torch.zeros(n, 3, dtype=REAL)
+    noise, none = torch.randn(n, 9 + 2 * model.nu, dtype=REAL, generator=generator), torch.zeros(n, 6, dtype=REAL)
     memory = torch.cat((command, clock, last, before, noise, none), dim=1)
     turned = command * torch.tensor([1.0, -1.0, -1.0]), (clock + 0.5) % 1.0
     sensed = mirror.obs(torch.cat((noise, torch.zeros(n, task.obs_dim - noise.shape[1], dtype=REAL)), 1))
