@@ -1,7 +1,7 @@
 """BPTT, backpropagation through time and through the simulator, the first-order baseline of the SHAC paper.
 
-The policy descends the gradient of the return of a window of simulated steps. There is no critic: no value stands for
-what comes after the window. Windows as long as an episode (--horizon 1000) make it the plain method of section 3.2.
+The policy descends the gradient of a rollout's return. There is no critic, so nothing stands for the rewards after the
+rollout. Rollouts as long as an episode (--horizon 1000) make it the plain method of section 3.2.
 
     python bptt.py --env ant --seed 1                                   train; writes runs/ant__bptt__1__<time>/
     python bptt.py --resume runs/ant__bptt__1__<time>/checkpoint.pt     continue an interrupted run exactly
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -20,10 +21,10 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import seeing
+from diffsim.training.layers import mlp, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Widths
 
-# Windows: section 4.2 of the SHAC paper; everything else: its authors' released settings.
+# Rollout lengths: section 4.2 of the SHAC paper; everything else: its authors' released settings.
 # fmt: off
 COLUMNS = ("hidden", "horizon", "num_envs", "lr", "normalize_obs", "iterations")
 PER_TASK = {
@@ -45,7 +46,7 @@ class Args(ParallelFlags):
     num_envs: Count = 32
     """parallel environments N, over all processes of torchrun (per task)"""
     horizon: Count = 128
-    """control steps H of a rollout, of 1/60 s each (per task)"""
+    """control steps H of a rollout (per task)"""
     deterministic_policy: bool = False
     """train a policy without noise"""
     hidden: Widths = (256, 128)
@@ -72,28 +73,14 @@ class Args(ParallelFlags):
 # Network --------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Sequential:
-    """Linear, ELU, LayerNorm per hidden layer and a linear output; torch's default or orthogonal initialisation."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True), nn.LayerNorm(width)]
-        inputs = width
-    layers.append(nn.Linear(inputs, outputs))
-    if orthogonal:
-        for layer in layers:
-            if isinstance(layer, nn.Linear):
-                nn.init.orthogonal_(layer.weight, math.sqrt(2))
-                nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
-
-
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        network = mlp(seen or obs_dim, args.hidden, action_dim, orthogonal=args.deterministic_policy)
+        orthogonal, elu = args.deterministic_policy, partial(nn.ELU, inplace=True)
+        network = mlp(seen or obs_dim, args.hidden, action_dim, elu, norm=True, orthogonal=orthogonal)
         self.mean = seeing(seen, network)
         log_std = torch.full((action_dim,), -math.inf if args.deterministic_policy else args.initial_log_std)
         self.log_std = nn.Parameter(log_std, requires_grad=not args.deterministic_policy)
@@ -115,7 +102,7 @@ class Actor(nn.Module):
 
 
 class Rollout(NamedTuple):
-    """What happened in one window, time first: (H, N, ...)."""
+    """What happened in one rollout, time first: (H, N, ...)."""
 
     obs: Tensor  # s_t, on which the policy acted
     reward: Tensor
@@ -133,7 +120,7 @@ class BPTT:
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
-        # However large a gradient is, it is clipped and followed: chaos is what the comparison is about.
+        # However large a gradient is, it is clipped and followed: the comparison shows exploding gradients.
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas, skip_norm=math.inf)
 
     def set_learning_rate(self, iteration: int) -> None:
@@ -141,7 +128,7 @@ class BPTT:
         self.optimizer.lr.fill_(args.lr + (args.final_lr - args.lr) * (iteration - 1) / args.iterations)
 
     def update(self) -> dict[str, Tensor]:
-        """Descend the loss of a window of all environments."""
+        """Act for a rollout, and descend its loss."""
         args = self.args
         rollout = collect(self.env, self.actor, self.actor.sample_noise(args.horizon, self.env.num_envs))
         loss = bptt_loss(rollout.reward, rollout.done, args.gamma)

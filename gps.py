@@ -12,30 +12,28 @@ which teaches a small network without a clock to act like the example.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maximum_entropy_controllers
-from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
+from diffsim.planning import REAL, AfterStep, LinearGaussian, Plan, Samples, SampleSet, Sum, Surprisal, System, Tracking
+from diffsim.planning.controller import gaussian_log_prob, maximum_entropy_controllers
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration
-from diffsim.planning.ilqr import Plan, ilqr
+from diffsim.planning.ilqr import ilqr
 from diffsim.planning.lbfgs import maximise
-from diffsim.planning.system import REAL, System
 from diffsim.tasks import find_task
 from diffsim.tasks.base import ASSETS
 from diffsim.training import distributed, evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer
-from diffsim.training.ranges import Count, Natural, NonNegative, Positive, Repeats
+from diffsim.training.ranges import Count, Natural, NonNegative, Positive, Repeats, Several
 from diffsim.training.run import Run
 
 STORED = 3  # times --active, the samples of S that are kept to choose from
@@ -44,7 +42,7 @@ COLUMNS = ("horizon", "control_dt", "action_cost", "hidden", "noise", "tracking"
 PER_TASK: dict[str, tuple[float, ...]] = {
     "cartpole": (240, 1 / 60, 1e-3,  50, 0.10, 0.05, 1500),
     "hopper":   (500, 0.02,   1e-1,  50, 0.10, 0.05,  200),
-    "humanoid": (500, 1 / 60, 1e-1, 200, 0.01, 0.05,  200),
+    "humanoid": (500, 1 / 60, 1e-1, 100, 0.10, 0.50, 1500),
     "swimmer":  (500, 0.05,   1e-2,  50, 0.10, 0.05,  200),
     "walker":   (500, 0.01,   1e-1,  50, 0.10, 0.50,   50),
 }
@@ -52,7 +50,7 @@ PER_TASK: dict[str, tuple[float, ...]] = {
 # Other tasks have their own.
 TARGETS = {
     "hopper":   (1.5, 1.25, 10.0, 1.0),
-    "humanoid": (4.2, 1.04, 10.0, 0.1),
+    "humanoid": (2.5, 1.20, 10.0, 0.1),
     "swimmer":  (2.0, 0.0,   0.0, 0.0),
     "walker":   (1.2, 1.35, 10.0, 10.0),
 }
@@ -66,7 +64,7 @@ class Args(Flags):
 
     iterations: Count = 80
     """iterations K of the policy search"""
-    horizon: Repeats = 500
+    horizon: Several = 500
     """control steps T of a trajectory (per task)"""
     control_dt: Positive = 1 / 60
     """seconds of a control step, which the --substeps divide (per task)"""
@@ -76,7 +74,7 @@ class Args(Flags):
     """the example, or several: .npz of qpos (T+1, nq), qvel (T+1, nv), action (T, nu), a row a step (per task)"""
     ilqr_iterations: Natural = 0
     """iterations of trajectory optimisation, which improve the example and make it harder to learn (docs/gps.md)"""
-    guiding_samples: Repeats = 40
+    guiding_samples: Several = 40
     """trajectories drawn from the guiding distributions"""
     adaptive: Natural = 0
     """number of first iterations that adapt the guides to the policy (Section 4.2; the paper: 40)"""
@@ -90,7 +88,7 @@ class Args(Flags):
     """weight of the squared deviation from the example's states, only in the guides (Section 6; per task)"""
     pretraining: Repeats = 1500
     """L-BFGS iterations of the fit to the guiding samples (per task)"""
-    samples: Repeats = 10
+    samples: Several = 10
     """trajectories of the policy per iteration"""
     active: Repeats = 100
     """trajectories in the active set S_k"""
@@ -118,10 +116,8 @@ class Args(Flags):
             fail(f"{self.env} shows its actor the first {seen} numbers of an observation, and this policy takes all")
         if not (self.demonstration or self.resume or self.evaluate):
             fail(f"--demonstration must be an example for {self.env}; shipped are those of {', '.join(PER_TASK)}")
-        least = dict(horizon=2, guiding_samples=2, samples=2, active=self.guiding_samples + self.samples)
-        for name, bound in least.items():
-            if getattr(self, name) < bound:
-                fail(f"--{name.replace('_', '-')} must be at least {bound}, not {getattr(self, name)}")
+        if self.active < (least := self.guiding_samples + self.samples):
+            fail(f"--active must be at least {least}, for the guides' and the policy's samples, not {self.active}")
         if self.regularizer_bounds[0] > self.regularizer_bounds[1]:
             fail(f"--regularizer-bounds must be two numbers in order, not {self.regularizer_bounds}")
 
@@ -134,7 +130,7 @@ class Search:
 
     guided = True  # whether S begins with the guides
     starts = 2  # of line 7
-    NUMBERS = "w_r floor scale plan_return guide_return control_steps nonfinite".split()
+    NUMBERS = "best initial w_r floor scale control_steps nonfinite".split()
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
@@ -147,9 +143,9 @@ class Search:
         self.network = Policy(args.hidden, self.system)  # has theta*
         self.w_r = math.prod(args.regularizer_bounds) ** 0.5
         self.floor, self.scale = -math.inf, 1.0  # least reward of a step; standard deviation of rewards
-        self.plan_return, self.guide_return = math.nan, (math.nan, math.nan)  # of the guides mean and deviation
         self.control_steps = self.nonfinite = 0
-        self.S = SampleSet(self.system, self.network)
+        self.S = SampleSet(self.log_density, self.system.device)
+        self.best = self.initial = 0  # number of theta* among the generators of S, and of initial guides there
 
     def prepare(self, say: Callable[[str], None]) -> dict[str, float]:
         """Lines 1 to 4; returns metrics."""
@@ -160,28 +156,27 @@ class Search:
         except ValueError as error:
             fail(error)
         self.grounds = [ground for ground, *_ in examples]
-        self.plan_return = -sum(plan.cost.item() for plan in plans) / len(plans)
         policy.sigma = (args.noise * plans[0].u[0].std(0)).clamp(min=1e-3)  # a motor at rest needs a density
         self.guides = [*map(self.guide, self.grounds, plans)]  # line 1: guides about DDP solutions
         guiding = self.sample_guides()  # line 2: sample their mixture
-        mean, std = self.guide_return
         policy.standardise(guiding.obs, guiding.u)
         policy.theta = self.pretrain(guiding)  # line 3: initialise theta*
         self.S.samples = guiding.pick(slice(0))  # line 4: build S from the guides and theta*
         if self.guided:
             self.S.append(guiding, *self.guides)
-        self.S.initial = self.S.best = len(self.S.generators)
-        own = self.draw(policy.theta, self.S.best)
+        self.initial = self.best = len(self.S.generators)
+        own = self.draw(policy.theta, self.best)
         self.S.append(own, (policy.theta,))
         self.scale = self.S.samples.reward.std().clamp(min=1e-6).item()
-        say(f"returns: example {self.plan_return:.1f}, guides {mean:.1f} +- {std:.1f}, policy {own.returns.mean():.1f}")
-        guides = {"gps/plan": self.plan_return, "gps/guides": mean, "gps/guides_std": std}
+        plan, (mean, std) = -sum(plan.cost.item() for plan in plans) / len(plans), guiding.spread
+        say(f"returns: example {plan:.1f}, guides {mean:.1f} +- {std:.1f}, policy {own.spread[0]:.1f}")
+        guides = {"gps/plan": plan, "gps/guides": mean, "gps/guides_std": std}
         return self.metrics(own) | guides | {"gps/guides_action": guiding.u.tanh().abs().mean().item()}
 
     def iterate(self, iteration: int) -> dict[str, float]:
         """Lines 6 to 17; returns metrics."""
         args, policy, S = self.args, self.network, self.S
-        active = S.choose(args.active, args.samples)  # line 6: choose S_k
+        active = self.choose(args.active, args.samples)  # line 6: choose S_k
         theta, metrics = self.optimise(S.samples.pick(active))  # line 7: theta_k <- arg max Phi
         source = len(S.generators)
         new = self.draw(theta, source)  # line 8: append samples from theta_k to S_k and S
@@ -191,17 +186,17 @@ class Search:
         better, values = self.estimate(theta, active)  # line 10: estimate the values of theta_k and theta*
         if better:  # ten samples do not see that one in ten falls: confirm it with more, and with all of theta*'s
             S.append(self.draw(theta, source, args.guiding_samples))
-            own = (S.samples.source == source) | (S.samples.source == S.best)
+            own = (S.samples.source == source) | (S.samples.source == self.best)
             better, values = self.estimate(theta, torch.cat((active, own.nonzero().flatten())).unique())
         metrics |= values | {"gps/accepted": float(better), "gps/regularizer": self.w_r}
         low, high = args.regularizer_bounds
         if better:  # line 11
-            policy.theta, S.best = theta, source  # line 12: theta* <- theta_k
+            policy.theta, self.best = theta, source  # line 12: theta* <- theta_k
             self.w_r = max(self.w_r / 10, low)  # line 13: decrease w_r
         else:  # line 14
             self.w_r = min(self.w_r * 10, high)  # line 15: increase w_r
-            S.append(self.draw(policy.theta, S.best))  # line 16: resample from theta*
-        S.prune(STORED * args.active)
+            S.append(self.draw(policy.theta, self.best))  # line 16: resample from theta*
+        self.best = S.keep(self.choose(STORED * args.active, STORED * args.active // 2), self.best)
         return metrics | self.metrics(new)
 
     def examples(self) -> list[tuple[System, Tensor, Tensor]]:
@@ -225,9 +220,7 @@ class Search:
         samples = self.follow(self.guides, self.args.guiding_samples)
         worst, top = samples.reward[torch.isfinite(samples.reward)].aminmax()
         self.floor = (2 * worst - top).item()
-        samples = samples._replace(reward=samples.reward.clamp(min=self.floor))
-        self.guide_return = samples.returns.mean().item(), samples.returns.std(correction=0).item()
-        return samples
+        return samples._replace(reward=samples.reward.clamp(min=self.floor))
 
     def pretrain(self, guiding: Samples) -> Tensor:
         """Line 3: the theta under which the guiding samples are likeliest."""
@@ -236,7 +229,7 @@ class Search:
     def optimise(self, S: Samples) -> tuple[Tensor, dict[str, float]]:
         """Line 7, from two starts (Section 5): theta*, and theta* fitted to the sample of the highest reward."""
         policy, iterations, top = self.network, self.args.lbfgs_iterations, S.returns.argmax()
-        value = self.objective(S.log_mixture, S.reward / self.scale)
+        value = self.objective(log_mixture(S), S.reward / self.scale)
         starts = [policy.theta, policy.fit(policy.theta, S.obs[top], S.u[top], iterations)][: self.starts]
         ends = [maximise(lambda theta: sparse(value, policy, theta, S), theta, iterations) for theta in starts]
         start = max(range(len(ends)), key=lambda i: ends[i][1])
@@ -246,13 +239,30 @@ class Search:
         """Phi () of log pi (m, T), for samples of this mixture and these rewards (m, T)."""
         return lambda log_pi: phi(log_pi, mixture, reward, self.w_r)
 
+    def choose(self, active: int, newest: int) -> Tensor:
+        """Line 6: indices of theta*'s newest samples, of the initial guides', and of those of most weight under theta*.
+
+        Adapted guides have too many to keep them all. Density breaks ties.
+        """
+        S, policy = self.S.samples, self.network
+        log_w = log_weights(policy.log_prob(policy.theta, S.obs, S.u), log_mixture(S))
+        score = torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
+        score = torch.where(S.source < self.initial, 2e9, score)
+        score[(S.source == self.best).nonzero().flatten()[-newest:]] = 3e9
+        return score.argsort(descending=True, stable=True)[:active].sort().values
+
+    def log_density(self, generator: tuple[Tensor, ...], samples: Samples) -> Tensor:
+        """(m, T) of prefixes: under a guide, or under a policy (theta,)."""
+        if len(generator) > 1:
+            return LinearGaussian(*generator).log_prob(self.system, samples.x, samples.u).cumsum(1)
+        return self.network.log_prob(generator[0], samples.obs, samples.u).cumsum(1)
+
     def adapt(self) -> Tensor:
         """Line 9: guides of exp(reward) pi_theta* (Section 4.2), from the last ones; their samples' indices."""
         args, system, policy = self.args, self.system, self.network
         guides, theta = self.adapted or self.guides, policy.theta
         x, u = torch.stack([g.x for g in guides]), torch.stack([g.u for g in guides])
-        surprisal = Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma)
-        cost = Sum((self.cost, surprisal))
+        cost = Sum((self.cost, Surprisal(system, lambda x: policy.mean(theta, system.observe(x)), policy.sigma)))
         plan = ilqr(system, cost, x, u, args.adaptive_iterations, mu=1e-3)
         self.adapted = maximum_entropy_controllers(system, cost, plan)
         return self.S.append(self.follow(self.adapted, args.samples, len(self.S.generators)), *self.adapted)
@@ -260,23 +270,19 @@ class Search:
     def estimate(self, theta: Tensor, active: Tensor) -> tuple[bool, dict[str, float]]:
         """Line 10: whether theta is better than theta* by Eq. 2 on the active set; the values, and theta's weights."""
         S = self.S.samples.pick(active)
-        mixture = S.log_mixture
+        mixture = log_mixture(S)
         log_pi = [self.network.log_prob(t, S.obs, S.u) for t in (theta, self.network.theta)]
         values = [phi(log_p, mixture, S.reward, 0.0).item() for log_p in log_pi]
         if not all(map(math.isfinite, values)):
             raise FloatingPointError(f"the value estimates are {values}: no active sample has a finite density")
         weights = torch.softmax(log_weights(log_pi[0], mixture), 0).sum(1)
-        share = (weights[S.source < self.S.initial].sum() / weights.sum()).item()
+        share = (weights[S.source < self.initial].sum() / weights.sum()).item()
         metrics = {"gps/estimate": values[0], "gps/best_estimate": values[1], "gps/guide_share": share}
         return values[0] > values[1], metrics
 
     def metrics(self, samples: Samples) -> dict[str, float]:
-        objective = {"gps/objective": samples.returns.mean(), "gps/objective_std": samples.returns.std(correction=0)}
-        objective["charts/episodic_return"] = self.system.reward(samples.x[:, 1:], samples.u).sum(1).mean()
-        metrics = {name: value.item() for name, value in objective.items()}
-        return metrics | {"sim/nonfinite": self.nonfinite}
-
-    # Trajectories -----------------------------------------------------------------------------------------------------
+        mean, std = samples.spread
+        return {"charts/episodic_return": mean, "gps/return_std": std, "sim/nonfinite": self.nonfinite}
 
     def reward(self, x: Tensor, u: Tensor) -> Tensor:
         """What is optimised (Section 6): reward (...) of u (..., nu), which led to x (..., nx)."""
@@ -303,19 +309,19 @@ class Search:
         sources, log_q = torch.full((len(u),), source, device=u.device), u.mT[:, :0]
         return Samples(x, self.system.observe(x[:, :-1]), u, reward, sources, log_q)
 
-    def roll_out(self, system: System, theta: Tensor, noise: Tensor, start: Tensor, source: int = -1) -> Samples:
+    def roll_out(self, theta: Tensor, noise: Tensor, start: Tensor, source: int = -1) -> Samples:
         """Trajectories of a policy with standard normal noise (m, T, nu), from start (1 or m, nx)."""
 
         def act(t: int, x: Tensor) -> Tensor:
-            return self.network.mean(theta, system.observe(x)) + self.network.sigma * noise[:, t]
+            return self.network.mean(theta, self.system.observe(x)) + self.network.sigma * noise[:, t]
 
-        return self.measure(*system.rollout(start.expand(len(noise), -1), self.args.horizon, act), source)
+        return self.measure(*self.system.rollout(start.expand(len(noise), -1), self.args.horizon, act), source)
 
     def draw(self, theta: Tensor, source: int = -1, count: int = 0) -> Samples:
         """So many trajectories of a policy, by default --samples; those without a source do not join S."""
         count = count or self.args.samples
         self.control_steps, noise = self.control_steps + count * self.args.horizon, self.noise(count)
-        return self.roll_out(self.system, theta, noise, self.guides[0].x[:1], source)
+        return self.roll_out(theta, noise, self.guides[0].x[:1], source)
 
     def follow(self, guides: list[LinearGaussian], count: int, first: int = 0) -> Samples:
         """So many trajectories of guides in equal shares, numbered from the first source on."""
@@ -327,25 +333,19 @@ class Search:
 
     @torch.no_grad()
     def evaluate(self) -> Evaluation:
-        """The best policy, with the same noise each time: the task's returns until it falls, and the optimised one."""
-        system, count = self.system, self.args.eval_episodes
+        """The best policy by the reward that is optimised, with the same noise each time."""
+        system, count, steps = self.system, self.args.eval_episodes, self.args.horizon
         noise = self.noise(count + 1, torch.Generator().manual_seed(SEED))
-        noise[0] = 0.0
-        rollouts = self.roll_out(system, self.network.theta, noise, self.guides[0].x[:1])
-        (without_noise, *_), S = rollouts.returns.tolist(), rollouts.pick(slice(1, None))
-        fallen = (system.task.terminated(system.observe(S.x[:, 1:])) & self.args.early_termination).int()
-        alive = fallen.cumsum(1) - fallen == 0
-        returns, lengths = (system.reward(S.x[:, 1:], S.u) * alive).sum(1), alive.sum(1)
-        forward, speed = system.task.forward_column, None
-        if forward is not None:
-            x = S.x[..., forward]
-            distance = x.gather(1, lengths.unsqueeze(1))[:, 0] - x[:, 0]
-            speed = (distance / (lengths * system.control_dt)).mean().item()
+        noise[count] = 0.0
+        rollouts = self.roll_out(self.network.theta, noise, self.guides[0].x[:1])
+        S, speed = rollouts.pick(slice(count)), None
+        if (forward := system.task.forward_column) is not None:
+            speed = (S.x[:, -1, forward] - S.x[:, 0, forward]).mean().item() / (steps * system.control_dt)
         qpos, action = S.x[:, :-1, : system.nq].transpose(0, 1), S.u.tanh().transpose(0, 1)
-        others = dict(without_noise=without_noise, plan=self.plan_return, guides=self.guide_return[0])
-        others |= dict(objective=S.returns.mean().item(), objective_std=S.returns.std(correction=0).item())
-        others |= dict(worst=S.returns.min().item(), action=S.u.tanh().abs().mean().item())
-        return Evaluation(returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
+        lengths, (mean, std), size = torch.full_like(S.source, steps), S.spread, action.abs().mean().item()
+        others = dict(objective=mean, objective_std=std, worst=S.returns.min().item(), action=size)
+        others["without_noise"] = rollouts.returns[count].item()
+        return Evaluation(S.returns, lengths, speed, qpos, action, system.scene, system.control_dt, others)
 
     @property
     def policy(self) -> nn.Sequential:
@@ -360,7 +360,10 @@ class Search:
         for name in self.NUMBERS:
             setattr(self, name, state[name])
         for name in ("guides", "adapted"):
-            setattr(self, name, [LinearGaussian(*moved(guide, self.system.device)) for guide in state[name]])
+            guides = [LinearGaussian(*(part.to(self.system.device) for part in guide)) for guide in state[name]]
+            setattr(self, name, guides)
+        if (steps := len(self.guides[0].u)) != self.args.horizon:
+            raise ValueError(f"--horizon is {steps}")
         self.grounds = [self.system] * len(self.guides)
         self.rng.set_state(state["rng"])
 
@@ -368,8 +371,9 @@ class Search:
 # Importance sampling --------------------------------------------------------------------------------------------------
 
 
-def log_mixture(log_q: Tensor) -> Tensor:
-    """(m, T) log of the mixture of n densities log q_j (m, n, T)."""
+def log_mixture(S: Samples) -> Tensor:
+    """(m, T) log density of prefixes under the mixture of the distributions that these samples come from."""
+    log_q = S.log_q[:, S.source.unique()]
     return torch.logsumexp(log_q, 1) - math.log(log_q.shape[1])
 
 
@@ -396,92 +400,6 @@ def sparse(value: Callable[[Tensor], Tensor], policy: Policy, theta: Tensor, S: 
     rows = slope.abs() > 1e-20 * slope.abs().max()
     linear = (slope[rows] * policy.log_prob(theta, S.obs[rows], S.u[rows])).sum()
     return result.detach() + linear - linear.detach()
-
-
-class Samples(NamedTuple):
-    """m trajectories."""
-
-    x: Tensor  # (m, T + 1, nx)
-    obs: Tensor  # (m, T, obs_dim) on which u acted
-    u: Tensor  # (m, T, nu)
-    reward: Tensor  # (m, T), bounded from below
-    source: Tensor  # (m,) index of the generator it came from
-    log_q: Tensor  # (m, n, T) log density of its prefixes under each generator
-
-    def pick(self, index: Tensor | slice) -> Samples:
-        return Samples(*(tensor[index] for tensor in self))
-
-    @property
-    def returns(self) -> Tensor:
-        return self.reward.sum(1)
-
-    @property
-    def log_mixture(self) -> Tensor:
-        """(m, T) log density of prefixes under the mixture of the distributions that these samples come from."""
-        return log_mixture(self.log_q[:, self.source.unique()])
-
-
-class SampleSet:
-    """S: samples, and the distributions that they come from."""
-
-    samples: Samples
-
-    def __init__(self, system: System, policy: Policy) -> None:
-        self.system, self.policy = system, policy
-        self.generators: list[tuple[Tensor, ...]] = []  # guides, the initial ones first, and policies as (theta,)
-        self.best = -1  # theta*'s index among them
-        self.initial = 0  # initial guides among them
-
-    def log_density(self, generator: tuple[Tensor, ...], samples: Samples) -> Tensor:
-        """(m, T) of prefixes."""
-        if len(generator) > 1:
-            return LinearGaussian(*generator).log_prob(self.system, samples.x, samples.u).cumsum(1)
-        return self.policy.log_prob(generator[0], samples.obs, samples.u).cumsum(1)
-
-    def append(self, samples: Samples, *new: tuple[Tensor, ...]) -> Tensor:
-        """Adds samples, and the generators that they are the first of; returns the samples' indices."""
-        for generator in new:
-            self.generators.append(tuple(generator))
-            column = self.log_density(generator, self.samples).unsqueeze(1)
-            self.samples = self.samples._replace(log_q=torch.cat((self.samples.log_q, column), 1))
-        log_q = torch.stack([self.log_density(generator, samples) for generator in self.generators], 1)
-        first, joined = len(self.samples.u), zip(self.samples, samples._replace(log_q=log_q), strict=True)
-        self.samples = Samples(*(torch.cat(tensors) for tensors in joined))
-        return torch.arange(first, len(self.samples.u), device=log_q.device)
-
-    def choose(self, active: int, newest: int) -> Tensor:
-        """Indices of theta*'s newest samples, of the initial guides', and of those with most weight under theta*.
-
-        Adapted guides have too many to keep them all. Density breaks ties.
-        """
-        S, policy = self.samples, self.policy
-        log_w = log_weights(policy.log_prob(policy.theta, S.obs, S.u), S.log_mixture)
-        score = torch.softmax(log_w, 0).sum(1) + 1e-9 * log_w[:, -1].clamp(min=-1e6)
-        score = torch.where(S.source < self.initial, 2e9, score)
-        score[(S.source == self.best).nonzero().flatten()[-newest:]] = 3e9
-        return score.argsort(descending=True, stable=True)[:active].sort().values
-
-    def prune(self, stored: int) -> None:
-        """Keeps so many: theta*'s newest, the initial guides', those of most weight; drops generators without any."""
-        kept = self.samples.pick(self.choose(stored, stored // 2))
-        used = torch.tensor(sorted({*kept.source.tolist(), self.best}), device=kept.u.device)
-        index = torch.full((len(self.generators),), -1, device=used.device)
-        index[used] = torch.arange(len(used), device=used.device)
-        self.samples = kept._replace(source=index[kept.source], log_q=kept.log_q[:, used])
-        self.generators, self.best = [self.generators[i] for i in used.tolist()], int(index[self.best])
-
-    def state_dict(self) -> dict[str, Any]:
-        parts = {"samples": tuple(self.samples), "generators": self.generators}
-        return parts | {"best": self.best, "initial": self.initial}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.samples = Samples(*moved(state["samples"], self.system.device))
-        self.generators = [moved(generator, self.system.device) for generator in state["generators"]]
-        self.best, self.initial = state["best"], state["initial"]
-
-
-def moved(tensors: Iterable[Tensor], device: torch.device) -> tuple[Tensor, ...]:
-    return tuple(tensor.to(device) for tensor in tensors)
 
 
 # The policy -----------------------------------------------------------------------------------------------------------
@@ -556,7 +474,7 @@ def train(args: Args, learner: type[Search] = Search) -> None:
             run.log_evaluation(search.evaluate())
 
 
-main = script(Args, train, partial(evaluate_checkpoint, learner=Search, method=Search.evaluate))
+main = script(Args, train, lambda args: evaluate_checkpoint(args, Search, Search.evaluate))
 
 if __name__ == "__main__":
     main()

@@ -1,8 +1,8 @@
 """MBPO, Model-Based Policy Optimization (Janner et al. 2019, https://arxiv.org/abs/1906.08253), and SE-MBPO.
 
-An ensemble of networks learns the dynamics; SAC learns from short rollouts of it, branched from real states. With
---sample-enhance (Qiao et al. 2021, https://arxiv.org/abs/2109.07719) the simulator's exact Jacobians add transitions
-around each real one.
+An ensemble of networks learns the dynamics, and SAC learns from its short rollouts, which branch from real states.
+--sample-enhance (Qiao et al. 2021, https://arxiv.org/abs/2109.07719) adds transitions around each real one by the
+simulator's Jacobians.
 
     python mbpo.py --env ant --seed 1                        train; writes runs/ant__mbpo__1__<time>/
     python mbpo.py --env ant --sample-enhance 4              SE-MBPO: four more transitions around each real one
@@ -28,7 +28,7 @@ from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, seeing
+from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Few, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -58,7 +58,7 @@ class Args(ParallelFlags):
     """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
 
     steps: Count = 16
-    """control steps of an iteration (1/60 s each)"""
+    """control steps of an iteration"""
     seed_steps: Natural = 64
     """control steps of each environment with random actions before training starts"""
     buffer_size: Count = 1_000_000
@@ -78,7 +78,7 @@ class Args(ParallelFlags):
     branches: Count = 1000
     """rollouts that each elite makes at once, branched from real states"""
     rollout_lengths: tuple[Count, Count] = (1, 1)
-    """first and final steps of a rollout, which grow linearly over the first half of the iterations (per task)"""
+    """steps of a rollout at first and from half of the iterations on; they grow linearly between (per task)"""
     retain: Repeats = 4
     """iterations whose rollouts stay in the buffer"""
     sample_enhance: Natural = 0
@@ -127,15 +127,6 @@ class Args(ParallelFlags):
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
-
-
-def mlp(inputs: int, hidden: Widths, outputs: int | None, activation: type[nn.Module]) -> nn.Sequential:
-    """Linear and activation per hidden layer, and a linear output, if any."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), activation()]
-        inputs = width
-    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
 
 
 class Actor(nn.Module):
@@ -328,9 +319,9 @@ class MBPO:
         args = self.args
         with torch.no_grad():
             action, density = self.actor(next_obs)
-            value = q_values(self.targets, next_obs, action).amin(0) - self.temperature["log"].exp() * density
+            value = self.targets.value(next_obs, action).amin(0) - self.temperature["log"].exp() * density
             target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
-        values = q_values(self.critics, obs, batch.action)
+        values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
         norm = self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -340,18 +331,12 @@ class MBPO:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to an entropy of minus one nat per action."""
         action, density = self.actor(obs)
-        value = q_values(self.critics, obs, action).amin(0)
+        value = self.critics.value(obs, action).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = action.shape[1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
-
-
-def q_values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-    """Each critic's Q(s, a) (2, B)."""
-    inputs = torch.cat((obs, action), -1)
-    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
 
 # SE-MBPO --------------------------------------------------------------------------------------------------------------

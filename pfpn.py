@@ -1,8 +1,8 @@
 """PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301), by PPO.
 
-A Gaussian policy has one peak. Here each action has particles: normal distributions, the same in all states, whose
-weights the network gives. The policy is their mixture. Particles without weight are moved to those that have it. PPO
-trains this policy and those with which the paper compares it; pfpn_sac.py trains it off-policy.
+A Gaussian policy has one peak. Here each action has particles: normal distributions that are the same in all states,
+with weights from the network. The policy is their mixture. Particles without weight are moved to others that have some.
+PPO trains this policy and those with which the paper compares it; pfpn_sac.py trains it off-policy.
 
     python pfpn.py --env ant --seed 1                        train; writes runs/ant__pfpn__1__<time>/
     python pfpn.py --env ant --policy gaussian               or gmm, discrete: the policies to compare
@@ -23,9 +23,9 @@ from torch import Tensor, nn
 from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, moments, seeing
+from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Decay, Fraction, Natural, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 
 # The settings of ppo_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
 # fmt: off
@@ -49,7 +49,7 @@ class Args(ParallelFlags):
     """The policy, and PPO. Defaults are the humanoid's."""
 
     policy: Literal["pfpn", "gaussian", "gmm", "discrete"] = "pfpn"
-    """particles; one Gaussian; a mixture whose locations and scales depend on the state too; fixed bins"""
+    """particles; one Gaussian; a mixture whose locations and scales also depend on the state; fixed bins"""
     std: Literal["state", "own"] = "state"
     """standard deviation of the Gaussian policy: a function of the state, or one parameter per action"""
     particles: Several = 35
@@ -66,11 +66,9 @@ class Args(ParallelFlags):
     """a particle is dead if its weight since the last resampling is below this share of 1 / particles"""
     dead_by: Literal["mean", "max"] = "mean"
     """weight that decides: the mean over the recorded steps, or the largest (Eq. 8)"""
-    log_particles: tuple[Natural, ...] = ()
-    """actions, counted from 0, whose particles' locations and mean weights are logged"""
 
     horizon: Count = 32
-    """control steps of a rollout, of 1/60 s each (per task)"""
+    """control steps of a rollout (per task)"""
     hidden: SomeWidths = (256, 128, 64)
     """units of the hidden layers, which policy and value share (per task)"""
     lr: Positive = 3e-4
@@ -96,8 +94,9 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        if self.lr_bounds[0] > self.lr_bounds[1]:
-            fail(f"--lr-bounds {self.lr_bounds}: the first must not exceed the second")
+        least, largest = self.lr_bounds
+        if least > largest:
+            fail(f"--lr-bounds {least} {largest}: the first must not exceed the second")
         if not LOG_STD[0] <= (self.initial_log_std or 0.0) <= LOG_STD[1]:
             fail(f"--initial-log-std must be from {LOG_STD[0]:g} to {LOG_STD[1]:g}, not {self.initial_log_std}")
 
@@ -226,22 +225,13 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
     return layer
 
 
-def mlp(inputs: int, hidden: SomeWidths) -> nn.Sequential:
-    """Linear and ELU per hidden layer."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU()]
-        inputs = width
-    return nn.Sequential(*layers)
-
-
 class Actor(nn.Module):
     """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden))
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ELU))
         self.head = Head(args, args.hidden[-1], action_dim)
         self.value = nn.Linear(args.hidden[-1], 1)
 
@@ -267,8 +257,6 @@ class Resampling(nn.Module):
         self.seen: Tensor = nn.Buffer(torch.zeros(2, *head.shape))  # since the last one: sum and largest of weights
         self.age: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # iterations
         self.moved: Tensor = nn.Buffer(torch.zeros(()))  # particles, ever
-        if self.active and (wrong := [k for k in args.log_particles if k >= head.shape[0]]):
-            fail(f"--log-particles {wrong[0]}: the actions of {args.env!r} are 0 to {head.shape[0] - 1}")
 
     def record(self, acting: Mixture) -> None:
         """Take the weights (..., m, n) with which the policy acts."""
@@ -294,17 +282,13 @@ class Resampling(nn.Module):
         if self.args.resampling != "none":
             chance = weight if self.args.resampling == "weighted" else torch.ones_like(weight)
             self.move(head, optimizer, dead & due, chance.masked_fill(dead, 0.0))
-        found = {
+        self.seen *= ~due
+        return {
             **{f"particles/dead_{by}": each.to(weight.dtype).mean() for by, each in below.items()},
             "particles/moved": self.moved,
             "particles/active": (-torch.xlogy(weight, weight).sum(-1)).exp().mean(),
             "particles/std": (weight * head.log_std.exp()).sum(-1).mean(),
         }
-        for name, values in (("loc", head.loc.clone()), ("weight", weight)):
-            for k in self.args.log_particles:
-                found |= {f"particles/{name}_{k}_{i}": value for i, value in enumerate(values[k].unbind())}
-        self.seen *= ~due
-        return found
 
     def move(self, head: Head, optimizer: ClippedAdam, dead: Tensor, chance: Tensor) -> None:
         """Make the dead particles copies of others, drawn by the chances (m, n) (Eq. 9), the policy the same (Eq. 10).
@@ -330,7 +314,7 @@ class Resampling(nn.Module):
 
 
 class Rollout(NamedTuple):
-    """What happened in a window, time first: (H, N, ...)."""
+    """What happened in a rollout, time first: (H, N, ...)."""
 
     obs: Tensor  # s_t, on which the policy acted
     next_obs: Tensor  # s_{t+1}, before any reset
@@ -343,7 +327,7 @@ class Rollout(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What the update needs of a window's samples, or of some of them: (B, ...)."""
+    """What the update needs of a rollout's samples, or of some of them: (B, ...)."""
 
     obs: Tensor  # normalized
     action: Tensor
@@ -371,7 +355,7 @@ class PPO:
 
     @torch.no_grad()
     def interact(self) -> dict[str, Tensor]:
-        """Act for a window, and keep its samples with their advantages and value targets."""
+        """Act for a rollout, and keep its samples with their advantages and value targets."""
         args, normalizer, steps, obs = self.args, self.actor.normalizer, [], self.env.detach()
         for _ in range(args.horizon):
             mixture, value = self.actor(normalizer(obs))
@@ -381,19 +365,19 @@ class PPO:
             ends = terminated, terminated | truncated
             steps.append((obs, info["final_obs"], action, mixture.log_prob(action), value, reward, *ends))
             obs = next_obs
-        window = Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
-        mixture, next_value = self.actor(normalizer(window.next_obs))
-        next_value = self.return_normalizer.inverse(next_value).masked_fill(window.terminated, 0.0)
-        target = td_lambda(window.reward, next_value, window.done, args.gamma, args.trace_decay)
-        advantage = target - self.return_normalizer.inverse(window.value)
+        rollout = Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
+        mixture, next_value = self.actor(normalizer(rollout.next_obs))
+        next_value = self.return_normalizer.inverse(next_value).masked_fill(rollout.terminated, 0.0)
+        target = td_lambda(rollout.reward, next_value, rollout.done, args.gamma, args.trace_decay)
+        advantage = target - self.return_normalizer.inverse(rollout.value)
         explained = 1 - advantage.var() / target.var()
         self.return_normalizer.update(target)
         var, mean = moments(advantage.flatten())
         advantage = (advantage - mean) / (var.sqrt() + 1e-8)
-        samples = normalizer(window.obs), window.action, window.log_prob, advantage, self.return_normalizer(target)
+        samples = normalizer(rollout.obs), rollout.action, rollout.log_prob, advantage, self.return_normalizer(target)
         for buffer, tensor in zip(self.batch, samples, strict=True):
             buffer.copy_(tensor.flatten(0, 1))
-        normalizer.update(window.obs)
+        normalizer.update(rollout.obs)
         return {"losses/entropy": mixture.entropy().mean(), "losses/explained_variance": explained}
 
     def learn(self) -> dict[str, Tensor]:
@@ -431,7 +415,7 @@ class PPO:
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, to a done or the window's end: the value and the generalized advantage.
+    """TD(lambda) of (H, N) steps, to a done or the rollout's end: the value and the generalized advantage.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """

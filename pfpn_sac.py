@@ -1,7 +1,7 @@
 """PFPN, Particle Filtering Policy Network (Xu and Karamouzas 2021, https://doi.org/10.1145/3487983.3488301), by SAC.
 
-The policy is a mixture of particles: normal distributions, the same in all states, whose weights the network gives.
-Soft Actor-Critic trains it off-policy, as in section 4.4 of the paper; the gradient of the critics goes on through the
+The policy is a mixture of particles: normal distributions that are the same in all states, with weights from the
+network. Soft Actor-Critic trains it off-policy, as in section 4.4 of the paper: the critics' gradient goes through the
 sampled actions. pfpn.py trains it by PPO.
 
     python pfpn_sac.py --env ant --seed 1                    train; writes runs/ant__pfpn_sac__1__<time>/
@@ -25,7 +25,7 @@ from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import Likeliest, ObsNormalizer, seeing
+from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -65,7 +65,7 @@ class Args(ParallelFlags):
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
 
     horizon: Count = 32
-    """control steps of a rollout (1/60 s each)"""
+    """control steps of a rollout"""
     hidden: SomeWidths = (512, 256)
     """units of the policy's hidden layers (per task)"""
     critic_hidden: SomeWidths = (512, 256)
@@ -186,22 +186,13 @@ def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
     return loc.float().repeat(actions, 1), widest.log().float().repeat(actions, 1)
 
 
-def mlp(inputs: int, hidden: SomeWidths, outputs: int | None = None) -> nn.Sequential:
-    """Linear and ReLU per hidden layer, and a linear output, if any."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ReLU()]
-        inputs = width
-    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
-
-
 class Actor(nn.Module):
     """pi(a|s), of normalized observations."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden))
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.head = Head(args, args.hidden[-1], action_dim)
 
     def forward(self, obs: Tensor) -> Mixture:
@@ -316,7 +307,7 @@ class SAC:
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
-        critics = [mlp(obs_dim + action_dim, args.critic_hidden, 1) for _ in range(2)]
+        critics = [mlp(obs_dim + action_dim, args.critic_hidden, 1, nn.ReLU) for _ in range(2)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.temperature = nn.ParameterDict({"log": torch.zeros(())}).to(env.device)  # the entropy's weight
@@ -327,7 +318,7 @@ class SAC:
 
     @torch.no_grad()
     def interact(self) -> dict[str, Tensor]:
-        """Act for a window, into the buffer."""
+        """Act for a rollout, into the buffer."""
         steps, obs, normalizer = [], self.env.detach(), self.actor.normalizer
         for _ in range(self.args.horizon):
             mixture = self.actor(normalizer(obs))
@@ -336,9 +327,9 @@ class SAC:
             next_obs, reward, terminated, _, info = self.env.step(action)
             steps.append((obs, action, reward, info["final_obs"], terminated.to(reward.dtype)))
             obs = next_obs
-        window = Transition(*(torch.cat(tensors) for tensors in zip(*steps, strict=True)))
-        self.buffer.add(window)
-        normalizer.update(window.obs)
+        rollout = Transition(*(torch.cat(tensors) for tensors in zip(*steps, strict=True)))
+        self.buffer.add(rollout)
+        normalizer.update(rollout.obs)
         return {}
 
     def learn(self) -> dict[str, Tensor]:
@@ -362,10 +353,10 @@ class SAC:
         with torch.no_grad():
             mixture = self.actor(next_obs)
             u = mixture.sample()
-            soft = values(self.targets, next_obs, torch.tanh(u)).amin(0)
+            soft = self.targets.value(next_obs, torch.tanh(u)).amin(0)
             soft = soft - self.temperature["log"].exp() * mixture.log_prob(u)
             target = batch.reward + self.args.gamma * (1 - batch.terminated) * soft
-        value = values(self.critics, obs, batch.action)
+        value = self.critics.value(obs, batch.action)
         loss = (value - target).square().mean(1).sum()
         self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -377,18 +368,12 @@ class SAC:
         mixture = self.actor(obs)
         u = self.sample(mixture)
         density = mixture.log_prob(u)
-        value = values(self.critics, obs, torch.tanh(u)).amin(0)
+        value = self.critics.value(obs, torch.tanh(u)).amin(0)
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         norm = self.optimizer.step(loss)
         surplus = u.shape[-1] - density.detach().mean()  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean(), "grad/norm": norm}
-
-
-def values(critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-    """Each critic's Q(s, a) (2, B)."""
-    inputs = torch.cat((obs, action), -1)
-    return critics(inputs.expand(2, *inputs.shape)).squeeze(-1)
 
 
 # The run --------------------------------------------------------------------------------------------------------------

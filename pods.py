@@ -25,7 +25,7 @@ from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import Flags
-from diffsim.training.layers import seeing
+from diffsim.training.layers import mlp, seeing
 from diffsim.training.ranges import Count, NonNegative, Positive, Repeats, Widths
 
 # fmt: off
@@ -54,7 +54,7 @@ class Args(Flags):
     num_envs: Count = 32
     """action sequences N of an iteration (per order)"""
     horizon: Count = 50
-    """control steps T of a sequence (1/60 s each); it must divide an episode (per task)"""
+    """control steps T of a sequence; an episode must be a multiple of them (per task)"""
     improvements: Count = 1
     """line-searched steps of each sequence in an iteration (per order)"""
     candidates: Repeats = 8
@@ -66,7 +66,7 @@ class Args(Flags):
     action_cost: NonNegative = 1e-2
     """second order: cost of the squared action before tanh, which bounds it where tanh is flat"""
     imitate: Literal["visited", "improved"] = "visited"
-    """states at which improved actions are taught: those that the policy visited, or they lead to (per order)"""
+    """states at which improved actions are taught: those visited by the policy, or by these actions (per order)"""
     epochs: Count = 4
     """passes of the imitation over the sequences (per order)"""
     batch_size: Count = 512
@@ -106,11 +106,7 @@ class Actor(nn.Module):
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        layers, inputs = list[nn.Module](), seen or obs_dim
-        for width in args.hidden:
-            layers += [nn.Linear(inputs, width), nn.ELU(), nn.LayerNorm(width)]
-            inputs = width
-        self.mean = seeing(seen, nn.Sequential(*layers, nn.Linear(inputs, action_dim)))
+        self.mean = seeing(seen, mlp(seen or obs_dim, args.hidden, action_dim, nn.ELU, norm=True))
 
     def forward(self, obs: Tensor) -> Tensor:
         """u (..., action_dim), the action before tanh."""

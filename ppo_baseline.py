@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -21,7 +22,7 @@ from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import SymmetricFlags
-from diffsim.training.layers import ObsNormalizer, folded, make_even, moments, seeing
+from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
 
@@ -53,7 +54,7 @@ class Args(SymmetricFlags):
     num_envs: Count = 1024
     """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
     horizon: Count = 32
-    """control steps of a rollout, of 1/60 s each (per task)"""
+    """control steps of a rollout (per task)"""
     hidden: Widths = (256, 128, 64)
     """units of the hidden layers that policy and value share (per task)"""
     lr: Positive = 3e-4
@@ -101,14 +102,6 @@ class Args(SymmetricFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def hidden(inputs: int, args: Args) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for width in args.hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True)]
-        inputs = width
-    return nn.Sequential(*layers)
-
-
 class ActorCritic(nn.Module):
     """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features."""
 
@@ -117,8 +110,10 @@ class ActorCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim, mirror)
-        self.features = seeing(seen, hidden(seen or obs_dim, args), mirror)
-        self.own = None if seen is None else seeing(None, hidden(obs_dim, args), mirror)  # of V, which sees more
+        elu = partial(nn.ELU, inplace=True)
+        self.features = seeing(seen, mlp(seen or obs_dim, args.hidden, None, elu), mirror)
+        own = None if seen is None else mlp(obs_dim, args.hidden, None, elu)  # of V, which sees more
+        self.own = None if own is None else seeing(None, own, mirror)
         mean, value = (nn.Sequential(nn.Linear(args.hidden[-1], n)) for n in (action_dim, 1))
         self.mean, self.value = folded(mean, mirror and mirror.action), folded(value, mirror and mirror.value)
         self.log_std = nn.Parameter(torch.full((action_dim,), args.initial_log_std))
@@ -242,7 +237,7 @@ def collect(env: DiffEnv, policy: ActorCritic, noise: Tensor) -> Rollout:
 
 
 def gae(reward: Tensor, value: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at the dones and at the window's end.
+    """Advantages of (H, N) steps (Schulman et al. 2016, Eq. 16), cut at the dones and at the rollout's end.
 
     next_value is V(s_{t+1}), before any reset: zero where the episode terminated, but not where its time ran out.
     """
@@ -278,7 +273,7 @@ def entropy(log_std: Tensor) -> Tensor:
 
 @torch.no_grad()
 def adapt(lr: Tensor, kl: Tensor, target: float, bounds: tuple[float, float]) -> None:
-    """Divides lr by 1.5 where kl is beyond twice the target, and multiplies it by 1.5 below half of it."""
+    """Divide lr by 1.5 where kl is beyond twice the target, and multiply it by 1.5 where kl is below half of it."""
     lr.mul_(1.5 ** ((kl < target / 2).to(lr.dtype) - (kl > 2 * target).to(lr.dtype))).clamp_(*bounds)
 
 

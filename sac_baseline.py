@@ -24,7 +24,7 @@ from diffsim import DiffEnv
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
-from diffsim.training.layers import ObsNormalizer, seeing
+from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
@@ -54,13 +54,13 @@ class Args(ParallelFlags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
     iterations: Count = 20_000
-    """learning iterations, `steps` control steps of all environments with their updates each (per task)"""
+    """learning iterations: --steps control steps of all environments, each followed by updates (per task)"""
     large_batch: bool = False
     """many environments, large batches, layer-normalized critics: hopper, ant and humanoid in minutes of a GPU"""
     num_envs: Count = 64
     """parallel environments N (per task)"""
     steps: Count = 32
-    """control steps of an iteration (1/60 s each)"""
+    """control steps of an iteration"""
     updates_per_step: Repeats = 1
     """gradient updates of the critics after each control step of all environments"""
     actor_updates: Repeats = 1
@@ -119,22 +119,13 @@ class Args(ParallelFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, args: Args, outputs: int | None = None, layer_norm: bool = False) -> nn.Sequential:
-    """Linear and ReLU per hidden layer, with LayerNorm after it if asked for; and a linear output."""
-    layers: list[nn.Module] = []
-    for width in args.hidden:
-        layers += [nn.Linear(inputs, width), nn.ReLU()] + ([nn.LayerNorm(width)] if layer_norm else [])
-        inputs = width
-    return nn.Sequential(*layers, *([nn.Linear(inputs, outputs)] if outputs else []))
-
-
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim)
-        self.body = seeing(seen, mlp(seen or obs_dim, args))
+        self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,7 +156,8 @@ class SAC:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
-        critics = [mlp(obs_dim + action_dim, args, 1, args.layer_norm) for _ in range(args.critics)]
+        inputs = obs_dim + action_dim
+        critics = [mlp(inputs, args.hidden, 1, nn.ReLU, args.layer_norm) for _ in range(args.critics)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         log = torch.full((), math.log(args.initial_temperature))
@@ -185,6 +177,7 @@ class SAC:
         return self.iterate(learning=True)
 
     def iterate(self, learning: bool) -> dict[str, Tensor]:
+        """Control steps of all environments; when learning, those of the policy, each followed by updates."""
         metrics = []
         obs = self.env.detach()
         for _ in range(self.args.steps):
@@ -226,14 +219,12 @@ class SAC:
         args = self.args
         with torch.no_grad():
             action, density = self.actor(next_obs)
-            values = self.values(self.targets, next_obs, action)
+            values = self.targets.value(next_obs, action)
             if args.critic_subset < args.critics:
                 values = values[torch.rand(args.critics, device=obs.device).argsort()[: args.critic_subset]]
-            entropy = -self.temperature["log"].exp() * density
-            target = batch.reward + args.gamma * (1 - batch.terminated) * (
-                values.amin(0) + entropy
-            )  # none after a fall
-        values = self.values(self.critics, obs, batch.action)
+            value = values.amin(0) - self.temperature["log"].exp() * density
+            target = batch.reward + args.gamma * (1 - batch.terminated) * value  # none after a fall
+        values = self.critics.value(obs, batch.action)
         loss = (values - target).square().mean(1).sum()
         norm = self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
@@ -244,18 +235,13 @@ class SAC:
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         """Ascend value and entropy; steer the temperature to the target entropy."""
         action, density = self.actor(obs)
-        values = self.values(self.critics, obs, action)
+        values = self.critics.value(obs, action)
         value = values.amin(0) if self.args.critic_subset == self.args.critics else values.mean(0)  # REDQ: the mean
         loss = (self.temperature["log"].detach().exp() * density - value).mean()
         self.actor_optimizer.step(loss)
         surplus = -density.detach().mean() - self.args.target_entropy * action.shape[1]  # of entropy over the target
         self.temperature_optimizer.step(self.temperature["log"].exp() * surplus)
         return {"losses/actor": loss.detach(), "charts/entropy": -density.detach().mean() / action.shape[1]}
-
-    def values(self, critics: Ensemble, obs: Tensor, action: Tensor) -> Tensor:
-        """Each critic's Q(s, a) (critics, B)."""
-        inputs = torch.cat((obs, action), -1)
-        return critics(inputs.expand(self.args.critics, *inputs.shape)).squeeze(-1)
 
 
 # The run --------------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """SAPO, Soft Analytic Policy Optimization (Xing et al. 2025, https://arxiv.org/abs/2412.12089).
 
-SHAC with a maximum-entropy objective: the actor descends the gradient of a short window of simulated steps, with the
-policy's entropy as a part of the reward; two critics are fitted to the soft TD(lambda) returns of the same window.
+SHAC with a maximum-entropy objective: the actor descends the gradient of a short rollout, taken through the simulator,
+with the policy's entropy as a part of the reward. Two critics are fitted to the soft TD(lambda) returns of the rollout.
 
     python sapo.py --env humanoid --seed 1                                  train; writes a folder of runs/
     python sapo.py --resume runs/humanoid__sapo__1__<time>/checkpoint.pt    continue an interrupted run exactly
@@ -25,10 +25,10 @@ from diffsim.tasks.mirror import Mirror
 from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import WindowFlags
-from diffsim.training.layers import ObsNormalizer, folded, make_even, seeing
-from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths, Widths
+from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, seeing
+from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths
 
-# SHAC's networks; docs/sapo.md has what was measured with these settings, which are those of its best results.
+# SHAC's networks, and the settings of the best results (docs/sapo.md).
 # fmt: off
 COLUMNS = ("actor_hidden", "critic_hidden", "activation", "actor_lr", "critic_lr", "target_alpha", "initial_log_std",
            "initial_target_entropy", "target_entropy", "population", "num_envs", "iterations", "critic_iterations")
@@ -43,11 +43,11 @@ PER_TASK = {
     "g1_track":     ((256, 128),    (512, 256), "silu", 2e-3, 1e-3, 0.9,  -2.0, -1.0, -2.0,  1, 1024,  700,  8),
 }
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
-# How --accuracy default integrates, where that is not as in the paper.
+# Integrators that replace the papers' with --accuracy default.
 INTEGRATION = {name: TASKS[name].integration("fast") for name in ("hopper", "half_cheetah")}
 INTEGRATION |= {"ant": Integration("implicit", 8)}
 INTEGRATION |= {name: Integration("implicit", 16) for name in ("humanoid", "humanoid_mtu")}
-# They fall before they learn to walk
+# Robots that fall before they learn to walk
 BALANCING: dict[str, dict[str, Any]] = {"g1": {"horizon": 16, "adjoint_clip": 5.0}, "g1_track": {"horizon": 16}}
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
 ON_CPU: dict[str, dict[str, Any]] = {
@@ -71,7 +71,7 @@ class Args(WindowFlags):
     state_std: bool = True
     """the standard deviation of the policy's noise depends on the state"""
     critics: Few = 2
-    """value functions: the smallest makes the targets, the mean the actor's loss"""
+    """value functions: targets take the smallest value, the actor's loss the mean"""
     activation: Literal["elu", "silu"] = "silu"
     """nonlinearity of actor and critics (per task)"""
     population: Few = 1
@@ -87,7 +87,7 @@ class Args(WindowFlags):
     temperature_lr: Positive = 5e-3
     """learning rate of the temperature's logarithm"""
     horizon: Count = 32
-    """control steps h of a rollout (1/60 s each)"""
+    """control steps h of a rollout"""
     actor_hidden: SomeWidths = (256, 128)
     """units of the actor's hidden layers (per task)"""
     critic_hidden: SomeWidths = (128, 128)
@@ -137,24 +137,6 @@ class Args(WindowFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, hidden: Widths, activation: str) -> nn.Sequential:
-    """Linear, nonlinearity, LayerNorm per hidden layer."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), ACTIVATIONS[activation](), nn.LayerNorm(width)]
-        inputs = width
-    return nn.Sequential(*layers)
-
-
-def critic(args: Args, obs_dim: int, mirror: Mirror | None) -> nn.Sequential:
-    network = mlp(obs_dim, args.critic_hidden, args.activation).append(nn.Linear(args.critic_hidden[-1], 1))
-    for layer in network:
-        if isinstance(layer, nn.Linear):
-            nn.init.orthogonal_(layer.weight, math.sqrt(2))
-            nn.init.zeros_(layer.bias)
-    return folded(seeing(None, network, mirror), mirror and mirror.value)
-
-
 class Actor(nn.Module):
     """pi(a|s) of K members, tanh of a Gaussian. Observations are normalized by the statistics of all members."""
 
@@ -164,7 +146,7 @@ class Actor(nn.Module):
         super().__init__()
         K, width = args.population, args.actor_hidden[-1]
         self.normalizer = ObsNormalizer(obs_dim, mirror)
-        bodies = [mlp(seen or obs_dim, args.actor_hidden, args.activation) for _ in range(K)]
+        bodies = [mlp(seen or obs_dim, args.actor_hidden, None, ACTIVATIONS[args.activation], True) for _ in range(K)]
         self.body = Ensemble([seeing(seen, body, mirror) for body in bodies])
         means = [nn.Sequential(nn.Linear(width, action_dim)) for _ in range(K)]
         self.mean = Ensemble([folded(mean, mirror and mirror.action) for mean in means])
@@ -196,7 +178,7 @@ class Actor(nn.Module):
 
 
 class Rollout(NamedTuple):
-    """What happened in one window, time first: (H, N, ...)."""
+    """What happened in one rollout, time first: (H, N, ...)."""
 
     obs: Tensor  # s_t, on which the policy acted
     next_obs: Tensor  # s_{t+1}, before any reset
@@ -218,7 +200,10 @@ class SAPO:
         self.args, self.env, K, obs_dim = args, env, args.population, env.task.obs_dim
         mirror = env.task.mirror if args.symmetric else None
         self.actor = Actor(args, obs_dim, env.scene.nu, env.task.actor_dim, mirror).to(env.device)
-        self.critics = Ensemble([critic(args, obs_dim, mirror) for _ in range(args.critics * K)]).to(env.device)
+        options = args.critic_hidden, 1, ACTIVATIONS[args.activation]
+        networks = [mlp(obs_dim, *options, norm=True, orthogonal=True) for _ in range(args.critics * K)]
+        critics = [folded(seeing(None, network, mirror), mirror and mirror.value) for network in networks]
+        self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         log = torch.full((K,), math.log(args.initial_temperature))
         self.temperature = nn.ParameterDict({"log": log}).to(env.device)  # the entropy's weight
@@ -230,7 +215,7 @@ class SAPO:
         self.temperature_optimizer = EnsembleAdam(self.temperature, 1, K, *limits)
         self.temperature_optimizer.lr.fill_(args.temperature_lr)
         self.target_entropy = torch.zeros((), device=env.device)
-        samples = args.horizon * env.num_envs // K  # a window's of a member, for its critics
+        samples = args.horizon * env.num_envs // K  # of a rollout, for each member's critics
         self.obs = torch.zeros(K, samples, obs_dim, device=env.device)
         self.value = torch.zeros(K, samples, device=env.device)
 
@@ -269,7 +254,7 @@ class SAPO:
     # The two halves of an iteration -----------------------------------------------------------------------------------
 
     def update_actor(self) -> dict[str, Tensor]:
-        """Descend the soft loss of a window of all environments; keep the critics' samples of it."""
+        """Act for a rollout, descend its soft loss, and keep its samples for the critics."""
         args, K = self.args, self.args.population
         rollout = self.collect()
         next_values, reward = self.next_values(rollout), rollout.reward
@@ -293,7 +278,7 @@ class SAPO:
         }
 
     def update_critic(self) -> dict[str, Tensor]:
-        """Fit the critics to the window's soft TD(lambda) returns, and let the target critics follow."""
+        """Fit the critics to the rollout's soft TD(lambda) returns, and let the target critics follow."""
         args = self.args
         batches = self.obs.chunk(args.critic_minibatches, -2), self.value.chunk(args.critic_minibatches, -1)
         for _ in range(args.critic_iterations):
@@ -323,7 +308,7 @@ class SAPO:
         return Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
 
     def split(self, tensor: Tensor) -> Tensor:
-        """The samples of a window (H, N, ...) by members (K, B, ...)."""
+        """The samples of a rollout (H, N, ...) by members (K, B, ...)."""
         return tensor.unflatten(1, (self.args.population, -1)).movedim(1, 0).flatten(1, 2)
 
     def values(self, critics: Ensemble, obs: Tensor) -> Tensor:
@@ -337,7 +322,7 @@ class SAPO:
         return torch.where(rollout.terminated, torch.zeros_like(values), values)
 
     def keep(self, rollout: Rollout, reward: Tensor, next_values: Tensor) -> None:
-        """A window's observations with their TD(lambda) returns, which the critics are to learn."""
+        """Store the critics' samples: observations of a rollout, and their TD(lambda) returns."""
         args, normalizer = self.args, self.actor.normalizer
         value = td_lambda(reward, next_values.amin(0), rollout.done, args.gamma, args.td_lambda)
         self.value.copy_(self.split(value))
@@ -356,7 +341,7 @@ def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the window's end does."""
+    """TD(lambda) of (H, N) steps, backward in time; a done ends the return as the rollout's end does."""
     returns = torch.empty_like(reward)
     following = next_value[-1]
     for t in reversed(range(len(reward))):

@@ -1,7 +1,7 @@
 """SHAC, Short-Horizon Actor-Critic (Xu et al. 2022, https://arxiv.org/abs/2204.07137).
 
-The actor descends the gradient of a short window of simulated steps, taken through the simulator, with a value function
-at the window's end (Eq. 5); the value function is fitted to the TD(lambda) returns of the same window (Eq. 6 and 7).
+The actor descends the gradient of a short rollout, taken through the simulator, with a value function at the rollout's
+end (Eq. 5). The value function is fitted to the TD(lambda) returns of the same rollout (Eq. 6 and 7).
 
     python shac.py --env ant --seed 1                                   train; writes runs/ant__shac__1__<time>/
     python shac.py --resume runs/ant__shac__1__<time>/checkpoint.pt     continue an interrupted run exactly
@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -23,7 +24,7 @@ from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
 from diffsim.training.flags import WindowFlags
-from diffsim.training.layers import Chain, folded, make_even, seeing
+from diffsim.training.layers import Chain, folded, make_even, mlp, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
@@ -43,9 +44,10 @@ PER_TASK = {
     "humanoid_imitation": ((256, 128), (128, 128), 2e-3, 5e-4, 0.995, 64, 2000),
 }
 # fmt: on
-# Near the pose from which a robot learns to walk
+# Robots with servos begin near their standing pose: little noise, actions near zero.
 STANDING = {"initial_log_std": -2.0, "initial_gain": 0.01, "adjoint_clip": 5.0}
 BEGINNING = {"go1": STANDING, "go2": STANDING} | dict.fromkeys(("g1", "g1_track"), STANDING | {"horizon": 16})
+ELU = partial(nn.ELU, inplace=True)
 ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  # where environments cost little
 
 
@@ -54,7 +56,7 @@ class Args(WindowFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
     horizon: Count = 32
-    """control steps h of a rollout (1/60 s each)"""
+    """control steps h of a rollout"""
     general_hyperparameters: bool = False
     """one setting for all tasks (Table 5) instead of the per-task ones"""
     deterministic_policy: bool = False
@@ -90,7 +92,7 @@ class Args(WindowFlags):
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh (per task)"""
     initial_gain: Positive = 1.0
-    """initial factor of the actor's last layer; a small one begins with actions near zero (per task)"""
+    """initial factor of the actor's last layer; with a small one, actions begin near zero (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK[self.env], strict=True)) if self.env in PER_TASK else {}
@@ -106,21 +108,6 @@ class Args(WindowFlags):
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def mlp(inputs: int, hidden: Widths, outputs: int, orthogonal: bool) -> nn.Sequential:
-    """Linear, ELU, LayerNorm per hidden layer and a linear output; torch's default or orthogonal initialisation."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True), nn.LayerNorm(width)]
-        inputs = width
-    layers.append(nn.Linear(inputs, outputs))
-    if orthogonal:
-        for layer in layers:
-            if isinstance(layer, nn.Linear):
-                nn.init.orthogonal_(layer.weight, math.sqrt(2))
-                nn.init.zeros_(layer.bias)
-    return Chain(*layers)
-
-
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
@@ -129,7 +116,8 @@ class Actor(nn.Module):
     ) -> None:
         super().__init__()
         self.normalizer = ObsNormalizer(obs_dim, mirror)
-        network = mlp(seen or obs_dim, args.actor_hidden, action_dim, orthogonal=args.deterministic_policy)
+        orthogonal = args.deterministic_policy
+        network = mlp(seen or obs_dim, args.actor_hidden, action_dim, ELU, norm=True, orthogonal=orthogonal)
         if args.initial_gain != 1.0:
             last = network[-1]
             assert isinstance(last, nn.Linear)
@@ -158,7 +146,7 @@ class Actor(nn.Module):
 
 
 class Rollout(NamedTuple):
-    """What happened in one window, time first: (H, N, ...)."""
+    """What happened in one rollout, time first: (H, N, ...)."""
 
     obs: Tensor  # s_t, on which the policy acted
     next_obs: Tensor  # s_{t+1}, before any reset
@@ -179,7 +167,7 @@ class SHAC:
         mirror = env.task.mirror if args.symmetric else None
         self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim, mirror).to(env.device)
         self.policy = self.actor.deterministic()
-        critic = seeing(None, mlp(obs_dim, args.critic_hidden, 1, orthogonal=True), mirror)
+        critic = seeing(None, mlp(obs_dim, args.critic_hidden, 1, ELU, norm=True, orthogonal=True), mirror)
         self.critic = folded(critic, mirror and mirror.value).to(env.device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas)
@@ -193,7 +181,7 @@ class SHAC:
         self.critic_optimizer.lr.fill_(args.critic_lr + (args.final_lr - args.critic_lr) * done)
 
     def update_actor(self) -> dict[str, Tensor]:
-        """Descend the loss of a window of all environments (Eq. 5); keep the critic's samples of it."""
+        """Act for a rollout, descend its loss (Eq. 5), and keep its samples for the critic."""
         args, normalizer = self.args, self.actor.normalizer
         noise = self.actor.sample_noise(args.horizon, self.env.num_envs)
         if args.inverse_variance:
@@ -227,7 +215,7 @@ class SHAC:
         return (gradient.detach() * (self.actor.mean(obs) + noise.detach() * std / std.detach())).sum()
 
     def update_critic(self) -> dict[str, Tensor]:
-        """Fit the critic to the window's TD(lambda) returns (Eq. 6), and let the target critic follow."""
+        """Fit the critic to the rollout's TD(lambda) returns (Eq. 6), and let the target critic follow."""
         args = self.args
         losses = [torch.zeros_like(self.critic_optimizer.skipped)]
         batches = list(zip(*(part.chunk(args.critic_minibatches) for part in (self.obs, self.value)), strict=True))
@@ -278,7 +266,7 @@ def discounts(done: Tensor, gamma: float, dtype: torch.dtype) -> tuple[Tensor, T
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the window's end does."""
+    """Eq. 7 of (H, N) steps, as its recursion backward in time; a done ends the return as the rollout's end does."""
     returns = torch.empty_like(reward)
     following = next_value[-1]
     for t in reversed(range(len(reward))):

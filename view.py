@@ -72,8 +72,7 @@ def show(args: Args) -> None:
     print(f"{task}, {name}, {args.episodes} episodes: {evaluation}")
     if feet := evaluation.gait():
         print(gait_lines(feet))
-    (qpos, action), ghost = evaluation.median_episode(args.seconds), evaluation.median_ghost()
-    print(f"video: {render.film(args.video, env.scene, qpos, env.control_dt, action, args.size, ghost)}")
+    print(f"video: {evaluation.save_video(args.video, args.seconds, size=args.size)}")
 
 
 if __name__ == "__main__":

@@ -1,18 +1,23 @@
-"""Policies of guided policy search beside their guides on terrain (Figures 3 to 5).
+"""Guides and policies of guided policy search as controllers: on terrain, and how fast they leave the example.
 
     python benchmarks/gps_controllers.py runs/gps/walker__incline__1 runs/gps/walker__rough__1
+    python benchmarks/gps_controllers.py --growth hopper walker
 
-Takes runs of gps.py and gps_variants.py in folders TASK__CASE__SEED. DDP is the first guide's controller by time, TBDP
-that of the step of all guides that looks most alike. None sees the terrain. A trajectory counts as walked if the robot
-stands to its end (the root never sinks FALL below its start's height over the ground) and comes at least FAR as far as
-the guides.
+Terrain (Figures 3 to 5): takes runs of gps.py and gps_variants.py in folders TASK__CASE__SEED. DDP is the first guide's
+controller by time, TBDP that of the step of all guides that looks most alike. None sees the terrain. A trajectory
+counts as walked if the robot stands to its end (the root never sinks FALL below its start's height over the ground) and
+comes at least FAR as far as the guides.
 
-Writes gps_controllers.csv and, with --update-results, the table of docs/gps.md.
+Growth: the policy is fitted to the guides of a shipped example, as it is and after iterations of iLQR. Its closed loop
+is linearised along the example. The rate is the largest Lyapunov exponent of the product of these matrices, of all
+states but the place along x, on which nothing depends. About 0 is a stable cycle (a shift in time neither grows nor
+decays), and 1 / s is a deviation that grows by e each second.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import mean
@@ -20,10 +25,11 @@ from statistics import mean
 import torch
 from common import CheckpointFlags, checkpoint_of, run
 from gps_variants import CASES, Ground, VariantArgs, gps, named_terrains
-from tables import Row, grouped, markdown, numbers
+from tables import Cells, Row, grouped, markdown, numbers
 from torch import Tensor
 
-from diffsim.training import checkpoint
+from diffsim.planning import step_jacobian
+from diffsim.training import checkpoint, parse
 from diffsim.training.evaluation import make_env
 
 Act = Callable[[int, Tensor], Tensor]
@@ -33,6 +39,18 @@ KEY = ("env", "variant", "seed", "kind", "terrain", "controller")
 CONTROLLERS = ("policy", "ddp", "tbdp")
 FALL, FAR = 0.45, 0.9  # m; of the guides' way
 COUNT = 10  # trajectories over each terrain, from the same start with the policy's noise
+LEFT = ("task", "iLQR iterations", "controller")  # key of gps_stability.csv
+
+
+@dataclass
+class Args(CheckpointFlags):
+    growth: tuple[str, ...] = ()  # tasks whose example's growth is measured
+    iterations: tuple[int, ...] = (0, 15)  # of iLQR
+    pretraining: int = 1500  # L-BFGS iterations
+
+    @property
+    def measured(self) -> tuple[Path, ...]:
+        return () if self.growth else super().measured
 
 
 def terrains(degrees: int) -> dict[str, list[str]]:
@@ -117,12 +135,54 @@ def table(rows: Rows) -> list[Row]:
     return result
 
 
-def main(args: CheckpointFlags) -> None:
+def growth(loop: Tensor, dt: float) -> float:
+    """1/s: the largest Lyapunov exponent of matrices (T, n, n) of steps of dt seconds."""
+    v, total = torch.ones(loop.shape[1], dtype=loop.dtype), 0.0
+    for matrix in loop:
+        v = matrix @ (v / v.norm())
+        total += v.norm().log().item()
+    return total / (len(loop) * dt)
+
+
+def leaving(env: str, iterations: int, pretraining: int) -> Iterator[Row]:
+    """How fast a guide and the policy fitted to it leave the example, and the policy's error."""
+    words = f"--env {env} --device cpu --ilqr-iterations {iterations} --pretraining {pretraining} --threads 1"
+    flags = parse(gps.Args, words.split())
+    search = gps.Search(flags, make_env(flags, 1))
+    search.prepare(print)
+    system, policy, guide = search.system, search.network, search.guides[0]
+    x = guide.x[:-1].requires_grad_()
+    mean = policy.mean(policy.theta, system.observe(x))
+    slopes = torch.stack([torch.autograd.grad(part.sum(), x, retain_graph=True)[0] for part in mean.unbind(-1)], 1)
+    f_z = step_jacobian(system, guide.x.detach()[None], guide.u[None])[0]
+    A, B = f_z.split((system.nd, system.nu), -1)
+    error = ((mean.detach() - guide.u) / policy.sigma).square().mean().sqrt().item()
+    for name, K in {"guide": guide.K, "policy": slopes}.items():
+        rate = growth((A + B @ K)[:, 1:, 1:], system.control_dt)
+        about = dict(zip(LEFT, (env, iterations, name), strict=True))
+        yield about | {"growth (1/s)": rate, "error (sigma)": error}
+
+
+def rates(rows: list[Cells]) -> list[Row]:
+    """A line for each example, a column for each controller's growth."""
+    return [
+        dict(zip(LEFT, key, strict=False))
+        | {f"{row['controller']}, growth (1/s)": row["growth (1/s)"] for row in own}
+        | {"policy's error (sigma)": own[0]["error (sigma)"]}
+        for key, own in grouped(rows, *LEFT[:2]).items()
+    ]
+
+
+def main(args: Args) -> None:
     for path in args.measured:
         for row in measure(path):
             args.keep("gps_controllers", row, KEY)
+    for env, iterations in () if args.draw_only else product(args.growth, args.iterations):
+        for row in leaving(env, iterations, args.pretraining):
+            args.keep("gps_stability", row, LEFT)
     args.publish("gps terrain", markdown(table(args.read("gps_controllers"))), "gps.md", everywhere=True)
+    args.publish("gps stability", markdown(rates(args.read("gps_stability"))), "gps.md", everywhere=True)
 
 
 if __name__ == "__main__":
-    run(main, CheckpointFlags, __doc__)
+    run(main, Args, __doc__)

@@ -3,7 +3,7 @@
     python shac.py --env benchmarks/gps_examples.py:WalkerExample --num-envs 64 --iterations 600 --actor-hidden 64 \
         --critic-lr 1e-3 --run-dir runs/walker
     python benchmarks/gps_examples.py --env walker --run runs/walker --to diffsim/assets/examples/walker.npz
-    python benchmarks/gps_examples.py --env swimmer --to diffsim/assets/examples/swimmer.npz
+    python benchmarks/gps_examples.py --env swimmer --settle 200 --to diffsim/assets/examples/swimmer.npz
 
 The tasks here have gps.py's reward and control steps, and a fall ends an episode. The swimmer's controller is a
 travelling wave, a formula.
@@ -14,13 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
-from diffsim.planning import System
+from diffsim.planning import System, save_demonstration
 from diffsim.tasks.hopper import Hopper
+from diffsim.tasks.humanoid import Humanoid
 from diffsim.tasks.walker import Walker
 from diffsim.training import command, fail, load_policy, parse
 from diffsim.training.evaluation import make_env
@@ -54,6 +54,18 @@ class WalkerExample(Walker):
         return ALIVE - error - 10.0 * obs[..., 1].square() - 0.1 * action.square().sum(-1)
 
 
+class HumanoidExample(Humanoid):
+    """Runs at 2.5 m/s, straight on, and does not look at the action before, which gps.py's states do not hold."""
+
+    name = "humanoid_example"
+    observe_action, obs_dim = False, 55
+
+    def reward(self, obs: Tensor, action: Tensor) -> Tensor:
+        error = (obs[..., 5] - 2.5).square() + obs[..., 6].square() + 10.0 * (obs[..., 0] - 1.2).square()
+        turn = 4.0 * obs[..., 1:4].square().sum(-1) + 0.1 * obs[..., 8:11].square().sum(-1)
+        return 3.0 * ALIVE - error - turn - 0.3 * action.square().sum(-1)
+
+
 # Recording ------------------------------------------------------------------------------------------------------------
 
 
@@ -65,6 +77,7 @@ class Args:
     switch: float = 0.0  # m/s by which the policy sees its speed too high in the second half, so that it walks slower
     terrain: tuple[str, ...] = ("level",)  # a trajectory over each, by the names of gps_variants.py
     steps: int = 520  # control steps
+    settle: int = 0  # control steps before, from a start that is moved by 0.1 in all coordinates: of a cycle
 
 
 def wave(x: Tensor) -> Tensor:
@@ -89,7 +102,8 @@ def main(args: Args) -> None:
     if not args.run and args.env != "swimmer":
         fail(f"--run must be the directory of a run: only the swimmer has a formula, not {args.env}")
     policy = load_policy(args.run / "checkpoint.pt").network.double() if args.run else None
-    found = list[list[Tensor]]()
+    inputs = None if policy is None else len(policy.get_buffer("0.mean"))  # a humanoid's own ones may be fewer
+    found = list[tuple[Tensor, Tensor]]()
     for name in args.terrain:
         system = search.system if name == "level" else search.over(name)
 
@@ -98,22 +112,21 @@ def main(args: Args) -> None:
                 return wave(x)
             seen = x.clone()
             seen[:, system.nq] += args.switch * (2 * t >= args.steps)
-            return torch.atanh(policy(system.observe(seen)).clamp(-0.995, 0.995))
+            return torch.atanh(policy(system.observe(seen)[:, :inputs]).clamp(-0.995, 0.995))
 
         start = system.start()
-        if policy is None:
-            start = system.rollout(start + 0.1, 200, act)[0][:, -1]  # on its cycle
-            start[:, :2] = 0.0
+        if args.settle:
+            moved = system.retract(start, torch.full((1, system.nd), 0.1).to(start))
+            start = system.rollout(moved, args.settle, lambda t, x, act=act: act(0, x))[0][:, -1]  # type: ignore[misc]
+            start[:, system.task.forward_column] = 0.0
         x, u, finite = system.rollout(start, args.steps, act)
         if not bool(finite.all()):
             fail(f"over {name} the motion is not finite")
         value = search.reward(x[:, 1 : flags.horizon + 1], u[:, : flags.horizon]).sum().item()
         print(f"{name}: {x[0, -1, 0] - x[0, 0, 0]:.2f} m, return {value:.1f}")
-        found.append([part[0].float() for part in (*x.split((system.nq, system.nv), -1), u.tanh())])
-    args.to.parent.mkdir(parents=True, exist_ok=True)
-    qpos, qvel, action = (torch.stack(parts).squeeze(0).numpy() for parts in zip(*found, strict=True))
-    about = dict(control_dt=np.float64(flags.control_dt), terrain=np.array(args.terrain))
-    np.savez_compressed(args.to, qpos=qpos, qvel=qvel, action=action, **about)  # type: ignore[arg-type]
+        found.append((x[0].float(), u[0].float()))
+    x, u = (torch.stack(parts).squeeze(0) for parts in zip(*found, strict=True))
+    save_demonstration(search.system, x, u, args.to, terrain=args.terrain)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,10 @@ terrains says by `terrain` which trajectory is over which one.
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -24,23 +23,23 @@ from torch import Tensor
 from diffsim import DiffEnv
 from diffsim.planning import REAL, System
 from diffsim.robot.scene import Array, Scene, TerrainError
-from diffsim.terrain import Elevation, incline, rough, step
+from diffsim.terrain import Elevation, incline, rough
 from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import Evaluation
 
 sys.path.append(str(ROOT))
 import gps  # noqa: E402
 
-Ablation = Literal["one-start", "unregularized", "effective-samples", "nonguided", "restart", "single-example"]
-Case = Literal["guided", Ablation, "policy-gradient", "dagger"]
+Case = Literal[
+    "guided", "one-start", "effective-samples", "nonguided", "restart", "single-example", "policy-gradient", "dagger"
+]
 LEAST = 5.0  # effective samples: half of what the policy draws
 MAKERS: dict[str, Callable[..., Array]] = {
     "level": lambda: incline(0.0),
     "incline": incline,
-    "step": lambda height, start=1.0: step(height / 100, start),
-    "rough": lambda degrees, segment=1.0, seed=0.0, start=1.0: rough(seed, segment, degrees, start=start),
+    "rough": lambda degrees, segment=1.0, seed=0.0: rough(seed, segment, degrees),
 }
-USAGE = "level, incline:DEGREES[:START], step:CENTIMETRES[:START] or rough:DEGREES[:SEGMENT[:SEED[:START]]]"
+USAGE = "level, incline:DEGREES[:START] or rough:DEGREES[:SEGMENT[:SEED]]"
 
 
 @dataclass
@@ -50,20 +49,13 @@ class VariantArgs(gps.Args):
     case: Case = "guided"
     """the search of gps.py, or a variant of the paper's algorithm"""
     terrain: tuple[str, ...] = ("level",)
-    """train on each, with its own guides: level, incline:DEGREES, step:CM or rough:DEGREES; the policy sees none"""
-
-    def task_defaults(self) -> dict[str, Any]:
-        bounds = {"regularizer_bounds": (0.0, 0.0)} if self.case == "unregularized" else {}
-        return super().task_defaults() | bounds
+    """train on each, with its own guides: level, incline:DEGREES or rough:DEGREES; the policy sees none"""
 
     def check(self) -> None:
         super().check()
-        if not self.terrain:
-            fail("--terrain needs at least one name: level, incline:DEGREES, step:CM or rough:DEGREES")
-        for name in ("samples", "guiding_samples"):
-            if getattr(self, name) < (least := len(self.terrain)):
-                fail(f"--{name.replace('_', '-')} must be at least {least}, not {getattr(self, name)}")
-        if self.adaptive and len(self.terrain) > 1:
+        if (least := len(self.terrain)) > min(self.samples, self.guiding_samples):
+            fail(f"--samples and --guiding-samples must be at least {least}, one for each --terrain")
+        if self.adaptive and least > 1:
             fail("--adaptive takes one --terrain")
         named_terrains(*self.terrain)
 
@@ -82,10 +74,8 @@ def named_terrains(*names: str) -> Array:
         kind, *numbers = name.split(":")
         try:
             profiles.append(MAKERS[kind](*map(float, numbers)))
-        except (KeyError, TypeError) as error:
-            raise TerrainError(f"terrain {name!r} must be {USAGE}") from error
-        except ValueError as error:
-            raise TerrainError(f"terrain {name!r}: {error}") from error
+        except (KeyError, TypeError, ValueError) as error:
+            raise TerrainError(f"terrain {name!r} must be {USAGE}: {error}") from error
     most = max(map(len, profiles))
     for i, p in enumerate(profiles):  # the last segment goes on
         more = p[-1] + np.arange(1, most - len(p) + 1)[:, None] * (p[-1] - p[-2])
@@ -109,13 +99,12 @@ class Ground(System):
         self._elevations: dict[int, Elevation] = {}
         super().__init__(env, threads, scene)
 
-    def copies(self, count: int, first: int = 0) -> Scene:
-        """The scene of so many trajectories from number `first` on."""
+    def copies(self, count: int) -> Scene:
         M = len(self.profiles)
-        return self.scene if M == 1 else self.scene.with_terrain(self.profiles[np.arange(first, first + count) % M])
+        return self.scene if M == 1 else self.scene.with_terrain(self.profiles[np.arange(count) % M])
 
     def rollout(self, x: Tensor, steps: int, act: Callable[[int, Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        ground = self._elevation(len(x))
+        ground = self.ground(len(x))
         start = self._moved(x, ground.lift)
         x, u, finite = super().rollout(start, steps, lambda t, x: act(t, self._moved(x, ground.lower)))
         return self._moved(x, ground.lower), u, finite
@@ -123,13 +112,13 @@ class Ground(System):
     def jacobians(self, x: Tensor, u: Tensor) -> Tensor:
         if len(self.profiles) > 1:
             raise ValueError("Jacobians need one terrain for all steps")
-        ground, nq, nv = self._elevation(1), self.nq, self.nv
+        ground, nq, nv = self.ground(1), self.nq, self.nv
         f_z, following = super().jacobians(self._moved(x, ground.lift), u), self.rollout(x, 1, lambda *_: u)[0][:, 1]
         before, after = (F.pad(ground.gradient(part[:, :nq])[..., :nv, :nv], (0, nv, 0, nv)) for part in (x, following))
         f_z[..., : self.nd] = f_z[..., : self.nd] + f_z[..., : self.nd] @ before
         return f_z - after @ f_z
 
-    def _elevation(self, count: int) -> Elevation:
+    def ground(self, count: int) -> Elevation:
         """The ground below so many trajectories."""
         if count not in self._elevations:
             self._elevations[count] = Elevation(self.copies(count), self.device, REAL)
@@ -166,11 +155,9 @@ class Search(gps.Search):
 
     def evaluate(self) -> Evaluation:
         found = super().evaluate()
-        if not isinstance(self.system, Ground):
-            return found
-        scene = self.system.copies(len(found.returns), 1)  # number 0 is the one without noise
-        qpos = Elevation(scene, self.system.device, REAL).lift(found.qpos)
-        return dataclasses.replace(found, qpos=qpos, scene=scene)
+        if isinstance(self.system, Ground):
+            found.qpos = self.system.ground(len(found.returns)).lift(found.qpos)
+        return found
 
 
 # The variants ---------------------------------------------------------------------------------------------------------
@@ -207,7 +194,7 @@ class Restart(NonGuided):
         x = torch.cat([guide.x[:-1] for guide in self.guides])
         start = x[torch.randint(len(x), (count,), generator=self.rng).to(x.device)]
         self.control_steps += count * self.args.horizon
-        return self.roll_out(self.system, theta, self.noise(count), start, source)
+        return self.roll_out(theta, self.noise(count), start, source)
 
 
 class SingleExample(NonGuided):
@@ -247,17 +234,8 @@ class DAgger(NonGuided):
         return self.metrics(new)
 
 
-CASES: dict[Case, type[Search]] = {
-    "guided": Search,
-    "one-start": OneStart,
-    "unregularized": Search,
-    "effective-samples": EffectiveSamples,
-    "nonguided": NonGuided,
-    "restart": Restart,
-    "single-example": SingleExample,
-    "policy-gradient": PolicyGradient,
-    "dagger": DAgger,
-}
+CLASSES = Search, OneStart, EffectiveSamples, NonGuided, Restart, SingleExample, PolicyGradient, DAgger
+CASES: dict[str, type[Search]] = dict(zip(get_args(Case), CLASSES, strict=True))
 
 main = script(
     VariantArgs,

@@ -38,6 +38,7 @@ SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "tenth": lambda values: f"{mean(values):.1f}",
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",
+    "percent": lambda values: f"{mean(values):.1%}",
     "counts": lambda values: ", ".join(f"{value:.0f}" for value in values),
     "each": lambda values: ", ".join(f"{value:.1f}" for value in values),
     "each, rounded": lambda values: ", ".join(f"{value:.0f}" for value in values),

@@ -1,4 +1,4 @@
-"""What policies keep of their speed in another simulator: of those trained here in MuJoCo, and the other way round.
+"""The share of speed that policies retain in another simulator: trained here and judged in MuJoCo, or the reverse.
 
     python benchmarks/transfer.py runs/learning/shac/ant__1            a run, or a checkpoint of any learner's script
     python benchmarks/transfer.py runs/learning/*/* --friction 0.5 0.7 1 1.3 1.5

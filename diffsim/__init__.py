@@ -86,7 +86,7 @@ def make(
         num_envs: number of environments N.
         device: "cpu" or a CUDA device.
         seed: of the random start states, commands and noise; by default another one for each environment that is made.
-        horizon: most differentiable steps between two calls of DiffEnv.detach.
+        horizon: largest number of differentiable steps between two calls of DiffEnv.detach.
         substeps, integrator, theta, passes, tolerance, touchdown: replace parts of the preset, see Integration.
         accuracy: preset of the integration, "fast" (soft contact only), "default" (the papers') or "accurate", see
             docs/numerics.md.

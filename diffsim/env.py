@@ -341,7 +341,7 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a state_dict of the same task, size and dtype, else ValueError. Call `detach` next."""
+        """Continue from a state_dict of the same task, size and dtype, otherwise ValueError. Call `detach` next."""
         own = self.state_dict()
         if state.keys() != own.keys():
             raise ValueError(f"the state has {', '.join(state)}; that of an environment has {', '.join(own)}")

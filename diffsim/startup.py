@@ -16,8 +16,6 @@ from pathlib import Path
 import warp as wp
 
 ROOM = 16 * 2**20  # bytes that a kernel takes in Warp's cache at most; LLVM aborts the process when there are fewer
-# What Warp prints when it starts and nobody needs: pip installs a Warp that supports the Python at hand.
-NOISE = (b"Could not find or load the NVIDIA CUDA driver", b"Support for Python 3.10 is deprecated")
 _started, _starting = False, threading.Lock()
 _announced: set[str] = set()
 
@@ -83,7 +81,7 @@ def check_kernel_cache() -> Path:
     try:
         with _starting:  # stderr is the process's: two threads that hold it back would wait for each other
             if not _started:
-                with _without(*NOISE):
+                with _silent():  # without "Could not find or load the NVIDIA CUDA driver" and a deprecation of Python
                     wp.init()
                 _started = True
         if not os.access(str(wp.config.kernel_cache_dir), os.W_OK):
@@ -132,25 +130,20 @@ def quick_kernels() -> Iterator[None]:
 
 
 @contextmanager
-def _without(*messages: bytes) -> Iterator[None]:
-    """Hold back what is written to stderr, by C as well, and let all lines through but those with a message."""
+def _silent() -> Iterator[None]:
+    """Hold back what is written to stderr, by C as well; what fails raises an error."""
     try:
         stderr = os.dup(2)
     except OSError:  # closed
         yield
         return
-    reader, writer = os.pipe()
-    os.dup2(writer, 2)
-    os.close(writer)
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
     try:
         yield
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
-        with open(reader, "rb") as pipe:
-            for line in pipe:
-                if not any(message in line for message in messages):
-                    os.write(2, line)
 
 
 import_mujoco()

@@ -6,8 +6,7 @@ all environments or, stacked to (num_envs, K, 2), one for each:
 
     env = diffsim.make("walker", num_envs=8, terrain=np.stack([rough(seed) for seed in range(8)]))
 
-All functions here leave the ground at z = 0 up to x = `start` [m], so that a robot can start at x = 0. What they get
-wrong, Scene.with_terrain refuses.
+All functions here leave the ground at z = 0 up to x = `start` [m], so that a robot can start at x = 0.
 """
 
 from __future__ import annotations

@@ -34,20 +34,6 @@ SETTINGS = [  # and the order of each
 # Presets
 
 
-def test_presets_of_every_task():
-    for name in SHAC_TASKS:
-        task = TASKS[name]
-        fast, default, accurate = (task.integration(accuracy) for accuracy in ("fast", "default", "accurate"))
-        assert default == Integration("semi_implicit", task.substeps)
-        works = [
-            each.substeps * (1.5 if each.integrator == "extrapolated" else 1) for each in (fast, default, accurate)
-        ]
-        assert works[0] <= works[1] / 2 and works[1] < works[2]
-        for accuracy, substeps, tolerance in (("default", 4, 1e-4), ("accurate", 16, 1e-5)):
-            preset = Integration("mujoco", substeps, tolerance=tolerance)
-            assert task.integration(accuracy, "mujoco") == preset, name
-
-
 HEAVY = "cartpole", "half_cheetah", "ant", "humanoid_mtu"  # whose kernels no other test needs
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import reference
@@ -169,9 +171,9 @@ WRONG = [  # a value: what is done to one that is right
     ("forces", torch.Tensor.numpy, "forces is a ndarray"),
 ]
 WRONG_NUMBERS = [
-    *(("factors", (1, 3), x, f"the factor of mu is {x} in environment 1", "not negative") for x in (-1.0, *NOT_FINITE)),
-    *(("forces", (1, 2, 1), x, f"force y on body pole is {x} in environment 1", "finite") for x in NOT_FINITE),
-    *(("forces", (1, 2, 5), x, f"torque z on body pole is {x} in environment 1", "finite") for x in NOT_FINITE),
+    *(("factors", (1, 3), x, f"factors[1, 3] is {x}", "not negative") for x in (-1.0, *NOT_FINITE)),
+    *(("forces", (1, 2, 1), x, f"forces[1, 2, 1] is {x}", "finite") for x in NOT_FINITE),
+    *(("forces", (1, 2, 5), x, f"forces[1, 2, 5] is {x}", "finite") for x in NOT_FINITE),
 ]
 
 
@@ -186,10 +188,10 @@ def test_wrong_factors_and_forces_are_refused():
     for name, place, number, message, allowed in WRONG_NUMBERS:
         bad = right[name].clone()
         bad[place] = number
-        with pytest.raises(ValueError, match=f"{message}; .*{allowed}"):
+        with pytest.raises(ValueError, match=f"{re.escape(message)}; .*{allowed}"):
             setattr(sim, name, bad)
         getattr(sim, name)[place] = number
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=re.escape(message)):
             sim.step(torch.zeros(2, 2), torch.zeros(2, 2), torch.zeros(2, 1))
         setattr(sim, name, right[name].clone())
     for name, sizes in (("factors", "(2, 8), must be (2, 0)"), ("forces", "(2, 3, 6), must be (2, 0, 6)")):

@@ -154,23 +154,6 @@ def test_actions_of_other_types_and_seeds() -> None:
 # Wrappers and pictures ------------------------------------------------------------------------------------------------
 
 
-def test_vector_wrappers() -> None:
-    plain, env = (gymnasium.make_vec(HOPPERS, num_envs=3, max_episode_steps=20) for _ in range(2))
-    env = wrappers.vector.ClipReward(wrappers.vector.NormalizeReward(env), -0.5, 0.5)
-    env.reset(seed=0), plain.reset(seed=0)
-    returns, ends = np.zeros(3), 0
-    for action in random_actions(60, 3, 3):
-        obs, reward, terminated, truncated, info = env.step(action)
-        expected = plain.step(action)
-        np.testing.assert_array_equal(obs, expected[0])
-        assert np.abs(reward).max() <= 0.5
-        returns += expected[1]
-        done = terminated | truncated
-        np.testing.assert_allclose(info["episode"]["r"][done], returns[done], rtol=1e-5)
-        returns[done], ends = 0, ends + done.sum()
-    assert ends >= 9
-
-
 def draw(env: Any) -> Any:
     try:
         return env.render()

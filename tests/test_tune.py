@@ -128,7 +128,7 @@ def test_the_command_prints_the_front_and_writes_all_rows(pendulum, tmp_path, ca
         (["PENDULUM", "--error", "0"], "must be"),
         (["PENDULUM", "--checkpoint", "ant.pt"], "ant.pt is a checkpoint of ant, not of"),
         (["IDLE"], "idle.xml has no actuators, so there is no action to differentiate in"),
-        (["missing.xml"], "missing.xml"),
+        (["missing.xml"], "no such file: missing.xml"),
         (["PENDULUM", "--device", "tpu"], "unknown device 'tpu'"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Measure the policies that come with the package, and write it to their cards, diffsim/policies/cards.csv.
+"""Measure the shipped policies, and write their cards, diffsim/policies/cards.csv.
 
     python tools/cards.py                              all of them
     python tools/cards.py diffsim/policies/ant.pt      one: write its other cells, command to revision, by hand

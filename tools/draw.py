@@ -86,11 +86,11 @@ def films(
     """A film of each policy, called as its task.
 
     Args:
-        checkpoints: of any script; else those that come with the package.
+        checkpoints: files of any script. Default: the shipped policies.
         size: width and height of a world's picture in pixels.
         start: seconds into the episode before which no loop begins.
-        seconds: least and most of a loop, unless the robot has a clock; what is shown from its start takes 3.5 s.
-        beside: MuJoCo, too; else the file is called <task>_here.webp.
+        seconds: shortest and longest loop, unless the robot has a clock; what is shown from its start takes 3.5 s.
+        beside: show MuJoCo, too; without it the file is called <task>_here.webp.
     """
     for checkpoint in checkpoints or [POLICIES / f"{task}.pt" for task in CLOSER]:
         case = load_case(checkpoint, DEMO_EPISODES, "cpu")
@@ -220,13 +220,13 @@ def save_webp(path: Path, frames: Sequence[Frame], fps: float) -> Path:
 def gait(
     checkpoint: Positional[Path], start: float = 2.0, every: float = 0.1, frames: int = 8, size: int = 240
 ) -> None:
-    """Frames of a policy at work, beside each other.
+    """Frames of a policy at work, side by side.
 
     Args:
-        checkpoint: the policy's, of any script.
+        checkpoint: file of any script.
         start: seconds into the episode of the first frame.
         every: seconds between frames.
-        frames: how many.
+        frames: number of frames.
         size: width and height of a frame in pixels.
     """
     saved = load_policy(checkpoint)

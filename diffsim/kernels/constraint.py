@@ -31,7 +31,7 @@ import warp as wp
 
 from diffsim.kernels.factors import K_D, K_N, MU
 from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -349,14 +349,4 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             gain[1] = gain[1] - pick(wp.abs(f), T(loss[0]), T(loss[1]) * T(loss[2]), T(0.0))
         return gain
 
-    return by_name(
-        touch,
-        add_contacts,
-        try_contacts,
-        keep_contacts,
-        record_contacts,
-        add_contacts_adjoint,
-        stop,
-        joint_constraint,
-        joint_gain,
-    )
+    return functions(locals())

@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.factors import K_D, K_N, K_T, MU
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
@@ -201,4 +201,4 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 adj.p = adj.p + wp.spatial_cross_dual(link.V, G) - wp.spatial_cross_dual(node.W, wrench)
         return adj
 
-    return by_name(add_contacts, add_contacts_adjoint)
+    return functions(locals())

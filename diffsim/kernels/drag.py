@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 
@@ -54,4 +54,4 @@ def drag_law(spec: KernelSpec) -> SimpleNamespace:
         g_w = T(m.drag_viscous[i][1]) * ww + T(2.0) * wp.cw_mul(vec3(m.drag_torque[i]), wp.cw_mul(wp.abs(w), ww))
         return wrench(F, com, g_l, g_w)
 
-    return by_name(drag_wrench, drag_adjoint)
+    return functions(locals())

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spec import KernelSpec
 
 
@@ -80,7 +80,7 @@ def lane_sums(spec: KernelSpec) -> SimpleNamespace:
                     adj[i].d = add_vec6(adj[i].d)
                     adj[i].w1 = add_vec6(adj[i].w1)
 
-        return by_name(add, add_loads, add_twists, add_adjoints)
+        return functions(locals())
 
     powers = [2**k for k in range(threads.bit_length() - 1)]
     return SimpleNamespace(

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -79,4 +79,4 @@ def external_force(spec: KernelSpec) -> SimpleNamespace:
             for k in range(6):
                 block.write(g_forces, here.e, 6 * body + k, block.pick(drop, T(0.5), adj_forces[body][k], T(0.0)))
 
-    return by_name(add_forces, add_forces_adjoint, broken_forces, write_forces_adjoint)
+    return functions(locals())

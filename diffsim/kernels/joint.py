@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
@@ -130,21 +130,13 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def gain(m: Model, here: Lane, i: int, q: T, qd: T, end_rate: T, free: T):
         """(d force / d q, d force / d qd), -B a included; end_rate is qd + h a, or qd if explicit."""
-        kq = T(0.0)
-        kv = T(0.0)
-        if wp.static(STIFFNESS):
-            kq = kq - T(m.stiffness[i])
-        if wp.static(DAMPING):
-            kv = kv - damping(m, i, free)
-        if wp.static(CLAMP):
-            kq = kq - free * T(m.servo_stiffness[i])
+        resisted = resistance(m, here, i, q, qd, free)
+        kq = -resisted[0]
         if wp.static(LIMIT):
             way = way_back(m, i, q)
             k, d = limit_constants(m, here, i)
-            on = pushes(k, d, way, qd)
-            kq = kq - on * k + on * d * returning(way, end_rate)
-            kv = kv - on * d * wp.abs(way)
-        return vec2(kq, kv)
+            kq = kq + pushes(k, d, way, qd) * d * returning(way, end_rate)
+        return vec2(kq, -resisted[1])
 
     @wp.func
     def limit_constants_gain(m: Model, here: Lane, i: int, q: T, qd: T, end_rate: T, lead: T):
@@ -155,4 +147,4 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         by_k = T(m.k_limit[i]) * (way - lead * (end_rate - qd))
         return on * vec2(by_k, -T(m.d_limit[i]) * wp.abs(way) * end_rate)
 
-    return by_name(drive, actuation, actuation_free, damping, passive_force, resistance, gain, limit_constants_gain)
+    return functions(locals())

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -119,4 +119,4 @@ def kinematics(spec: KernelSpec) -> SimpleNamespace:
             links[i].V = links[p].V + Si * links[i].qd
         return place
 
-    return by_name(load, store, link_of, qpos_adr, load_quat, load_quat_row, place_balls, carrier_place, place_links)
+    return functions(locals())

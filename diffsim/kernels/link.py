@@ -8,7 +8,7 @@ import warp as wp
 from diffsim.kernels.contact import contact_law
 from diffsim.kernels.drag import drag_law
 from diffsim.kernels.factors import MASS
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 
@@ -119,4 +119,4 @@ def link_law(spec: KernelSpec) -> SimpleNamespace:
             x.w1 = x.w1 + y.w1
         return x
 
-    return by_name(link_inertia, link_adjoint, add_damping_adjoint, plus)
+    return functions(locals())

@@ -294,9 +294,9 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     )
 
 
-def by_name(*functions: wp.Function) -> SimpleNamespace:
-    """What a module of the kernels offers to others."""
-    return SimpleNamespace(**{function.func.__name__: function for function in functions})
+def functions(names: dict[str, Any]) -> SimpleNamespace:
+    """What a module of the kernels offers to others: Warp's functions among its names."""
+    return SimpleNamespace(**{name: value for name, value in names.items() if isinstance(value, wp.Function)})
 
 
 def model_of(scene: Scene, division: Division, dtype: type, device: str) -> Any:

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -121,4 +121,4 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
             adj[i].p = adj[i].p - gp
             adj[j].p = adj[j].p + gp
 
-    return by_name(activate, add_muscles, add_muscles_adjoint)
+    return functions(locals())

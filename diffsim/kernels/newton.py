@@ -19,7 +19,7 @@ import warp as wp
 from diffsim.kernels.constraint import constraint_law
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.joint import joint_law
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
@@ -230,4 +230,4 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
         by.passes = by.passes + 1
         return root, by
 
-    return by_name(begin, linearize, step_on)
+    return functions(locals())

@@ -8,7 +8,7 @@ import warp as wp
 from diffsim.kernels.exchange import lane_sums
 from diffsim.kernels.joint import joint_law
 from diffsim.kernels.kinematics import kinematics
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 
@@ -100,7 +100,7 @@ def base_inertia(spec: KernelSpec) -> SimpleNamespace:
             load.d = load.d + wp.diag(vec3(hb, hb, hb))
         return load
 
-    return by_name(factor_base, store_base, solve_base, damp_base)
+    return functions(locals())
 
 
 @cache
@@ -217,7 +217,7 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
             motions[i].u = qdd
         return root
 
-    return by_name(inward, accelerate)
+    return functions(locals())
 
 
 @cache

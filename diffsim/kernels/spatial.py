@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
@@ -89,16 +89,4 @@ def spatial(spec: KernelSpec) -> SimpleNamespace:
         """The gradient with respect to a quaternion that is normalised before use: tangent, and scaled by 1/|q|."""
         return (wp.normalize(q) * quat(g[0], g[1], g[2], T(0.0))) * (T(2.0) / wp.length(q))
 
-    return by_name(
-        join,
-        force_at,
-        point_velocity,
-        on_link,
-        momentum,
-        exp_quat,
-        exp_adjoint,
-        log_quat,
-        log_adjoint,
-        to_tangent,
-        from_tangent,
-    )
+    return functions(locals())

@@ -17,7 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from diffsim.kernels.model import by_name, types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spec import KernelSpec
 
 PREAMBLE = """
@@ -168,4 +168,4 @@ def blocks(spec: KernelSpec) -> SimpleNamespace:
             if BLOCK * b + k < a.shape[0] and element(x, k) > U(0.0):
                 a[BLOCK * b + k] = a[BLOCK * b + k] + 1
 
-    return by_name(pick, any_of, broken, element, with_element, env_of, read, write, read_flags, write_flags, count)
+    return functions(locals())

@@ -9,4 +9,5 @@ from diffsim.planning.controller import LinearGaussian, gaussian_log_prob, maxim
 from diffsim.planning.cost import AfterStep, Sum, Surprisal, Tracking
 from diffsim.planning.demonstration import follow_demonstration, load_demonstration, save_demonstration
 from diffsim.planning.ilqr import Cost, Plan, backward_pass, follow, ilqr, step_jacobian
+from diffsim.planning.samples import Samples, SampleSet
 from diffsim.planning.system import REAL, System

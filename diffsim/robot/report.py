@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from diffsim.robot.contact import HULL_POINTS, base_geoms, ground_pairs, pair_law, self_pairs
-from diffsim.robot.elements import label, listed, motors, servos
-from diffsim.robot.scene import PENALTY_CONSTANTS, Scene
+from diffsim.robot.elements import label, listed, motors
+from diffsim.robot.scene import Scene
 
 Kind = mujoco.mjtObj
 
@@ -21,13 +21,11 @@ ROUGH_SHAPES = {
 }
 
 
-def report(scene: Scene, contact: str) -> str:
-    """A page of text about a scene on "soft" or "mujoco" contact."""
+def report(scene: Scene) -> str:
+    """A page of text about a scene."""
     sections = [
         (f"{scene.name}: can be simulated", list(_parts(scene))),
-        ("constants of soft contact and limits", list(_constants(scene)) if contact == "soft" else []),
         ("approximated", [f"- {sentence}" for sentence in scene.approximations]),
-        ("perhaps a mistake", [f"- {sentence}" for sentence in _mistakes(scene)]),
     ]
     return "\n\n".join("\n  ".join([title, *lines]) for title, lines in sections if lines)
 
@@ -45,14 +43,6 @@ def _parts(scene: Scene) -> Iterator[str]:
     yield f"controls   {scene.nu - muscles} motors, {muscles} muscles"
     yield f"contact    {scene.ncontact} points, {ground}"
     yield f"features   {', '.join(sorted(scene.features))}"
-
-
-def _constants(scene: Scene) -> Iterator[str]:
-    """Those that soft contact needs."""
-    for name, unit in PENALTY_CONSTANTS.items():
-        value = np.max(getattr(scene, name))
-        if not np.isnan(value) and (scene.ncontact or name.endswith("_limit")):
-            yield f"{name:8} {value:>10.4g} {unit}"
 
 
 def approximations(scene: Scene) -> tuple[str, ...]:
@@ -92,19 +82,3 @@ def _actuators(scene: Scene) -> Iterator[str]:
     if (~motors(m) & (m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON)).any():
         yield "A control sets the activation of a <muscle> at once."
         yield "A <muscle> pulls with its activation times its maximum force, without MuJoCo's curves."
-
-
-def _mistakes(scene: Scene) -> Iterator[str]:
-    """Of position servos, whose targets MuJoCo's compiler does not convert from degrees."""
-    m, joints = scene.mj_model, scene.mj_model.actuator_trnid[:, 0]
-    holds = servos(m) & (m.actuator_ctrllimited != 0) & (m.actuator_biasprm[:, 1] < 0) & (m.actuator_gear[:, 0] != 0)
-    for a in np.flatnonzero(holds & (m.jnt_limited[joints] != 0)).tolist():
-        low, high = m.jnt_range[joints[a]]
-        scale = -m.actuator_gainprm[a, 0] / (m.actuator_biasprm[a, 1] * m.actuator_gear[a, 0])
-        targets = m.actuator_ctrlrange[a] * scale
-        if np.abs(targets - targets.clip(low, high)).max() > high - low:
-            name, least, most = label(m, Kind.mjOBJ_ACTUATOR, a), *sorted(targets)
-            yield (
-                f"Actuator {name} has targets of {least:.4g} to {most:.4g}, far outside its joint's range of {low:.4g} "
-                f"to {high:.4g}; a ctrlrange is in radians or metres."
-            )

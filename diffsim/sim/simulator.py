@@ -164,8 +164,8 @@ class Simulator:
 
         Args:
             qpos: (N, nq) MuJoCo's generalised positions; quaternions wxyz, which need not have unit length.
-            qvel: (N, nv) MuJoCo's generalised velocities; of a free joint the linear one in the world's frame, the
-                angular one in the body's.
+            qvel: (N, nv) MuJoCo's generalised velocities; a free joint's linear velocity is in the world frame, its
+                angular velocity in the body's.
             ctrl: (N, nu) one number per motor, [-1, 1] over its control range, constant over the step, not clipped.
 
         Returns:
@@ -295,17 +295,10 @@ class Simulator:
                 bad[:, DIVISORS] |= value[:, DIVISORS] == 0
         if not bool(bad.any()):
             return value
-        env, part, *column = bad.nonzero()[0].tolist()
-        if name == "factors":
-            what, rest = (
-                f"factor of {FACTORS[part]}",
-                " and not negative, with the integrator mujoco those of k_n, k_d and k_limit positive",
-            )
-        else:
-            body = self.scene.mj_model.body(part).name or f"number {part}"
-            what, rest = f"{'force' if column[0] < 3 else 'torque'} {'xyz'[column[0] % 3]} on body {body}", ""
-        number = value[(env, part, *column)].item()
-        raise ValueError(f"the {what} is {number} in environment {env}; {name} must be finite{rest}")
+        place = tuple(bad.nonzero()[0].tolist())
+        rest = " and not negative, with the integrator mujoco those of k_n, k_d and k_limit positive"
+        must = f"must be finite{rest if name == 'factors' else ''}"
+        raise ValueError(f"{name}[{', '.join(map(str, place))}] is {value[place].item()}; {name} {must}")
 
 
 def refuse_transforms(value: torch.Tensor) -> None:

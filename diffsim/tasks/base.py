@@ -247,7 +247,7 @@ class Task:
         return {}
 
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """What a control step starts with in place of qvel (..., nv) and action (..., nu): pushes, delays.
+        """The qvel (..., nv) and action (..., nu) that a control step takes instead of these: pushes, delays.
 
         memory: (..., num_memory) before the step.
         """
@@ -262,7 +262,7 @@ class Task:
         raise NotImplementedError
 
     def terminated(self, obs: Tensor) -> Tensor:
-        """Whether an episode ends, as the robot has fallen or the task is over: bool (...)."""
+        """bool (...), true where the episode ends because the robot has fallen or the task is over."""
         return self.over(obs) if self.min_height is None else obs[..., 0] < self.min_height
 
     def over(self, obs: Tensor) -> Tensor:

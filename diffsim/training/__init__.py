@@ -10,7 +10,7 @@ from diffsim.training.checkpoint import Learner, SavedPolicy, export_onnx, expor
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, fail
 from diffsim.training.evaluation import Evaluation, evaluate, evaluate_checkpoint, make_policy_env
-from diffsim.training.flags import Flags, ParallelFlags, parse, parse_penalty
+from diffsim.training.flags import Flags, ParallelFlags, parse
 from diffsim.training.layers import Likeliest, ObsNormalizer, moments
 from diffsim.training.main import command, script
 from diffsim.training.optimizer import ClippedAdam

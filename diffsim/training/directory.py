@@ -126,7 +126,6 @@ SCREEN = Screen()
 
 
 def say(text: object) -> None:
-    """Print a line."""
     SCREEN.write(f"{text}\n")
 
 

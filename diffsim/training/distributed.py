@@ -3,26 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
 import torch.distributed as dist
 
 from diffsim.training import graph
-
-
-class LostRankError(RuntimeError):
-    """Another rank of a training is gone."""
-
-
-@contextmanager
-def _joined() -> Iterator[None]:
-    try:
-        yield
-    except RuntimeError as error:  # that is all that gloo raises
-        raise LostRankError("another process of this training is gone") from error
 
 
 def choose_device(device: str) -> str:
@@ -58,8 +44,7 @@ def size() -> int:
 def average(tensor: torch.Tensor) -> torch.Tensor:
     """The mean of the tensor over all ranks, in place; it does not wait for the device and can be captured."""
     if dist.is_initialized():
-        with _joined():
-            dist.all_reduce(tensor)
+        dist.all_reduce(tensor)
         tensor /= dist.get_world_size()
     return tensor
 
@@ -76,6 +61,5 @@ def gather(value: Any) -> list[Any]:
     if not dist.is_initialized():
         return [value]
     values: list[Any] = [None] * dist.get_world_size()
-    with _joined():
-        dist.all_gather_object(values, value)
+    dist.all_gather_object(values, value)
     return values

@@ -61,7 +61,7 @@ class Ensemble(nn.Module):
 
     def __init__(self, networks: Sequence[nn.Sequential]) -> None:
         super().__init__()
-        alone = len(networks) == 1
+        self.count, alone = len(networks), len(networks) == 1
         self.layers = nn.ModuleList(networks[0] if alone else map(_stack, zip(*networks, strict=True)))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -74,6 +74,11 @@ class Ensemble(nn.Module):
             else:
                 raise TypeError(f"no ensemble of LayerNorm and then {type(layer).__name__}: only Linear may follow")
         return x if norms is None else torch.addcmul(norms.bias, x, norms.weight)
+
+    def value(self, *inputs: Tensor) -> Tensor:
+        """What each says of the same inputs (B, ...), side by side, in its only output: (E, B)."""
+        x = torch.cat(inputs, -1)
+        return self.forward(x.expand(self.count, *x.shape)).squeeze(-1)
 
     def __getitem__(self, e: int) -> nn.Sequential:
         return nn.Sequential(*(layer[e] if isinstance(layer, Linears | LayerNorms) else layer for layer in self.layers))

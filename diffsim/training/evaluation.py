@@ -26,7 +26,7 @@ from diffsim.training import checkpoint, gait, graph
 from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
-from diffsim.training.flags import Args, Flags, parse_penalty
+from diffsim.training.flags import Args, Flags
 
 L = TypeVar("L", bound=Learner)
 
@@ -37,7 +37,7 @@ ENOUGH = 0.97  # of the return, kept there
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
 OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination clip control_dt".split()}
-SETTINGS = OPTIONS | {"env", "penalty", "device", "eval_episodes"}
+SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 
 
 @dataclass
@@ -109,8 +109,10 @@ class Evaluation:
         """How the robot moves over the ground."""
         return gait.measure(self.scene, self.control_dt, map(self.episode, range(len(self.returns))))
 
-    def save_video(self, path: Path, seconds: float = VIDEO_SECONDS) -> Path:
+    def save_video(self, path: Path, seconds: float = VIDEO_SECONDS, **options: Any) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
+
+        options: of render.film, such as size (width, height) in pixels.
 
         Raises:
             OSError, RuntimeError: what is missing to draw or to write, see render.film.
@@ -120,7 +122,7 @@ class Evaluation:
         (qpos, action), scene = self.median_episode(seconds), self.scene
         if scene.terrain is not None:
             scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])
-        return render.film(path, scene, qpos, self.control_dt, action, ghost=self.median_ghost())
+        return render.film(path, scene, qpos, self.control_dt, action, ghost=self.median_ghost(), **options)
 
 
 def gait_lines(parts: gait.Gait) -> str:
@@ -216,7 +218,7 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, seed: int = 0, **others: Any) -> DiffEnv:
     """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
     options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
-    options |= dict(penalty=parse_penalty(args.penalty), threads=args.threads or None)
+    options["threads"] = args.threads or None
     try:
         return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options | others)
     except ValueError as error:
@@ -277,7 +279,7 @@ def evaluate_checkpoint(
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
-    """Print the gait, and leave gait.csv, evaluation.json and, if asked for, the video in the run's directory."""
+    """Print the gait, and leave gait.csv and evaluation.json in the run's directory."""
     assert args.run_dir
     settings = {name: value for name, value in vars(args).items() if name in SETTINGS}
     settings |= dict(script=args.script(), iteration=iteration)
@@ -287,8 +289,3 @@ def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **foun
         rows = [(part, name, value) for part, values in numbers.items() for name, value in values.items()]
         with (args.run_dir / "gait.csv").open("w", newline="") as file:
             csv.writer(file).writerows([("part", "number", "value"), *rows])
-    if args.capture_video:
-        try:
-            say(f"video: {evaluation.save_video(args.run_dir / 'video.mp4')}")
-        except (OSError, RuntimeError) as error:
-            fail(error)

@@ -29,7 +29,8 @@ ClipFile = Annotated[
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
-FIXED = ("env", "seed", "num_envs")  # of a run that goes on or is evaluated; what else must fit, `restore` tells
+# Of a run that goes on or is evaluated; what else must fit, `restore` tells.
+FIXED = ("env", "seed", "num_envs", "control_dt")
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -54,13 +55,11 @@ class RunFlags:
     stop_after: Natural = 0
     """stop and save at this iteration, as Ctrl-C would; schedules still run to --iterations (0: do not stop)"""
     resume: Path | None = None
-    """checkpoint to continue from, with its arguments unless the command line gives others"""
+    """checkpoint, or directory of a run, to continue with its arguments unless the command line gives others"""
     evaluate: Path | None = None
-    """checkpoint to evaluate without training, e.g. with other --substeps; writes evaluation.json to --run-dir"""
+    """checkpoint, or directory of a run, to evaluate, e.g. with more --substeps; writes evaluation.json to --run-dir"""
     finer: bool = True
     """with --evaluate, also measure the return at four times the substeps, explicitly integrated"""
-    capture_video: bool = False
-    """write video.mp4: the first 10 s of the last evaluation's median episode"""
     track: bool = False
     """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
@@ -87,10 +86,8 @@ class Flags(RunFlags):
     """with --integrator mujoco: residual that ends the passes (per --accuracy)"""
     touchdown: bool = True
     """with --integrator mujoco: gradients include the jump at which a contact begins (docs/adjoint.md)"""
-    contact: Annotated[Contact, tyro.conf.arg(constructor=str, metavar="{soft,mujoco}")] = "soft"
+    contact: Contact = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
-    penalty: tuple[str, ...] = ()
-    """constants of penalty contact and limits that replace those of the robot's file, e.g. k_n=1e5 k_d=1e4"""
     early_termination: bool = True
     """end episodes when the robot falls; otherwise they end only by time"""
     clip: ClipFile = None
@@ -201,14 +198,6 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args.device = distributed.choose_device(args.device)
     check_ranges(args)
     args.check()
-    if args.capture_video and distributed.rank() == 0:
-        from diffsim.view import render
-
-        try:
-            render.check_opengl()
-            render.check_video("video.mp4")
-        except RuntimeError as error:
-            fail(f"--capture-video: {error}")
     if path and args.run_dir is None:
         args.run_dir = path.parent
     return args
@@ -230,11 +219,10 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     hints = get_type_hints(kind, include_extras=True)
     choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
     known = {
-        name: value
-        for name, value in saved["args"].items()
-        if name in hints and not name.isupper() and value in choices.get(name, (value,))
+        name: value for name, value in saved["args"].items() if name in hints and value in choices.get(name, (value,))
     }
-    if gone := ", ".join(f"{flag(name)} {value}" for name, value in saved["args"].items() if name not in known):
+    others = {name: value for name, value in saved["args"].items() if name not in known and value}
+    if gone := ", ".join(f"{flag(name)} {value}" for name, value in others.items()):
         message = f"{path} was written by a {kind.script()}.py with other flags: {gone}"
         if given.resume:
             fail(message)
@@ -266,12 +254,8 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
-    return tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
-
-
-def parse_penalty(items: Sequence[str]) -> dict[str, float]:
-    """Of the flag --penalty k_n=1e5 k_d=1e4: {"k_n": 1e5, "k_d": 1e4}; anything else ends the script."""
-    try:
-        return {name: float(value) for name, _, value in (item.partition("=") for item in items)}
-    except ValueError:
-        fail(f"--penalty takes pairs like k_n=1e5, not {' '.join(items)!r}")
+    args = tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
+    for name in ("resume", "evaluate"):
+        if (path := getattr(args, name)) and path.is_dir():
+            setattr(args, name, path / "checkpoint.pt")
+    return args

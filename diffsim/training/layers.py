@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
@@ -84,6 +86,30 @@ class Chain(nn.Sequential):
         for layer in self:
             x = layer.forward(x)
         return x
+
+
+def mlp(
+    inputs: int,
+    hidden: Sequence[int],
+    outputs: int | None,
+    activation: Callable[[], nn.Module],
+    norm: bool = False,
+    orthogonal: bool = False,
+) -> Chain:
+    """Linear, activation and, if asked for, LayerNorm per hidden layer, and a linear output unless it is None.
+
+    Weights are initialised as torch does, or orthogonal with gain sqrt(2) and zero biases.
+    """
+    layers = list[nn.Module]()
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), activation(), *([nn.LayerNorm(width)] if norm else [])]
+        inputs = width
+    layers += [] if outputs is None else [nn.Linear(inputs, outputs)]
+    for layer in layers if orthogonal else ():
+        if isinstance(layer, nn.Linear):
+            nn.init.orthogonal_(layer.weight, 2**0.5)
+            nn.init.zeros_(layer.bias)
+    return Chain(*layers)
 
 
 class First(nn.Module):

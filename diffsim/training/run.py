@@ -58,7 +58,7 @@ class Record:
     iteration: int
     steps: int  # control steps that it took
     names: list[str]
-    numbers: Tensor  # of the names, then of all that was observed, then how many signals have arrived
+    numbers: Tensor  # of the names, then how many signals have arrived
     scalars: dict[str, float]  # that are known already
     times: dict[str, tuple[Mark, Mark]]  # begin and end, by name
 
@@ -153,10 +153,9 @@ class Run:
         if rank > 0:
             torch.manual_seed(self.args.seed + rank * RANK_SEED)
         if state := self._state:
-            own = state["ranks"][rank]  # None of a rank that was lost, which begins new episodes
-            checkpoint.restore(learner, state, (self._env, own["env"]) if own and self._env is not None else None)
-            if own:
-                self._random_numbers().set_state(own["rng"])
+            own = state["ranks"][rank]
+            checkpoint.restore(learner, state, (self._env, own["env"]) if self._env is not None else None)
+            self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]
             self._totals |= state["totals"]
@@ -170,8 +169,7 @@ class Run:
         def timed() -> Metrics:
             begin = Mark(self.device)
             try:
-                with self._together():
-                    metrics = call()
+                metrics = call()
             except ActionError:
                 self._check_learner()  # they say more
                 raise
@@ -221,9 +219,7 @@ class Run:
         if self._env is not None:
             tensors |= self._env.take_statistics()
         signals = torch.full((), float(len(self._signals)), device=self.device)
-        seen = sum((normalizer.mean.sum() for normalizer in self._normalizers), torch.zeros_like(signals))
-        with self._together():
-            numbers = distributed.average(torch.stack([*tensors.values(), seen, signals]))
+        numbers = distributed.average(torch.stack([*tensors.values(), signals]))
         steps, begin, self._mark = control_steps or self._samples, self._mark, Mark(self.device)
         times = self._times | {"time/total": (begin, self._mark)}
         self._records.append(Record(self.iteration, steps, list(tensors), numbers, scalars, times))
@@ -281,16 +277,13 @@ class Run:
                 self._write(record)
             self._records.clear()
         if saving or self._stopping:
-            with self._together():
-                self._save(distributed.gather(self._own_state()))
+            self._save(distributed.gather(self._own_state()))
         if pausing:
             self._mark = Mark(self.device)
 
     def _write(self, record: Record) -> None:
         """Wait until the device has finished an iteration, and write it."""
-        ranks, (*numbers, seen, signals) = distributed.size(), record.numbers.tolist()
-        if not math.isfinite(seen):
-            self._check_observations()
+        ranks, (*numbers, signals) = distributed.size(), record.numbers.tolist()
         self._stopping = self._stopping or signals > 0
         times = {name: end.since(begin) for name, (begin, end) in record.times.items()}
         self.seconds += times["time/total"]
@@ -392,21 +385,10 @@ class Run:
         return torch.default_generator
 
     def _own_state(self) -> dict[str, Any]:
-        """The state of this rank."""
         env = self._env.state_dict() if self._env is not None else None
         return {"env": env, "rng": self._random_numbers().get_state()}
 
-    @contextmanager
-    def _together(self) -> Iterator[None]:
-        """Around what all ranks do: where one is lost, the first one saves what it has before the script ends."""
-        try:
-            yield
-        except distributed.LostRankError as error:
-            self.iteration -= 1  # which is incomplete
-            self._save([self._own_state() if k == distributed.rank() else None for k in range(distributed.size())])
-            fail(f"{error}; {self._kept()}")
-
-    def _save(self, ranks: list[dict[str, Any] | None]) -> None:
+    def _save(self, ranks: list[dict[str, Any]]) -> None:
         assert self._learner is not None
         if not self.writes:
             return
@@ -444,6 +426,6 @@ class Run:
             say(f"evaluation of iteration {iteration}, {args.eval_episodes} episodes: {evaluation}")
         say(f"written to {path}")
         if self.iteration < args.iterations:
-            say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} goes on")
+            say(f"stopped early: python {args.script()}.py --resume {path / 'checkpoint.pt'} continues")
         elif self._evaluation:
             write_evaluation(args, self._evaluation[1], self.iteration)

@@ -94,6 +94,8 @@ def subject(robot: str) -> type[Task]:
     path = Path(robot)
     if path.suffix != ".xml":
         return find_task(robot)
+    if not path.is_file():
+        fail(f"no such file: {robot}")
     return type("Robot", (Watched,), {"name": path.stem, "asset": path.resolve()})
 
 

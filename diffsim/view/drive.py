@@ -1,24 +1,20 @@
 """Drive a robot from a browser: its policy acts in this simulator, live, as keys, gamepads and the mouse command.
 
 Python's own web server shows the page of view/web.py. Each picture comes to it as an event of a stream, and what its
-user asks for goes back as a POST. Several pages show one robot; their commands add up.
+user asks for goes back as a POST. Several pages show one robot, which follows the latest command.
 """
 
 from __future__ import annotations
 
-import base64
 import functools
-import hashlib
 import ipaddress
-import itertools
 import json
 import math
-import re
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, NamedTuple
@@ -46,7 +42,6 @@ TURN = 0.3  # rad/s by which a key turns the way of a robot that otherwise runs 
 STIFFNESS, MAX_PULL = 20.0, 19.62  # N/kg per m of the mouse's pull, and N/kg: twice the weight
 SILENCE = 10.0  # s after which a page that takes no more pictures is given up
 LONGEST = 1000  # bytes of what a page asks for
-SECURITY = "default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; frame-ancestors 'none'"
 
 
 class Wish(NamedTuple):
@@ -54,12 +49,12 @@ class Wish(NamedTuple):
 
     move: tuple[float, ...] = (0.0, 0.0, 0.0)  # forward, left, turn to the left, each in [-1, 1] of the most
     pull: tuple[float, ...] = ()  # a body's number, and the point (3,) to which it is pulled, if any
-    restarts: int = 0  # how often a new episode was asked for
+    restart: bool = False  # a new episode
 
 
 def parse(said: dict[str, Any], bodies: int) -> Wish:
     """Raises ValueError, TypeError, OverflowError or KeyError if it is no wish."""
-    wish = Wish(tuple(map(float, said["move"])), tuple(map(float, said["pull"] or ())), int(said["restarts"]))
+    wish = Wish(tuple(map(float, said["move"])), tuple(map(float, said["pull"] or ())), said["restart"] is True)
     if len(wish.move) != 3 or not all(map(math.isfinite, (*wish.move, *wish.pull))):
         raise ValueError("a move has three finite numbers")
     if wish.pull and (len(wish.pull) != 4 or wish.pull[0] not in range(1, bodies)):
@@ -87,11 +82,11 @@ class Pilot:
         self._heading, self._action = 0.0, torch.zeros(1, self.env.scene.nu)
 
     @torch.no_grad()
-    def step(self, wishes: Sequence[Wish]) -> dict[str, str]:
+    def step(self, wish: Wish) -> dict[str, str]:
         """A control step; the picture of it, see web.encode."""
-        env, move = self.env, np.sum([wish.move for wish in wishes], axis=0).clip(-1.0, 1.0)
-        env.sim.forces = torch.as_tensor(self._forces(wishes), dtype=env.dtype)[None]
-        action = self._action = self._policy(self._see(move)).clamp(-1.0, 1.0)
+        env = self.env
+        env.sim.forces = torch.as_tensor(self._forces(wish), dtype=env.dtype)[None]
+        action = self._action = self._policy(self._see(np.clip(wish.move, -1.0, 1.0))).clamp(-1.0, 1.0)
         _, _, terminated, truncated, _ = env.step(action)
         states = env.qpos, env.task.ghost(env.memory)
         shown = [state[0].double().numpy() for state in states if state is not None]
@@ -111,13 +106,14 @@ class Pilot:
         self._heading += TURN * float(move[2]) * env.control_dt
         return task.observe(*turned(-self._heading, env.qpos, env.qvel), self._action)
 
-    def _forces(self, wishes: Sequence[Wish]) -> Array:
-        """(nbody, 6) of all pulls, as Simulator.forces has them."""
+    def _forces(self, wish: Wish) -> Array:
+        """(nbody, 6) of a pull, as Simulator.forces has them."""
         forces = np.zeros((self.env.scene.nbody, 6))
-        for body, *point in (wish.pull for wish in wishes if wish.pull):
+        if wish.pull:
+            body, *point = wish.pull
             way = point - self._places[int(body)]
             strength = min(STIFFNESS, MAX_PULL / max(float(np.linalg.norm(way)), 1e-9))
-            forces[int(body), :3] += self._mass * strength * way
+            forces[int(body), :3] = self._mass * strength * way
         return forces
 
 
@@ -134,11 +130,15 @@ def turned(angle: float, qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Stage:
-    """What pages and the simulation share: the wishes of each, and the latest picture."""
+    """What pages and the simulation share: how many pages there are, the latest wish and the latest picture."""
 
     def __init__(self) -> None:
-        self.changed, self.wishes = threading.Condition(), dict[int, Wish]()
-        self._picture, self._number, self._clients = "", 0, itertools.count(1)
+        self.changed, self.pages, self.wish, self.restart = threading.Condition(), 0, Wish(), False
+        self._picture, self._number = "", 0
+
+    def ask(self, wish: Wish) -> None:
+        with self.changed:
+            self.wish, self.restart = wish, self.restart or wish.restart
 
     def show(self, picture: dict[str, str]) -> None:
         with self.changed:
@@ -146,13 +146,11 @@ class Stage:
             self.changed.notify_all()
 
     def watch(self) -> Generator[str, None, None]:
-        """The client's number, then each picture, except those that come while it is busy with another."""
-        client, seen = next(self._clients), self._number
+        """Each picture, except those that come while a page is busy with another. One that leaves wishes no more."""
         with self.changed:
-            self.wishes[client] = Wish()
+            self.pages, seen = self.pages + 1, self._number
             self.changed.notify_all()
         try:
-            yield json.dumps({"client": client})
             while True:
                 with self.changed:
                     while self._number == seen:
@@ -161,7 +159,7 @@ class Stage:
                 yield picture
         finally:
             with self.changed:
-                del self.wishes[client]
+                self.pages, self.wish = self.pages - 1, Wish()
 
 
 def is_here(host: str, own: str) -> bool:
@@ -170,13 +168,6 @@ def is_here(host: str, own: str) -> bool:
         name = urlsplit(f"//{host}").hostname or ""
         return name in ("localhost", own.lower(), socket.gethostname().lower()) or bool(ipaddress.ip_address(name))
     return False
-
-
-def security(page: bytes) -> str:
-    """The page talks only to this server, no other page shows it, and no script runs except those that it has now."""
-    scripts = re.findall(b"<script>(.*?)</script>", page, re.DOTALL)
-    hashes = (base64.b64encode(hashlib.sha256(script).digest()).decode() for script in scripts)
-    return f"{SECURITY}; script-src " + " ".join(f"'sha256-{each}'" for each in hashes)
 
 
 class Server(ThreadingHTTPServer):
@@ -209,7 +200,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self.path == "/":
-            self._answer("text/html; charset=utf-8", self._page, **{"Content-Security-Policy": security(self._page)})
+            self._answer("text/html; charset=utf-8", self._page)
         elif self.path == "/stream":
             self._answer("text/event-stream")
             with closing(self._stage.watch()) as pictures:
@@ -221,18 +212,15 @@ class Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         try:
             length = int(self.headers["Content-Length"])
-            said = json.loads(self.rfile.read(length if 0 <= length <= LONGEST else 0))
-            client, wish = said["client"], parse(said, self._bodies)
+            wish = parse(json.loads(self.rfile.read(length if 0 <= length <= LONGEST else 0)), self._bodies)
         except (KeyError, OverflowError, RecursionError, TypeError, ValueError):
             return self.send_error(400)
-        with self._stage.changed:
-            if client in [*self._stage.wishes]:  # still
-                self._stage.wishes[client] = wish
+        self._stage.ask(wish)
         self._answer("text/plain")
 
-    def _answer(self, kind: str, content: bytes = b"", **headers: str) -> None:
+    def _answer(self, kind: str, content: bytes = b"") -> None:
         self.send_response(200)
-        for header, value in {"Content-Type": kind, "Cache-Control": "no-store", **headers}.items():
+        for header, value in (("Content-Type", kind), ("Cache-Control", "no-store")):
             self.send_header(header, value)
         self.end_headers()
         self.wfile.write(content)
@@ -247,7 +235,7 @@ def serve(env: DiffEnv, policy: Callable[[Tensor], Tensor], caption: str, host: 
     Raises:
         OSError: nothing can listen at host and port, in one line.
     """
-    stage, scene, name, restarts, due = Stage(), env.scene, env.task.name, 0, 0.0
+    stage, scene, name, due = Stage(), env.scene, env.task.name, 0.0
     motion = web.describe(scene, env.control_dt, env.task.ghost(env.memory) is not None)
     motion["live"] = next(text for kind, text in KEYS.items() if isinstance(env.task, kind)) + ALWAYS
     try:
@@ -258,18 +246,17 @@ def serve(env: DiffEnv, policy: Callable[[Tensor], Tensor], caption: str, host: 
         raise OSError(f"cannot listen on {host}:{port}: {why}; choose another --host or --port") from error
     with server, suppress(KeyboardInterrupt):
         pilot = Pilot(env, policy)
-        pilot.step([Wish()])  # compiles
+        pilot.step(Wish())  # compiles
         threading.Thread(target=server.serve_forever, daemon=True).start()
         print(f"http://{host}:{server.server_port} drives {name}; Ctrl-C ends it", flush=True)
         while True:  # pictures, each at its time
             with stage.changed:
-                while not stage.wishes:
+                while not stage.pages:
                     stage.changed.wait()
-                wishes = [*stage.wishes.values()]
-            if (asked := sum(wish.restarts for wish in wishes)) > restarts:
+                wish, restart, stage.restart = stage.wish, stage.restart, False
+            if restart:
                 pilot.restart()
-            restarts = asked
-            stage.show(pilot.step(wishes))
+            stage.show(pilot.step(wish))
             now = time.perf_counter()
             due = max(due + env.control_dt, now - 0.1)  # late: go on from here
             time.sleep(max(0.0, due - now))

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import torch
 import tracking
-from learners import refusal
 from torch import Tensor, nn
 from worlds import OtherFile
 
@@ -60,9 +58,3 @@ def test_tables_of_policies_variants_and_races() -> None:
     sapo, ppo = tracking.race([*way, other])
     assert (sapo["learner"], sapo["s to 95%"], sapo["in all (s)"]) == ("sapo", "60", "90")
     assert (ppo["learner"], ppo["s to 95%"], ppo["last success"]) == ("ppo in mujoco_warp", "never", "10%")
-
-
-def test_what_cannot_be_judged(capsys: pytest.CaptureFixture[str]) -> None:
-    args = tracking.Args(checkpoints=(POLICIES / "hopper.pt",))
-    error = refusal(lambda: tracking.main(args), capsys)
-    assert "was trained on hopper, which is not judged by its clip's root" in error

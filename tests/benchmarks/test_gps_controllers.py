@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import gps_controllers as controllers
 import pytest
 import torch
-from common import DOCS, RESULTS, CheckpointFlags
+from common import DOCS, RESULTS
 from gps_variants import named_terrains
 from learners import run
 from tables import markdown, read_csv
@@ -35,11 +36,11 @@ def search(hopper: Path) -> gps.Search:
 def test_the_command(hopper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The guide hops over level ground; a second call draws from the csv file alone."""
     monkeypatch.setattr(controllers, "terrains", lambda degrees: {"some": ["level", "incline:60:-1"]})
-    controllers.main(CheckpointFlags(checkpoints=(hopper,), output=tmp_path))
+    controllers.main(controllers.Args(checkpoints=(hopper,), output=tmp_path))
     rows = {(row["terrain"], row["controller"]): row for row in read_csv(tmp_path / "gps_controllers.csv")}
     assert len(rows) == 6 and rows["level", "ddp"]["walked"] == "1" and rows["incline:60:-1", "ddp"]["walked"] == "0"
     before = (tmp_path / "gps_controllers.csv").read_bytes()
-    controllers.main(CheckpointFlags(draw_only=True, output=tmp_path))
+    controllers.main(controllers.Args(draw_only=True, output=tmp_path))
     assert before == (tmp_path / "gps_controllers.csv").read_bytes()
 
 
@@ -84,6 +85,13 @@ def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
     assert second["rough"] == "100% / 0% / 50%"
 
 
-def test_the_page_has_the_table_of_the_csv_file() -> None:
-    table = markdown(controllers.table(read_csv(RESULTS / "cpu" / "gps_controllers.csv")))
-    assert f"<!-- gps terrain -->\n{table}<!--" in (DOCS / "gps.md").read_text()
+def test_the_page_has_the_tables_of_the_csv_files() -> None:
+    page, folder = (DOCS / "gps.md").read_text(), RESULTS / "cpu"
+    terrain = markdown(controllers.table(read_csv(folder / "gps_controllers.csv")))
+    rates = markdown(controllers.rates(read_csv(folder / "gps_stability.csv")))
+    assert f"<!-- gps terrain -->\n{terrain}<!--" in page and f"<!-- gps stability -->\n{rates}<!--" in page
+
+
+def test_growth_is_the_largest_exponent() -> None:
+    loop = torch.tensor([[1.1, 0.3], [0.0, 0.5]]).double().expand(4000, 2, 2)
+    assert controllers.growth(loop, 0.02) == pytest.approx(math.log(1.1) / 0.02, rel=1e-2)

@@ -1,12 +1,10 @@
-"""benchmarks/gps_examples.py and gps_stability.py: what is recorded and shipped, and how fast a policy leaves it."""
+"""benchmarks/gps_examples.py: what is recorded and shipped."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import gps_examples
-import gps_stability
 import numpy as np
 import pytest
 import torch
@@ -60,7 +58,7 @@ def test_a_recorded_policy(tmp_path: Path) -> None:
 
 
 def test_a_swimmer_swims_forward(tmp_path: Path) -> None:
-    gps_examples.main(gps_examples.Args(to=tmp_path / "swim.npz", env="swimmer", steps=60))
+    gps_examples.main(gps_examples.Args(to=tmp_path / "swim.npz", env="swimmer", steps=60, settle=200))
     x = np.load(tmp_path / "swim.npz")["qpos"][:, 0]
     assert x[0] == 0.0 and x[-1] > 0.6 * 60 * 0.05
 
@@ -68,8 +66,3 @@ def test_a_swimmer_swims_forward(tmp_path: Path) -> None:
 def test_without_a_run_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = gps_examples.Args(to=tmp_path / "a.npz", env="hopper")
     assert "--run must be the directory of a run" in refusal(lambda: gps_examples.main(args), capsys)
-
-
-def test_growth_is_the_largest_exponent() -> None:
-    loop = torch.tensor([[1.1, 0.3], [0.0, 0.5]]).double().expand(4000, 2, 2)
-    assert gps_stability.growth(loop, 0.02) == pytest.approx(math.log(1.1) / 0.02, rel=1e-2)

@@ -1,4 +1,4 @@
-"""Pages have the tables that the benchmarks make of the csv files today."""
+"""Of all benchmarks: pages have their tables of today's csv files, and what one cannot measure is one line."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from typing import Any
 
 import common
 import pytest
+import torch
+from learners import refusal
+
+from diffsim.training.checkpoint import POLICIES
 
 MADE = "gradients", "joystick", "numerics", "suites", "tracking", "transfer", "gps_controllers"
 CASES = [*((name, "cpu", {}) for name in (*MADE, "gps_stability")), ("joystick", "cpu", {"race": True})]
@@ -32,3 +36,31 @@ def test_a_page_has_the_tables_of_the_csv_files(
     kind = getattr(script, "Args", common.CheckpointFlags)
     script.main(kind(draw_only=True, output=common.RESULTS / machine, **flags))
     assert filled
+
+
+@pytest.mark.parametrize(
+    ("name", "checkpoint", "message"),
+    [
+        ("transfer", "", "of what? give a checkpoint"),
+        ("transfer", "none", "no such checkpoint: "),
+        ("transfer", "juggler", "was trained elsewhere: unknown task 'juggler': choose from cartpole, hopper"),
+        ("transfer", "humanoid_mtu", "humanoid_mtu, whose muscles are not simulated in MuJoCo here"),
+        ("robustness", "cartpole", "was trained on cartpole, whose episodes do not end with a fall"),
+        ("gradients", "cartpole", "was trained on cartpole, which has no ground"),
+        ("joystick", "hopper", "was trained on hopper, which follows no command"),
+        ("tracking", "hopper", "was trained on hopper, which is not judged by its clip's root"),
+    ],
+)
+def test_a_policy_that_cannot_be_measured_is_one_line(
+    name: str,
+    checkpoint: str,
+    message: str,
+    tmp_path_factory: pytest.TempPathFactory,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    script, path = importlib.import_module(name), POLICIES / f"{checkpoint}.pt"
+    if checkpoint == "juggler":
+        state, path = torch.load(POLICIES / "cartpole.pt", weights_only=True), tmp_path_factory.mktemp("other") / "a.pt"
+        torch.save(state | {"args": state["args"] | {"env": "juggler"}}, path)
+    args = common.parse(script.Args, None, [str(path)] if checkpoint else [])
+    assert message in refusal(lambda: script.main(args), capsys)

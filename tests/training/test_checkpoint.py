@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 import operator
 import sys
@@ -334,12 +333,3 @@ def test_what_cannot_be_onnx_is_one_line(tiny_run, tmp_path, monkeypatch, capsys
                 ': ONNX needs packages that are not installed: pip install -e ".[onnx]"'
             )
     assert not list(tmp_path.iterdir())
-
-
-def test_names_of_observations_add_up():
-    for task in diffsim.TASKS.values():
-        if task.obs_parts:
-            sizes = [size for _, size in task.obs_parts]
-            assert sum(sizes) == task.obs_dim and task.actor_dim in (None, *itertools.accumulate(sizes))
-            assert len({name for name, _ in task.obs_parts}) == len(sizes)
-    assert diffsim.TASKS["g1"].obs_parts[3] == ("joint_pos", 29)

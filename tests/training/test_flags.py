@@ -83,10 +83,8 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
     ("arguments", "message"),
     [
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant, humanoid"),
+        ("--env walker --accuracy fast", "task 'walker' has no preset 'fast' on soft contact; choose from default"),
         ("--substeps 5 --integrator extrapolated", "substeps is 5, must be even"),
-        ("--penalty mu=1 k_n", "--penalty takes pairs like k_n=1e5, not 'mu=1 k_n'"),
-        ("--penalty k_n=stiff", "--penalty takes pairs like k_n=1e5, not 'k_n=stiff'"),
-        ("--penalty kn=1e5", "unknown penalty constant 'kn'"),
         ("--device nonsense", "nonsense"),
         ("--device cuda", "device 'cuda' asked for, but PyTorch sees 0 CUDA GPUs here; choose cpu"),
         ("--run-dir {file}", "cannot write to run directory {file}: Not a directory"),
@@ -99,6 +97,7 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
         ("--resume {elsewhere} --device cpu --iterations 9", "{elsewhere} was trained on cuda:0, which cpu cannot"),
         ("--evaluate {trained}/checkpoint.pt --run-dir {file}", "cannot write to run directory {file}"),
         ("--resume {trained}/checkpoint.pt", "is at iteration 2 already"),
+        ("--resume {trained}", "{trained}/checkpoint.pt is at iteration 2 already"),
         ("--resume {trained}/checkpoint.pt --iterations 20 --stop-after 2", "is at iteration 2 already"),
         ("--resume {file} --evaluate {file}", "--resume and --evaluate exclude each other"),
     ],
@@ -174,23 +173,20 @@ def test_the_command_line_is_before_the_checkpoint_is_before_the_task():
     assert parse(shac.Args, ["--resume", str(path), "--device", "auto", "--stop-after", "6"]).device == "cpu"
 
 
-def test_accuracy_and_penalty_are_stored_and_can_be_replaced():
+def test_accuracy_is_stored_and_can_be_replaced():
     fast, accurate = (diffsim.TASKS["cartpole"].integration(name) for name in ("fast", "accurate"))
-    path = save(parse(shac.Args, "--env cartpole --accuracy fast --penalty k_limit=50 mu=0.5".split()))
+    path = save(parse(shac.Args, "--env cartpole --accuracy fast".split()))
 
-    def simulator(*arguments: str) -> tuple[diffsim.Simulator, tuple[str, int, float]]:
+    def numbers(*arguments: str) -> tuple[str, int, float]:
         args = parse(shac.Args, ["--evaluate", str(path), *arguments])
-        return make_env(args, 1).sim, (args.integrator, args.substeps, args.theta)
+        assert make_env(args, 1).sim.integration.substeps == args.substeps
+        return args.integrator, args.substeps, args.theta
 
-    sim, numbers = simulator()
-    assert numbers == (fast.integrator, fast.substeps, fast.theta)
-    assert (set(sim.scene.k_limit), sim.scene.mu) == ({50.0}, 0.5)
+    assert numbers() == (fast.integrator, fast.substeps, fast.theta)
     for words in (["--accuracy", "accurate"], ["--accuracy=accurate"]):
-        assert simulator(*words)[1] == (accurate.integrator, accurate.substeps, accurate.theta)
-    assert simulator("--accuracy", "accurate", "--substeps", "2")[1] == (accurate.integrator, 2, accurate.theta)
-    sim, numbers = simulator("--substeps", "16", "--integrator", "semi_implicit", "--penalty", "k_limit=100")
-    assert numbers == ("semi_implicit", 16, 0.0)
-    assert (set(sim.scene.k_limit), sim.scene.mu) == ({100.0}, diffsim.make("cartpole", 1).scene.mu)
+        assert numbers(*words) == (accurate.integrator, accurate.substeps, accurate.theta)
+    assert numbers("--accuracy", "accurate", "--substeps", "2") == (accurate.integrator, 2, accurate.theta)
+    assert numbers("--substeps", "16", "--integrator", "semi_implicit") == ("semi_implicit", 16, 0.0)
 
 
 def test_what_a_checkpoint_decides(capsys):

@@ -160,4 +160,4 @@ def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFi
         parts
     )
     assert returns.startswith("ant, 2 episodes")
-    assert evaluation.kept(-2.0, -4.0) == 0.5 and evaluation.kept(-1.0, 0.0) == 1.0
+    assert evaluation.kept(4.0, 2.0) == evaluation.kept(-2.0, -4.0) == 0.5 and evaluation.kept(-1.0, 0.0) == 1.0

@@ -27,7 +27,7 @@ import diffsim
 import shac
 from diffsim.env import DiffEnv
 from diffsim.tasks.cartpole import CartPole
-from diffsim.training import ClippedAdam, Evaluation, Run, checkpoint, distributed, evaluate, load_policy, parse
+from diffsim.training import ClippedAdam, Run, checkpoint, evaluate, load_policy, parse
 from diffsim.training.directory import COLUMNS
 
 # Iterations of a few milliseconds.
@@ -162,38 +162,8 @@ def test_a_directory_that_is_moved_is_made_again(tmp_path, monkeypatch):
 
     original = bptt.bptt_loss
     monkeypatch.setattr(bptt, "bptt_loss", moved)
-    assert run(bptt, tmp_path / "run", *TINY, "--iterations", 3, "--quiet")["iteration"] == 3
+    assert run(bptt, tmp_path / "run", *TINY, "--iterations", 3, "--eval-every", 1, "--quiet")["iteration"] == 3
     assert len(read_progress(tmp_path / "moved")) == 3
-
-
-def test_what_a_rank_has_is_saved_when_another_is_lost(tmp_path, monkeypatch, capsys):
-    """In the third iteration. A rank whose state is not there begins new episodes."""
-    calls, path, average = [], tmp_path / "checkpoint.pt", distributed.average
-
-    def all_reduce(_: Tensor) -> None:
-        raise RuntimeError("Connection closed by peer")  # gloo's
-
-    def lost(tensor: Tensor) -> Tensor:
-        calls.append(1)
-        if len(calls) > 6:
-            monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
-        return average(tensor)
-
-    argv = [*TINY, "--iterations", "5", "--quiet", "--run-dir", str(tmp_path)]
-    with monkeypatch.context() as patch:
-        patch.setattr("torch.distributed.all_reduce", all_reduce)
-        patch.setattr("torch.distributed.destroy_process_group", lambda: None)
-        patch.setattr("torch.distributed.get_rank", lambda: 0)
-        patch.setattr("torch.distributed.get_world_size", lambda: 1)
-        patch.setattr(distributed, "average", lost)
-        error = refusal(lambda: bptt.main(argv), capsys)
-    monkeypatch.undo()
-    state = checkpoint.load(path)
-    assert error == f"script.py: another process of this training is gone; {path} is of iteration {state['iteration']}"
-    assert 1 <= state["iteration"] < 5
-    torch.save(state | {"ranks": [None]}, path)
-    bptt.main(["--resume", str(path)])
-    assert checkpoint.load(path)["iteration"] == 5
 
 
 @pytest.mark.parametrize("part", ["reward", "observation 2"])
@@ -353,32 +323,6 @@ def test_track(tmp_path, monkeypatch, capsys):
     line = refusal(lambda: run(bptt, missing, *TINY, "--track"), capsys)
     assert line == "script.py: --track needs Weights & Biases: pip install wandb"
     assert not missing.exists()
-
-
-def test_video(tmp_path, monkeypatch, capsys):
-    """Of the last evaluation; what is missing to draw it is named, after everything else is written."""
-    films = []
-
-    def film(self: Evaluation, path: Path) -> Path:
-        films.append(path)
-        return path.with_suffix(".gif")
-
-    monkeypatch.setattr(Evaluation, "save_video", film)
-    run(bptt, tmp_path, *TINY, "--iterations", 2, "--eval-every", 1, "--quiet", "--capture-video")
-    assert capsys.readouterr().out.endswith(f"video: {tmp_path / 'video.gif'}\n")
-    bptt.main(["--evaluate", str(tmp_path / "checkpoint.pt")])
-    assert films == [tmp_path / "video.mp4"] * 2
-
-    def no_library(self: Evaluation, path: Path) -> Path:
-        raise RuntimeError("MuJoCo finds no OpenGL to draw with")
-
-    monkeypatch.setattr(Evaluation, "save_video", no_library)
-    (tmp_path / "evaluation.json").unlink()
-    with pytest.raises(SystemExit) as exit:
-        bptt.main(["--evaluate", str(tmp_path / "checkpoint.pt")])
-    assert exit.value.code == 2
-    assert capsys.readouterr().err == "script.py: MuJoCo finds no OpenGL to draw with\n"
-    assert json.loads((tmp_path / "evaluation.json").read_text())["settings"]["iteration"] == 2
 
 
 def test_a_renamed_copy_trains_resumes_and_evaluates(tmp_path, monkeypatch):

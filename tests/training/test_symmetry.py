@@ -22,7 +22,7 @@ from diffsim.training.layers import folded, seeing
 
 MIRRORED = ("ant", "humanoid", "humanoid_mtu", "go1", "go2", "g1")
 LEARNERS = {
-    "shac": ("SHAC", "--actor-hidden 16 --critic-hidden 16 --deterministic-policy"),
+    "shac": ("SHAC", "--actor-hidden 16 --critic-hidden 16"),
     "sapo": ("SAPO", "--actor-hidden 16 --critic-hidden 16 --population 2"),
     "ppo_baseline": ("PPO", "--hidden 16"),
 }
@@ -94,7 +94,9 @@ def test_the_noise_of_the_image_is_as_large(flags: str) -> None:
     assert_alike(image, mirror.action(action))
     torch.testing.assert_close(same, surprise, rtol=1e-5, atol=1e-4)
     if flags == "--no-state-std":
-        assert torch.equal(actor.log_std, actor.log_std.index_select(-1, mirror.action.index)) and actor.log_std.std()
+        others = build("shac", "ant").actor, build("ppo_baseline", "ant").actor_critic
+        for log_std in (actor.log_std, *(other.log_std for other in others)):
+            assert torch.equal(log_std, log_std.index_select(-1, mirror.action.index)) and log_std.std()
 
 
 @pytest.mark.parametrize("script", LEARNERS)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -58,7 +60,7 @@ def test_what_divides_the_gradient_is_positive(env: diffsim.DiffEnv) -> None:
     for name in ("k_n", "k_d", "k_limit"):
         bad = factors.clone()
         bad[5, FACTORS.index(name)] = 0.0
-        with pytest.raises(ValueError, match=f"the factor of {name} is 0.0 in environment 5; .* positive"):
+        with pytest.raises(ValueError, match=rf"factors\[5, {FACTORS.index(name)}\] is 0.0; .* positive"):
             env.sim.factors = bad
 
 
@@ -100,11 +102,22 @@ def test_disturbances_are_the_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert "unknown 'push'" in refusal(lambda: shac.main(["--env", "ant", "--randomise", "push=0:1"]), capsys)
 
 
-def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(tmp_path: Path) -> None:
+def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    collect, seen = shac.collect, list[torch.Tensor]()
+
+    def watched(env: diffsim.DiffEnv, *rest: Any) -> shac.Rollout:
+        seen.append(env.sim.factors.clone())
+        return collect(env, *rest)
+
+    monkeypatch.setattr(shac, "collect", watched)
     flags = "--env hopper --contact mujoco --num-envs 16 --horizon 8 --iterations 4 --eval-episodes 2"
     flags += " --redraw 1 --randomise mass=0.9:1.1 friction=0.5:2 --device cpu --critic-iterations 2"
     flags += " --threads 1 --quiet"
     whole = run(shac, tmp_path / "whole", *flags.split())
+    assert len(seen) == 4 and not any(torch.equal(a, b) for a, b in pairwise(seen))
+    assert all((factors[:, FACTORS.index("mass")] != 1).all() for factors in seen)
     run(shac, tmp_path / "part", *flags.split(), "--stop-after", 2)
     part = run(shac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
     assert_same(part["modules"], whole["modules"])

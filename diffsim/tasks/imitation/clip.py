@@ -38,10 +38,10 @@ class Clip:
     The last frame of a loop is the first one of the next round: equal except for x and y.
 
     Attributes:
-        name: of the file, without its suffix, or of the folder.
+        name: name of the file, without its suffix, or of the folder.
         qpos: (T, nq) float64 in MuJoCo's convention, the world's frame, m and rad; quaternions wxyz of unit length.
         loop: whether it goes on from the beginning.
-        lengths: the frames of each motion, of several that stand in qpos one after the other; empty of one.
+        lengths: number of frames of each motion, if qpos holds several in a row; empty for one.
     """
 
     lengths: tuple[int, ...] = ()

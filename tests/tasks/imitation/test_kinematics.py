@@ -42,12 +42,6 @@ def test_bodies_and_centre_of_mass(name: str, rng: np.random.Generator) -> None:
         np.testing.assert_allclose(centre[i], data.subtree_com[0], atol=1e-12)
 
 
-def test_gradients(rng: np.random.Generator) -> None:
-    model = task_scene("ant").mj_model
-    kinematics, qpos = Kinematics(model, "cpu", REAL), torch.tensor(random_qpos(model, rng, 2), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda q: kinematics.centre(*kinematics(q)), qpos)
-
-
 @pytest.mark.parametrize("name", ["hopper", "humanoid_mtu"])
 def test_other_joints_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match="needs a free root and hinges"):

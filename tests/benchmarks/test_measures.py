@@ -1,0 +1,133 @@
+"""Transfer, gradients of contact, robots of others, and speed: what is measured, on small cases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import foreign
+import gradients
+import numpy as np
+import pytest
+import speed
+import torch
+import transfer
+from common import Panel, lines, parse
+from scenes import BOUNDED_SERVOS, pendulum
+from tables import markdown, read_csv
+
+import diffsim
+from diffsim.training.checkpoint import POLICIES
+
+# Transfer -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_summary_of_a_known_motion() -> None:
+    """A hopper glides along; the second episode ends after half of it."""
+    env = diffsim.make("hopper", 2)
+    qpos, qvel = np.zeros((61, 2, 6)), np.zeros((61, 2, 6))
+    qpos[..., 0] = 1.5 * env.control_dt * np.arange(61)[:, None]
+    motion = transfer.Motion(qpos, qvel, np.array([3.0, 1.0]), np.array([60, 30]), np.array([False, True]))
+    assert transfer.summary(motion, env) == pytest.approx({"return": 2.0, "speed": 1.5, "whole": 0.5})
+
+
+def test_a_row_for_each_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is kept counts from the world of the training, here or, in mujoco_warp, that of the same law."""
+    state = torch.load(POLICIES / "hopper.pt", weights_only=True)
+    exact = {"contact": "mujoco", "integrator": "mujoco", "substeps": 4, "theta": 0.0, "passes": 4, "seed": 1}
+    paths = [POLICIES / "hopper.pt", POLICIES / "cartpole.pt"]
+    for simulator in ("diffsim", "mujoco_warp"):
+        paths.append(tmp_path / simulator / "hopper__1" / "checkpoint.pt")
+        paths[-1].parent.mkdir(parents=True)
+        torch.save(state | {"args": state["args"] | exact, "simulator": simulator}, paths[-1])
+    flags = "--episodes 2 --steps 30 --friction 1 0.5 --output".split()
+    transfer.main(parse(transfer.Args, None, [*map(str, paths), *flags, str(tmp_path)]))
+    rows = read_csv(tmp_path / "transfer.csv")
+    by = {line["learner"]: line for line in transfer.table(rows)}
+    assert markdown(transfer.table(rows)) in capsys.readouterr().out
+    worlds = ["here", "finer", "MuJoCo x1", "MuJoCo x0.5"]
+    for learner, names, judge in (
+        ("policies/hopper", worlds, "MuJoCo x1"),
+        ("diffsim", ["here", "finer", "MuJoCo same", *worlds[2:]], "MuJoCo x1"),
+        ("mujoco_warp", ["MuJoCo same", "here", "finer", *worlds[2:]], "here"),
+    ):
+        own = {row["condition"]: row for row in rows if row["checkpoint"].startswith(learner)}
+        speeds = {name: float(row["speed"]) for name, row in own.items()}
+        assert sorted(own) == sorted(names)
+        assert "MuJoCo same" in own or speeds["finer"] == pytest.approx(speeds["here"], rel=0.02)
+        kept = float(own[judge]["kept"])
+        assert kept == pytest.approx(speeds[judge] / speeds[names[0]], rel=0.01)
+        assert by[learner]["retained (worst)"] == f"{kept:.0%} ({kept:.0%})"
+        if "MuJoCo same" in own:  # one law
+            assert speeds["here"] == pytest.approx(speeds["MuJoCo same"], rel=0.01)
+    alone = [row for row in rows if row["task"] == "cartpole"]  # which touches nothing: a return, the same in MuJoCo
+    assert [row["condition"] for row in alone] == ["here", "finer", "MuJoCo x1"]
+    assert all(row["return"] and not row["speed"] for row in alone)
+    line = by["policies/cartpole"]
+    assert float(line["here"]) == pytest.approx(float(line["MuJoCo x1"]), rel=0.02) and line["retained (worst)"] == ""
+
+
+# Gradients ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_gradient_of_a_window_agrees_with_differences() -> None:
+    """Where no jump is in reach; both begin in the same state, which differences leave as it was."""
+    env = diffsim.make("hopper", 16, horizon=4, dtype=torch.float64, early_termination=False)
+    policy = torch.nn.Linear(env.task.obs_dim, env.scene.nu).double()
+    torch.nn.init.normal_(policy.weight, std=0.02, generator=torch.Generator().manual_seed(0))
+    env.reset(seed=0)
+    noise = 0.1 * torch.randn(4, 16, env.scene.nu, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    start = env.qpos.clone()
+    slopes = gradients.differences(env, policy, 4, noise, 1e-5)
+    assert torch.equal(env.qpos, start)
+    shift = torch.zeros(16, env.scene.nu, dtype=torch.float64, requires_grad=True)
+    (each,) = torch.autograd.grad(gradients.window(env, policy, 4, shift, noise).sum(), shift)
+    torch.testing.assert_close(each.mean(0), slopes, rtol=1e-4, atol=1e-6)
+
+
+def test_gradients_on_each_ground(tmp_path: Path) -> None:
+    flags = f"--num-envs 16 --horizons 8 --warmup 990 --output {tmp_path}".split()
+    gradients.main(parse(gradients.Args, None, [str(POLICIES / "hopper.pt"), *flags]))
+    rows = read_csv(tmp_path / "gradients.csv")
+    assert [row["ground"] for row in rows] == [*gradients.GROUNDS]
+    assert len({row["norm"] for row in rows}) == len(rows)
+    assert all(abs(float(row["cosine"])) <= 1 for row in rows) and float(rows[0]["differences"]) > 0.99
+
+
+# Robots of others -----------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robots = {
+        "servos": BOUNDED_SERVOS,
+        "rubbed": pendulum('axis="0 1 0" frictionloss="1"'),
+        "bad": pendulum(rest='<actuator><velocity joint="hinge" kv="-2"/></actuator>'),
+    }
+    for name, mjcf in robots.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.xml").write_text(mjcf)
+    flags = ["--states", "8", "--output", str(tmp_path / "out")]
+    foreign.main(parse(foreign.Args, None, [str(tmp_path), *flags]))
+    assert "2 of 3 load" in capsys.readouterr().out
+    rows = {row["file"]: row for row in read_csv(tmp_path / "out" / "foreign.csv")}
+    bad = "actuator number 0: stiffness and damping of a servo must not be negative"
+    assert rows["bad/scene.xml"]["refused"] == bad
+    for name in ("servos", "rubbed"):
+        assert rows[f"{name}/scene.xml"]["refused"] == ""
+        assert float(rows[f"{name}/scene.xml"]["relative error of qacc"]) < 1e-9
+
+
+# Speed ----------------------------------------------------------------------------------------------------------------
+
+
+def test_of_each_state_the_fastest_turn_counts_and_over_states_the_median() -> None:
+    times = iter([99.0, 3.0, 1.0, 7.0, 5.0, 20.0, 30.0])  # the first state warms up; two turns in each of three
+    state = (torch.zeros(1),) * 3
+    found = speed.race({"ours": lambda _: {"forward": next(times)}}, [state] * 4, repeats=2)
+    assert found == {"ours": {"forward": 5.0}}
+
+
+def test_a_line_for_each_value_by_its_x() -> None:
+    rows = [{"n": "64", "us": "2", "task": "ant"}, {"n": "8", "us": "1", "task": "ant"}]
+    first, second = lines([*rows, {"n": "8", "us": "3", "task": "hopper"}], "n", "us", "task")
+    assert (first.label, [*first.x], [*first.y]) == ("ant", [8.0, 64.0], [1.0, 2.0])
+    assert (second.label, second.style) == ("hopper", "C1o-") and Panel([first, second]).log == ""
