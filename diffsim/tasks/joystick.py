@@ -103,6 +103,7 @@ class Joystick(Task):
         "motor=0.8:1.2",
         "latency=0:1",
         "push=0:1",
+        "pull=0:0.6",
     )
     substeps = 4
     control_dt = 0.02
@@ -314,5 +315,5 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
-    alive, smooth, randomise = 2.5, 1.0, (*Joystick.randomise[:-1], "push=0:0.5")
+    alive, smooth, randomise = 2.5, 1.0, Joystick.randomise[:-1]
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise
