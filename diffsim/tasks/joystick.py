@@ -209,7 +209,7 @@ class Joystick(Task):
         return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise, late, pull, kick), dim=-1)
 
     def _recall(self, memory: Tensor) -> tuple[Tensor, ...]:
-        """Command, clock, the last action, the one before, latency, pull, push; the noise lies before the last three."""
+        """Command, clock, the last action, the one before, latency, pull, push; before the last three the noise."""
         sizes = 3, 1, self._n, self._n, 9 + 2 * self._n, 1, 3, 2
         command, clock, last, before, _, late, pull, kick = memory.split(sizes, -1)
         return command, clock, last, before, late, pull, kick
