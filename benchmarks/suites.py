@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
 from typing import NamedTuple
@@ -146,7 +146,7 @@ def main(args: Args) -> None:
             runner.train(case)
             if not args.train_only and (found := line(suite, case.folder)):
                 args.keep(suite.csv, {"group": group, "cell": cell, "seed": case.seed} | found, KEY)
-        rows = replace(args, machine=args.machine or suite.machine).read(suite.csv)
+        rows = args.read(suite.csv) or read_csv(args.directory.parent / suite.machine / f"{suite.csv}.csv")
         args.publish(*shown(group, rows), suite.page, everywhere=True)
 
 

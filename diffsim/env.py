@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from numbers import Integral
 from typing import Any, Literal
 
@@ -137,21 +137,17 @@ class DiffEnv(VectorEnv):
 
     @in_plain_mode
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Restart all episodes, or those of options={"reset_mask": mask (N,) bool}, and begin a window.
-
-        Returns:
-            obs (N, obs_dim) of all environments, and an empty info.
+        """Restart all episodes and begin a window; returns obs (N, obs_dim) and an empty info.
 
         Raises:
-            ValueError: several seeds (one generator draws all start states); a mask of another shape or dtype; unknown
-                options.
+            ValueError: several seeds (one generator draws all start states); options.
         """
-        mask = self._mask(options) if options else torch.ones_like(self.episode_step, dtype=torch.bool)
+        if options:
+            raise ValueError(f"options are {options!r}, but reset takes none")
         if seed is not None:
             self.generator.manual_seed(check_seed(seed))
-        if not options:
-            self._cut()
-        self._begin(mask, self._draw(1)[0])
+        self._cut()
+        self._begin(torch.ones_like(self.episode_step, dtype=torch.bool), self._draw(1)[0])
         if self._pinned is not None:
             self.carry_over(self._pinned)
         if self.device.type == "cuda":  # the next step draws start states, as it does in each replay of a graph
@@ -229,16 +225,6 @@ class DiffEnv(VectorEnv):
         self._put(torch.where(row, start, now) for start, now in zip(starts, self._state(), strict=True))
         self.episode_step.masked_fill_(mask, 0)
         self._episode_return.masked_fill_(mask, 0.0)
-
-    def _mask(self, options: dict[str, Any]) -> Tensor:
-        """The environments that reset's options name; raises ValueError for other options."""
-        if not isinstance(options, Mapping) or options.keys() != {"reset_mask"}:
-            raise ValueError(f"options are {options!r}, must be a dictionary with only reset_mask")
-        mask = options["reset_mask"]
-        mask = torch.as_tensor(mask) if isinstance(mask, np.ndarray | Tensor) else torch.empty(0)
-        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
-            raise ValueError(f"reset_mask must be an array or a tensor, bool ({self.num_envs},)")
-        return mask.to(self.device)
 
     def render(self) -> Frames:
         """A frame (height, width, 3) of each environment.

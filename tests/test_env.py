@@ -145,35 +145,23 @@ def test_seed_decides_everything():
     assert not torch.equal(diffsim.make("hopper", num_envs=1).qpos, diffsim.make("hopper", num_envs=1).qpos)
 
 
-def test_reset_of_some():
-    """Those begin anew, gradients of the others go on, and so does the window."""
-    env, other = (diffsim.make("hopper", num_envs=3, seed=2, horizon=3) for _ in range(2))
+def test_reset_begins_a_window_and_keeps_its_seed():
+    env = diffsim.make("hopper", num_envs=3, seed=2, horizon=2)
     actions = random_actions(env, 3).requires_grad_()
     env.step(actions[0])
-    other.step(actions[0])
-    obs, info = env.reset(options={"reset_mask": np.array([False, True, False])})
-    assert info == {} and env.episode_step.tolist() == [1, 0, 1]
-    assert_same(obs[::2], other._obs[::2])
-    assert (obs[1] != other._obs[1]).all() and obs[1, :5].abs().max() <= 0.05
-    total = env.step(actions[1])[0].sum()
-    (gradient,) = torch.autograd.grad(total, actions, retain_graph=True)
-    assert (gradient[0, [0, 2]] != 0).all() and (gradient[0, 1] == 0).all() and (gradient[1] != 0).all()
     assert env.np_random_seed == 2
-    env.reset(options={"reset_mask": torch.tensor([True, True, True])})
-    torch.autograd.grad(total, actions)  # still possible: no new window has begun
-    env.reset(seed=np.int64(5))
+    _, info = env.reset(seed=np.int64(5))
+    assert info == {} and env.episode_step.tolist() == [0, 0, 0] and env.np_random_seed == 5
     assert_same(env.qpos, diffsim.make("hopper", num_envs=3, seed=5).qpos)
-    assert env.np_random_seed == 5 and env.episode_step.tolist() == [0, 0, 0]
+    env.step(actions[1])
+    (gradient,) = torch.autograd.grad(env.step(actions[2])[0].sum(), actions)  # of a window of two
+    assert (gradient[0] == 0).all() and (gradient[1:] != 0).any()
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        *(
-            (dict(options={"reset_mask": mask}), r"bool \(2,\)")
-            for mask in (torch.ones(3), np.ones(3, bool), "all", None)
-        ),
-        *((dict(options=options), "with only reset_mask") for options in (5, {"mask": np.array([True, False])})),
+        *((dict(options=options), "but reset takes none") for options in (5, {"mask": True})),
         *((dict(seed=seed), "must be one integer of 64 bits") for seed in (True, 1.5, "a", [1, 2], 10**30)),
     ],
 )
@@ -254,7 +242,6 @@ def test_what_a_caller_has_is_his_own():
     given, state = [x.clone() for x in (env.qpos, env.qvel)], env.state_dict()
     calls = {
         "reset": lambda: env.reset(seed=1)[0],
-        "reset of some": lambda: env.reset(options={"reset_mask": torch.tensor([True, False, False])})[0],
         "step": lambda: env.step(torch.zeros(3, 3))[0],
         "detach": env.detach,
         "set_state": lambda: env.set_state(*given),

@@ -122,11 +122,6 @@ def test_a_batch_is_the_tensors_batch_in_arrays() -> None:
         ends += arrays[2].sum()
         arrays[0][:], info["final_obs"][:] = 0, 0
     assert ends > 2
-    mask = np.array([True, False, True, False])
-    before = plain._obs.clone()
-    some, info = env.reset(options={"reset_mask": mask})
-    assert info == {} and (some[mask] != before.numpy()[mask]).any(1).all()
-    np.testing.assert_array_equal(some[~mask], before[torch.from_numpy(~mask)])
 
 
 def test_actions_of_other_types_and_seeds() -> None:

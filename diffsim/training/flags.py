@@ -24,8 +24,8 @@ ClipFile = Annotated[
     tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar="FILE",
-        instance_from_str=lambda words: read_clip(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, Clip),
+        instance_from_str=lambda words: words[0],  # which _cli reads: tyro's complaints have many lines
+        is_instance=lambda value: value is None or isinstance(value, Clip | str),
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
@@ -255,6 +255,10 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
     args = tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
+    try:
+        args.clip = read_clip(args.clip) if isinstance(args.clip, str) else args.clip
+    except ValueError as error:
+        fail(f"--clip: {error}")
     for name in ("resume", "evaluate"):
         if (path := getattr(args, name)) and path.is_dir():
             setattr(args, name, path / "checkpoint.pt")

@@ -50,13 +50,13 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
     (one,) = paper.wanted(paper.Args(only=("headline",), learners=("sapo",), env=("hopper",), seeds=(4,)))
     assert one == paper.Cell("h200", "sapo", "hopper", 4) and one.timed
     assert not paper.Cell("cpu", "shac_fast", "cartpole", 1).timed and paper.Cell("cpu", "shac", "cartpole", 1).timed
-    some = list(paper.wanted(paper.Args(only=("headline", "large_batch"), env=("humanoid_mtu",), seeds=(2, 4))))
+    some = list(paper.wanted(paper.Args(only=("headline", "large_batch"), env=("humanoid",), seeds=(2, 4))))
     assert {(cell.learner, cell.seed) for cell in some} == {
         *((learner, seed) for learner in ("shac", "sapo", "ppo_4096") for seed in (2, 4)),
         ("sac_large", 2),
     }
     (cell,) = (cell for cell in some if cell.learner == "sac_large")
-    command = "python sac_baseline.py --env humanoid_mtu --seed 2 --device cuda --large-batch --accuracy fast"
+    command = "python sac_baseline.py --env humanoid --seed 2 --device cuda --large-batch --accuracy fast"
     assert cell.command == f"{command} --iterations 400"
 
 

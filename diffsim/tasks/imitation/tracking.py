@@ -23,6 +23,7 @@ from diffsim.tasks.locomotion import push, rotate, score
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
 
 SMOOTH = 5  # frames of 1/60 s whose mean a frame of the reference is
+SWIFTEST = 10.0  # m/s
 STANDING = 0.05  # share of a clip's frames in which a foot may be in the ground: captured feet slip and sink
 REACH = 0.4  # rad, by how much an action changes a servo's target: its range is the clip's and so much to both sides
 BEFORE_END = 60  # frames, at least, that an episode has of its clip, if this is longer
@@ -87,7 +88,12 @@ class Tracking(Imitation):
         """A motion at the rate of control, smoothed, from above the origin on, with its feet on the ground."""
         motion.check(scene.mj_model)
         found = motion.smoothed(SMOOTH).at(self.control_dt)
-        rates = found.velocity(self.control_dt)[:, 6:].abs().amax(0)
+        qvel = found.velocity(self.control_dt)
+        rates, speed = qvel[:, 6:].abs().amax(0), qvel[:, :3].norm(dim=1).max()
+        if speed > SWIFTEST:
+            raise ValueError(
+                f"clip {motion}: the root moves by up to {speed:.3g} m/s; does it jump, or is it not in m?"
+            )
         if rates.max() > FASTEST:
             which = (
                 f"joint {scene.mj_model.joint(int(rates.argmax()) + 1).name!r} turns by up to {rates.max():.3g} rad/s"

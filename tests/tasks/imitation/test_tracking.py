@@ -80,7 +80,9 @@ def test_both_csv_forms_and_a_folder_are_the_motion_that_they_hold(tmp_path: Pat
 def test_bad_clips_are_refused_in_one_line(tmp_path: Path) -> None:
     good, fast, wide = sway(2, 60), sway(2, 60), sway(2, 60) * np.where(np.arange(36) < 7, 1, 10)
     fast[:, 22] = 2.6 * np.sin(10 * np.arange(len(fast)) / 60)  # of a shoulder; at twice the speed it is too fast
+    jump = np.concatenate((good[:60], good[60:] + np.eye(36)[0]))
     wrong = {
+        "clip bad: the root moves by up to 12.* m/s; does it jump, or is it not in m?": jump,
         "qpos has 28 columns, the robot has 36": good[:, :28],
         "is up to .* rad beyond its limits .*; are the angles in radians?": wide,
         "turns by up to .* rad/s, more than a motor's 40; is it played too fast?": fast,
