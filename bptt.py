@@ -74,7 +74,10 @@ class Args(ParallelFlags):
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only.
+
+    The policy sees the first `seen` numbers of an observation (None: all).
+    """
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()

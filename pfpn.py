@@ -226,7 +226,10 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
 
 
 class Actor(nn.Module):
-    """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations."""
+    """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations.
+
+    Both see the first `seen` numbers of an observation (None: all).
+    """
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()

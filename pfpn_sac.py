@@ -187,7 +187,10 @@ def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
 
 
 class Actor(nn.Module):
-    """pi(a|s), of normalized observations."""
+    """pi(a|s), of normalized observations.
+
+    The policy sees the first `seen` numbers of an observation (None: all).
+    """
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()

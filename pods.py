@@ -101,7 +101,10 @@ class Args(Flags):
 
 
 class Actor(nn.Module):
-    """The deterministic policy a = tanh(u(s))."""
+    """The deterministic policy a = tanh(u(s)).
+
+    The policy sees the first `seen` numbers of an observation (None: all).
+    """
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()

@@ -103,7 +103,10 @@ class Args(SymmetricFlags):
 
 
 class ActorCritic(nn.Module):
-    """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features."""
+    """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features.
+
+    The policy sees the first `seen` numbers of an observation (None: all). A mirror makes it symmetric.
+    """
 
     def __init__(
         self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None

@@ -120,7 +120,10 @@ class Args(ParallelFlags):
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
+    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state.
+
+    The policy sees the first `seen` numbers of an observation (None: all).
+    """
 
     def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
         super().__init__()

@@ -138,7 +138,10 @@ class Args(WindowFlags):
 
 
 class Actor(nn.Module):
-    """pi(a|s) of K members, tanh of a Gaussian. Observations are normalized by the statistics of all members."""
+    """pi(a|s) of K members, tanh of a Gaussian. Observations are normalized by the statistics of all members.
+
+    The policy sees the first `seen` numbers of an observation (None: all). A mirror makes it symmetric.
+    """
 
     def __init__(
         self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None

@@ -107,7 +107,10 @@ class Args(WindowFlags):
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only.
+
+    The policy sees the first `seen` numbers of an observation (None: all). A mirror makes it symmetric.
+    """
 
     def __init__(
         self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None

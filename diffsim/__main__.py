@@ -77,10 +77,13 @@ def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None
     print(f"video: {evaluation.save_video(output)}")
 
 
+def shipped_tasks() -> list[str]:
+    return [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
+
+
 def shipped(task: str) -> Path:
     """The shipped policy of a task."""
-    there = [name for name in TASKS if (POLICIES / f"{name}.pt").is_file()]
-    if task not in there:
+    if task not in (there := shipped_tasks()):
         fail(f"no policy for {task} is shipped; there are: {', '.join(there) or 'none'}")
     return POLICIES / f"{task}.pt"
 
@@ -176,18 +179,7 @@ def report() -> str:
         except (RuntimeError, ValueError) as error:
             machine[name] = "none"
             hints.append(str(error))
-    blocks = describe_tasks(), [f"{name:<10} {text}" for name, text in machine.items()], [f"! {hint}" for hint in hints]
-    return "\n\n".join("\n".join(block) for block in blocks if block)
-
-
-def describe_tasks() -> list[str]:
-    lines = [f"{'task':<18} {'obs':>4} {'act':>4}  {'episode':<18} {'substeps':>8}  demo"]
-    for name, task in TASKS.items():
-        episode = f"{task.episode_length} steps, {task.episode_length * task.control_dt:.1f} s"
-        demo = "yes" if (POLICIES / f"{name}.pt").is_file() else "-"
-        numbers = f"{task.obs_dim:>4} {task.load_robot().nu:>4}  {episode:<18} {task.substeps:>8}"
-        lines.append(f"{name:<18} {numbers}  {demo}")
-    return lines
+    return "\n".join([*(f"{name:<10} {text}" for name, text in machine.items()), *(f"! {hint}" for hint in hints)])
 
 
 def describe_machine() -> dict[str, str]:
@@ -199,22 +191,20 @@ def describe_machine() -> dict[str, str]:
         "diffsim": f"{own[0]}, {PACKAGE}",
         "versions": ", ".join([f"python {platform.python_version()}", *packages]),
         "devices": "; ".join([f"cpu, {available_cores()} cores", *devices]),
+        "tasks": ", ".join(TASKS),
+        "policies": ", ".join(shipped_tasks()),
     }
 
 
 def find_gpu_troubles() -> list[str]:
-    """Why there is no GPU on a machine that has a driver, with the remedy."""
-    driver, seen = startup.nvidia_driver() or shutil.which("nvidia-smi") is not None, torch.cuda.is_available()
-    shown = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if seen and not wp.is_cuda_available():
-        return ["torch sees a GPU and Warp does not: the driver is too old for Warp, see nvidia-smi"]
-    if seen or not driver:
+    """What to look at on a machine that has a driver where torch or Warp sees no GPU."""
+    sees = {"torch": torch.cuda.is_available(), "Warp": wp.is_cuda_available()}
+    if all(sees.values()) or not (startup.nvidia_driver() or shutil.which("nvidia-smi")):
         return []
-    if torch.version.cuda is None:
-        return ["this torch is a build for the CPU: see https://pytorch.org/get-started for one with CUDA"]
-    if shown is not None:
-        return [f"torch sees no GPU with CUDA_VISIBLE_DEVICES={shown!r}: unset it"]
-    return [f"torch sees no GPU: the driver may be older than CUDA {torch.version.cuda}, see nvidia-smi"]
+    blind = " and ".join(name for name, there in sees.items() if not there)
+    shown = os.environ.get("CUDA_VISIBLE_DEVICES")
+    about = f"torch is built for CUDA {torch.version.cuda}, CUDA_VISIBLE_DEVICES is {shown}"
+    return [f"a driver, but no GPU for {blind}: {about}; see nvidia-smi and https://pytorch.org/get-started"]
 
 
 if __name__ == "__main__":

@@ -138,7 +138,7 @@ def test_actions_of_other_types_and_seeds() -> None:
     for action in (plain.astype(complex), plain.astype(object), plain.astype(str)):
         with pytest.raises(ValueError, match=f"array of {action.dtype}, must be one of real numbers"):
             env.step(action)
-    with pytest.raises(ValueError, match=r"action has shape \(2, 2\), must be \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"action is \(2, 2\) .*, must be a torch.Tensor of \(2, 3\)"):
         env.step(np.zeros((2, 2)))
     for kind in (gymnasium.make(HOPPER), env):
         for seed in (True, 1.5):

@@ -114,7 +114,7 @@ def test_from_another_directory(
     view.main([*film, there])
     assert (tmp_path / "a.mp4").is_file()
     line = refusal(lambda: ppo_baseline.main(["--evaluate", str(path), "--env", "ant"]), capsys)
-    assert "has --env examples/own_robot.py, not ant" in line
+    assert "has --env examples/own_robot.py, which cannot change to ant" in line
 
 
 def test_flags_of_an_own_task(home: Path) -> None:

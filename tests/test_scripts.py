@@ -39,7 +39,7 @@ SCALARS = {
 }
 COMMON_SCALARS = (
     "charts/episodic_return charts/episodic_length charts/SPS eval/return eval/length grad/norm grad/skipped "
-    "sim/nonfinite sim/nonfinite_gradients time/total"
+    "sim/nonfinite sim/nonfinite_gradients time/evaluation time/total"
 )
 
 
@@ -131,7 +131,8 @@ def test_files_of_a_run(script, trained, checkpoint):
             first = arguments[{"charts_learning_rate": "lr"}.get(name, name.removeprefix("charts_"))]
             rates = [first + (arguments["final_lr"] - first) * k / 10 for k in range(10)]
             assert [float(row[name]) for row in rows] == pytest.approx(rates, rel=1e-5)
-    late = {name for name in rows[0] if name.startswith("eval")} | {"return", "length"}
+    assert [bool(row["time_evaluation"]) for row in rows] == [bool(row["eval_return"]) for row in rows]
+    late = {name for name in rows[0] if name.startswith("eval")} | {"return", "length", "time_evaluation"}
     assert all(row[name] for row in rows for name in row.keys() - late)
 
     scalars = set(f"{COMMON_SCALARS} {SCALARS[script.__name__]}".split())

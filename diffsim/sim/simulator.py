@@ -272,18 +272,13 @@ class Simulator:
 
     def check_tensor(self, name: str, value: torch.Tensor, *size: int) -> None:
         """Raise ValueError unless value is a (num_envs, *size) tensor of the simulator's dtype on its device."""
-        if not isinstance(value, torch.Tensor):
-            raise ValueError(f"{name} is a {type(value).__name__}, must be a torch.Tensor")
-        refuse_transforms(value)
-        wanted, bodies = (self.num_envs, *size), "bodies, " * (len(size) - 1)
-        if tuple(value.shape) != wanted:
-            raise ValueError(
-                f"{name} has shape {tuple(value.shape)}, must be {wanted} (environments, {bodies}numbers each)"
-            )
-        if value.dtype != self.dtype:
-            raise ValueError(f"{name} has dtype {value.dtype}, must be {self.dtype}")
-        if value.device != self.device:
-            raise ValueError(f"{name} is on {value.device}, must be on {self.device}")
+        found: tuple[object, ...] = (type(value).__name__,)
+        if isinstance(value, torch.Tensor):
+            refuse_transforms(value)
+            found = tuple(value.shape), value.dtype, value.device
+        if found != (wanted := ((self.num_envs, *size), self.dtype, self.device)):
+            have, must = (" ".join(map(str, each)) for each in (found, wanted))
+            raise ValueError(f"{name} is {have}, must be a torch.Tensor of {must}")
 
     def _check_given(self, name: str, value: torch.Tensor, *size: int) -> torch.Tensor:
         """Factors or forces; raises ValueError unless they are finite, and factors not negative, divisors positive."""

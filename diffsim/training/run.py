@@ -38,8 +38,8 @@ Metrics = dict[str, Tensor]
 
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
 TOLD = {  # totals, and how a message tells that they have doubled
-    "grad/skipped": "updates skipped so far because of their gradients",
-    "sim/unconverged": "control steps so far in which Newton's method did not converge",
+    "grad/skipped": "updates skipped so far because of their gradients: {:.0f}; if many, shorten --horizon",
+    "sim/unconverged": "control steps so far in which Newton's method did not converge: {:.0f}; give more --passes",
 }
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 RANK_SEED = 1_000_003  # between the seeds of two ranks
@@ -304,7 +304,7 @@ class Run:
         for name, text in TOLD.items():
             if (total := scalars.get(name, 0.0)) > 2 * self._told[name]:
                 self._told[name] = total
-                self.message(f"iteration {record.iteration}: {text}: {total:.0f}")
+                self.message(f"iteration {record.iteration}: {text.format(total)}")
         if self._log is not None:
             with self._writing():
                 self._log.write(record.iteration, self.control_steps, self.seconds, scalars)

@@ -8,10 +8,9 @@ from pathlib import Path
 import gps_controllers as controllers
 import pytest
 import torch
-from common import DOCS, RESULTS
 from gps_variants import named_terrains
 from learners import run
-from tables import markdown, read_csv
+from tables import read_csv
 
 import gps
 
@@ -83,13 +82,6 @@ def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
     first, second = controllers.table(rows)
     assert first == {"terrain": "a", "rough": "80% / 0% / 50%", "incline": "50% / 25% / 100%"}
     assert second["rough"] == "100% / 0% / 50%"
-
-
-def test_the_page_has_the_tables_of_the_csv_files() -> None:
-    page, folder = (DOCS / "gps.md").read_text(), RESULTS / "cpu"
-    terrain = markdown(controllers.table(read_csv(folder / "gps_controllers.csv")))
-    rates = markdown(controllers.rates(read_csv(folder / "gps_stability.csv")))
-    assert f"<!-- gps terrain -->\n{terrain}<!--" in page and f"<!-- gps stability -->\n{rates}<!--" in page
 
 
 def test_growth_is_the_largest_exponent() -> None:

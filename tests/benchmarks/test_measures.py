@@ -126,6 +126,15 @@ def test_of_each_state_the_fastest_turn_counts_and_over_states_the_median() -> N
     assert found == {"ours": {"forward": 5.0}}
 
 
+def test_microseconds_count_for_a_substep_of_one_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = {"mj_step": 640.0, "forward": 320.0, "backward": 1280.0}  # of 2 x 16 substeps
+    monkeypatch.setattr(speed, "race", lambda competitors, *_: dict.fromkeys(competitors, times))
+    first, second = speed.measure_physics(parse(speed.Args, None, ["--num-envs", "2", "--states", "1"]), "hopper")
+    assert (first["scene"], second["scene"]) == ("", "rough ground")
+    columns = "forward (us/substep)", "backward (us/substep)", "mj_step, one core (us/substep)", "mj_step/forward"
+    assert [first[column] for column in columns] == pytest.approx([10, 40, 20, 2])
+
+
 def test_a_line_for_each_value_by_its_x() -> None:
     rows = [{"n": "64", "us": "2", "task": "ant"}, {"n": "8", "us": "1", "task": "ant"}]
     first, second = lines([*rows, {"n": "8", "us": "3", "task": "hopper"}], "n", "us", "task")
