@@ -42,7 +42,7 @@ COLUMNS = ("horizon", "control_dt", "action_cost", "hidden", "noise", "tracking"
 PER_TASK: dict[str, tuple[float, ...]] = {
     "cartpole": (240, 1 / 60, 1e-3,  50, 0.10, 0.05, 1500),
     "hopper":   (500, 0.02,   1e-1,  50, 0.10, 0.05,  200),
-    "humanoid": (300, 1 / 60, 1e-1, 200, 0.10, 0.50, 5000),
+    "humanoid": (300, 1 / 60, 1e-1, 200, 0.10, 0.50, 1500),
     "swimmer":  (500, 0.05,   1e-2,  50, 0.10, 0.05,  200),
     "walker":   (500, 0.01,   1e-1,  50, 0.10, 0.50,   50),
 }

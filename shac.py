@@ -87,6 +87,8 @@ class Args(WindowFlags):
     """passes over the samples of a rollout to fit the critic"""
     critic_minibatches: Repeats = 4
     """minibatches of a pass, contiguous in time"""
+    inverse_variance: bool = False
+    """weight each step's gradient and that of the policy's density by their variances (arXiv 2604.18161)"""
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh (per task)"""
     initial_gain: Positive = 1.0
@@ -184,16 +186,36 @@ class SHAC:
     def update_actor(self) -> dict[str, Tensor]:
         """Act for a rollout, descend its loss (Eq. 5), and keep its samples for the critic."""
         args, normalizer = self.args, self.actor.normalizer
-        rollout = collect(self.env, self.actor, self.actor.sample_noise(args.horizon, self.env.num_envs))
+        noise = self.actor.sample_noise(args.horizon, self.env.num_envs)
+        if args.inverse_variance:
+            noise = noise.detach().requires_grad_()
+        rollout = collect(self.env, self.actor, noise)
         next_value = self.next_values(rollout)
         loss = actor_loss(rollout.reward, next_value, rollout.done, args.gamma)
-        norm = self.actor_optimizer.step(loss)
-        rollout = Rollout(*(tensor.detach() for tensor in rollout))
-        value = td_lambda(rollout.reward, next_value.detach(), rollout.done, args.gamma, args.td_lambda)
+        seen = Rollout(*(tensor.detach() for tensor in rollout))
+        value = td_lambda(seen.reward, next_value.detach(), seen.done, args.gamma, args.td_lambda)
+        norm = self.actor_optimizer.step(self.weighted(loss, noise, seen, value) if args.inverse_variance else loss)
+        rollout = seen
         self.value.copy_(value.view(-1, 1))
         self.obs.copy_(normalizer(rollout.obs).flatten(0, 1))
         normalizer.update(rollout.obs)
         return {"losses/actor": loss.detach(), "grad/norm": norm, "charts/actor_lr": self.actor_optimizer.lr}
+
+    def weighted(self, loss: Tensor, noise: Tensor, rollout: Rollout, value: Tensor) -> Tensor:
+        """A loss whose gradient is, in each step, that of the loss and that of the policy's density, weighted.
+
+        Where gradients through the simulator scatter more, over the environments, the others count more.
+        """
+        (through,) = torch.autograd.grad(loss, noise)
+        obs, std = self.actor.normalizer(rollout.obs), self.actor.log_std.exp()
+        advantage = (
+            discounts(rollout.done, self.args.gamma, value.dtype)[0] * (value - self.target(obs).squeeze(-1)).detach()
+        )
+        advantage = (advantage - advantage.mean(1, keepdim=True)) / advantage.numel()
+        density = -advantage.unsqueeze(-1) * noise / std.detach().square()
+        off, other = (g.var(1, keepdim=True).sum(-1, keepdim=True) for g in (through, density))
+        gradient = torch.lerp(density, through, other / (other + off))
+        return (gradient.detach() * (self.actor.mean(obs) + noise.detach() * std / std.detach())).sum()
 
     def update_critic(self) -> dict[str, Tensor]:
         """Fit the critic to the rollout's TD(lambda) returns (Eq. 6), and let the target critic follow."""
@@ -233,12 +255,17 @@ def collect(env: DiffEnv, actor: Actor, noise: Tensor) -> Rollout:
 
 def actor_loss(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float) -> Tensor:
     """Eq. 5 of (H, N) steps: each environment's rollout is cut at its dones, and the discount restarts after them."""
-    t = torch.arange(len(reward), device=reward.device).unsqueeze(1)
+    discount, ends = discounts(done, gamma, reward.dtype)
+    return -(discount * reward + discount * gamma * ends * next_value).mean()
+
+
+def discounts(done: Tensor, gamma: float, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Of (H, N) steps gamma to the power of those since the start or the last done, and which ones end a rollout."""
+    t = torch.arange(len(done), device=done.device).unsqueeze(1)
     starts, ends = done.roll(1, 0), done.clone()
     starts[0] = ends[-1] = True
-    age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values  # steps since the start or the last done
-    discount = gamma ** age.to(reward.dtype)
-    return -(discount * reward + discount * gamma * ends * next_value).mean()
+    age = t - torch.where(starts, t, torch.zeros_like(t)).cummax(0).values
+    return gamma ** age.to(dtype), ends
 
 
 def td_lambda(reward: Tensor, next_value: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:

@@ -127,7 +127,7 @@ def table(rows: Rows) -> list[Row]:
     """A line for each kind of terrain, a column for each training: means over places, seeds; policy / DDP / TBDP."""
     result = list[Row]()
     for (kind,), here in grouped(rows, "kind").items():
-        line: dict[str, object] = {"terrain": kind}
+        line = dict[str, object](over=kind, **dict.fromkeys((row["variant"] for row in rows), ""))
         for (name,), own in grouped(here, "variant").items():
             kinds = grouped(own, "controller")
             line[name] = " / ".join(f"{mean(numbers(kinds[each,], 'walked')):.0%}" for each in CONTROLLERS)

@@ -12,10 +12,8 @@ travelling wave, a formula.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 
-import numpy as np
 import torch
 import tyro
 from torch import Tensor
@@ -80,7 +78,6 @@ class Args:
     terrain: tuple[str, ...] = ("level",)  # a trajectory over each, by the names of gps_variants.py
     steps: int = 520  # control steps
     settle: int = 0  # control steps before, from a start that is moved by 0.1 in all coordinates: of a cycle
-    starts: int = 1  # trajectories over each terrain; the second and later ones are moved by 0.1 times normal numbers
 
 
 def wave(x: Tensor) -> Tensor:
@@ -107,7 +104,7 @@ def main(args: Args) -> None:
     policy = load_policy(args.run / "checkpoint.pt").network.double() if args.run else None
     inputs = None if policy is None else len(policy.get_buffer("0.mean"))  # a humanoid's own ones may be fewer
     found = list[tuple[Tensor, Tensor]]()
-    for name, number in product(args.terrain, range(args.starts)):
+    for name in args.terrain:
         system = search.system if name == "level" else search.over(name)
 
         def act(t: int, x: Tensor, system: System = system) -> Tensor:
@@ -119,8 +116,7 @@ def main(args: Args) -> None:
 
         start = system.start()
         if args.settle:
-            normal = torch.randn((1, system.nd), generator=torch.Generator().manual_seed(number))
-            moved = system.retract(start, 0.1 * (normal if number else torch.ones_like(normal)).to(start))
+            moved = system.retract(start, torch.full((1, system.nd), 0.1).to(start))
             start = system.rollout(moved, args.settle, lambda t, x, act=act: act(0, x))[0][:, -1]  # type: ignore[misc]
             start[:, system.task.forward_column] = 0.0
         x, u, finite = system.rollout(start, args.steps, act)
@@ -130,7 +126,7 @@ def main(args: Args) -> None:
         print(f"{name}: {x[0, -1, 0] - x[0, 0, 0]:.2f} m, return {value:.1f}")
         found.append((x[0].float(), u[0].float()))
     x, u = (torch.stack(parts).squeeze(0) for parts in zip(*found, strict=True))
-    save_demonstration(search.system, x, u, args.to, terrain=np.repeat(args.terrain, args.starts))
+    save_demonstration(search.system, x, u, args.to, terrain=args.terrain)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array, Arra
     (T, n, nq), actions (T, n, nu), falls (n,)."""
     task, scene, n = in_double(case.env), case.env.scene, len(COMMANDS)
     late = args.latency / 1e3 / task.control_dt
-    task.disturbances = {"latency": (late, late), "push": (0.0, 0.0)}
+    task.disturbances = {**task.disturbances, "latency": (late, late)}
     push = pushes(args.push, task.control_dt, np.random.default_rng(1))
     rest = torch.tensor(task.start).double().expand(n, -1)  # the keyframe
     memory = task.begin(rest.new_full((n, task.num_random), 0.5))

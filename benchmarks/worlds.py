@@ -131,6 +131,8 @@ class OtherFile(MuJoCo):
         self, env: DiffEnv, num_envs: int, file: Path | None, friction: float, mass: float = 1.0, gains: float = 1.0
     ) -> None:
         own = env.scene.mj_model
+        if file and not file.is_file():
+            fail(f"no such file: {file}; MuJoCo Menagerie is at github.com/google-deepmind/mujoco_menagerie")
         model = copy.copy(own) if file is None else mujoco.MjModel.from_xml_path(str(file))
         model.geom_friction[:, 0] *= friction
         model.pair_friction[:, :2] *= friction

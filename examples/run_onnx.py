@@ -52,7 +52,7 @@ if __name__ == "__main__":
     parser.add_argument("--model", help="MJCF of the robot on a ground; by default that of this repository")
     parser.add_argument("--command", nargs=3, type=float, default=[0.5, 0, 0], help="vx, vy [m/s] and yaw rate [rad/s]")
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--video", help="an .mp4 in place of the window; needs imageio-ffmpeg")
+    parser.add_argument("--video", help="an .mp4 instead of the window; minutes without a GPU; needs imageio-ffmpeg")
     args = parser.parse_args()
     policy = InferenceSession(args.policy)
     told = policy.get_modelmeta().custom_metadata_map
@@ -72,6 +72,7 @@ if __name__ == "__main__":
                 renderer.update_scene(data, camera)
                 video.send(renderer.render())
             video.close()
+        print(args.video)
     else:
         with mujoco.viewer.launch_passive(model, next(states)) as viewer:
             while viewer.is_running() and next(states, None):

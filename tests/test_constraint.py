@@ -434,10 +434,10 @@ def test_neighbours_do_not_change_where_an_environment_converges(rng):
         sim.rewind()
         end = torch.cat(sim.step(*start), 1)
         all_of = torch.cat((end, *torch.autograd.grad(end.square().sum(), start)), 1)
-        found.append((all_of[list(order).index(3)], sim.passes[list(order).index(3)]))
+        found.append(torch.cat((all_of, sim.residual.unsqueeze(1)), 1)[list(order).index(3)])
         if len(found) == 1:
-            assert sim.passes.min() < 2 and sim.passes.max() > 4
-    assert all(torch.equal(a, found[0][0]) and b == found[0][1] for a, b in found)
+            assert sim.residual.max() > 100 * sim.residual.min()  # some have converged long before others
+    assert all(torch.equal(row, found[0]) for row in found)
 
 
 def test_steps_that_do_not_converge_are_counted():

@@ -143,6 +143,12 @@ def test_every_logged_metric_is_explained() -> None:
 
 
 @each_page
+def test_tables_have_at_most_seven_columns(page: Path) -> None:
+    for line in re.findall(r"^\|(?: ?:?-+:? ?\|)+$", page.read_text(), re.MULTILINE):
+        assert line.count("|") <= 8, f"{page.name}: {line}"
+
+
+@each_page
 def test_no_spread_of_a_single_seed(page: Path) -> None:
     assert not re.search(r"±\s*0(?![.\d])", page.read_text()), "the spread of one run is not 0: print the seed count"
 

@@ -107,6 +107,27 @@ def test_gradient_of_the_actor_loss_is_its_finite_difference() -> None:
     assert_derivatives(dict(policy.named_parameters()), loss, places, rel=5e-6)
 
 
+def test_gradients_that_scatter_count_less() -> None:
+    """Of rewards -|u|^2: where gradients spike, in the second step, those of the density stand in; both are right."""
+    learner, n = build("cartpole", "--inverse-variance", "--initial-log-std", "-0.5"), 100_000
+    generator = torch.Generator().manual_seed(3)
+    obs = torch.randn(2, n, learner.env.task.obs_dim, generator=generator)
+    noise = (0.6 * torch.randn(2, n, 1, generator=generator)).requires_grad_()
+    with torch.no_grad():
+        learner.actor.log_std.fill_(np.log(0.6))
+    parameters = [*learner.actor.mean.parameters(), learner.actor.log_std]
+    mean = learner.actor.mean(obs)
+    right = torch.autograd.grad(mean.square().mean() + learner.actor.log_std.mul(2).exp().mean(), parameters)
+    u = learner.actor.mean(obs) + noise
+    reward, nothing = -u.square().squeeze(-1), torch.zeros(2, n, dtype=torch.bool)
+    spike = 1e4 * torch.randn(n, 1, generator=generator) * torch.tensor([0.0, 1.0]).view(2, 1, 1)
+    rollout = shac.Rollout(obs, obs, reward.detach(), nothing, ~nothing)
+    loss = learner.weighted((spike * u).mean() - reward.mean(), noise, rollout, reward.detach())
+    found = torch.autograd.grad(loss, parameters)
+    off = torch.cat([(a - b).flatten() for a, b in zip(found, right, strict=True)]).norm()
+    assert off < 0.05 * torch.cat([g.flatten() for g in right]).norm()
+
+
 def test_the_critic_is_fitted_to_the_returns_and_the_target_follows_slowly() -> None:
     torch.manual_seed(0)
     learner = build("cartpole", "--critic-hidden", "8", "--target-alpha", "0.9", "--critic-iterations", "1")

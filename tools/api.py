@@ -16,7 +16,7 @@ HEAD = """# API
 and `NumpyVectorEnv`: [gymnasium.md](gymnasium.md). `read_clip`: [tracking.md](tracking.md#clips). `SceneError` and
 `TaskError` are `ValueError`s.
 """
-NAMES = "make DiffEnv Simulator Integration Task load_scene Scene".split()
+NAMES = "make DiffEnv Simulator Integration Task load_scene".split()
 # Methods that few programs need
 INTERNAL = """pin carry_over take_statistics advance check_tensor rewind tangent explicit replaced check load_robot
 scene bind presets integration falls metadata over ghost program disturb observe_with""".split()
@@ -51,7 +51,6 @@ def page() -> str:
         thing, kind = getattr(diffsim, name), isinstance(getattr(diffsim, name), type)
         doc = re.sub(r"\n\nExample:\n.*?(?=\n\n\w)", "", inspect.getdoc(thing) or "", flags=re.DOTALL)
         doc = re.sub(r"\n\n(Args|Raises):\n.*?(?=\n\n\w|\Z)", "", doc, flags=re.DOTALL) if kind else doc
-        doc = doc.split("\n\n")[0] if name == "Scene" else doc
         call = "" if isinstance(thing, type) and name != "Integration" else f"({signature(thing)})"
         parts.append(f"## {name}\n\n```python\ndiffsim.{name}{call}\n```\n\n```text\n{doc}\n```\n")
         if kind and (rows := [*members(thing)]):

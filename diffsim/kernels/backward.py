@@ -159,7 +159,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
                 ahead = own.q
                 if wp.static(IMPLICIT):
                     ahead = ahead + here.theta * here.h * own.qd
-                nodes[i].free = joint.actuation_free(m, k, nodes[i].driven, ahead, own.qd)
+                nodes[i].free = joint.actuation_free(m, k, nodes[i].motor, ahead, own.qd)
 
     @wp.func
     def partials(
@@ -398,10 +398,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         pull = wp.zeros(shape=PULLS, dtype=T)
         adj_pull = wp.zeros(shape=PULLS, dtype=T)
         if wp.static(CLAMP):
-            driven = wp.zeros(shape=SLOTS, dtype=T)
-            joint.drive(m, here, batch.ctrl, driven)
-            for i in range(1, here.n):
-                nodes[i].driven = driven[i]
+            joint.drive_again(m, here, batch.ctrl, nodes)
         if wp.static(MUSCLE):
             muscle.activate(m, here, batch.ctrl, pull)
         links[0].R = wp.identity(3, dtype=T)

@@ -223,7 +223,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         record: int,
         row0: int,
         ck: t.Checkpoint,
-        # out; with constraints the last columns of qvel_out are the residual and the number of passes
+        # out; with constraints the last column of qvel_out is the residual
         nonfinite: wp.array(dtype=wp.bool),
         unconverged: wp.array(dtype=int),
     ):
@@ -236,15 +236,11 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(MUSCLE):
             muscle.activate(m, here, batch.ctrl, pull)
         if wp.static(MOTOR):
-            motor = wp.zeros(shape=SLOTS, dtype=T)
-            joint.drive(m, here, batch.ctrl, motor)
-            for i in range(1, here.n):
-                motions[i].motor = motor[i]
+            joint.drive(m, here, batch.ctrl, motions)
         if wp.static(CONSTRAINED):
             free = wp.zeros(shape=SLOTS, dtype=Load)  # without constraints
             touches = wp.zeros(shape=SPHERES, dtype=Contact)
             residual = T(0.0)
-            count = T(0.0)
         root = state_of(m, here, batch, links, turn)
         for sub in range(substeps):
             here.row = row0 + sub
@@ -301,7 +297,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
                         sweep.inward(m, here, phase, ck, links, motions, loads)
                         root = sweep.accelerate(m, here, phase, ck, links, motions, loads[0], root)
                         if phase == NEWTON:
-                            count = count + by.going
                             root, by = newton.step_on(m, here, links, motions, touches, free, root, by)
                         else:
                             phase = phase + 1
@@ -339,7 +334,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         if wp.static(CONSTRAINED):
             residual = pick(T(0.0), broken, T(0.0), wp.sqrt(residual))
             write(batch.qvel_out, here.e, NV, residual)
-            write(batch.qvel_out, here.e, NV + 1, count)
             if here.lane == 0:
                 block.count(unconverged, here.e, pick(T(tolerance), residual, T(1.0), T(0.0)))
         write_state(m, here, broken, batch, links, turn, root)

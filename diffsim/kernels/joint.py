@@ -33,15 +33,20 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
     LIMIT = LIMIT and not spec.constrained
     VARIED, NU = spec.varied, spec.nu
 
-    @wp.func
-    def drive(m: Model, here: Lane, ctrl: t.array2, motor: t.Ts):
-        """Adds the motors' forces to the links' of a lane."""
-        for k in range(NU):
-            i = m.motor_slot[here.lane * NU + k]
-            motor[i] = motor[i] + T(m.gear[k]) * block.read(ctrl, here.e, k) + T(m.motor_bias[k])
-        if wp.static(VARIED):
-            for i in range(1, here.n):
-                motor[i] = here.motor * motor[i]
+    def drives(rows: type) -> wp.Function:
+        @wp.func
+        def drive(m: Model, here: Lane, ctrl: t.array2, links: rows):
+            """Adds the motors' forces to the links' of a lane; what drives other lanes' links is in slot 0."""
+            for k in range(NU):
+                i = m.motor_slot[here.lane * NU + k]
+                links[i].motor = links[i].motor + T(m.gear[k]) * block.read(ctrl, here.e, k) + T(m.motor_bias[k])
+            if wp.static(VARIED):
+                for i in range(1, here.n):
+                    links[i].motor = here.motor * links[i].motor
+
+        return drive
+
+    drive, drive_again = drives(t.Motions), drives(t.Nodes) if CLAMP else None
 
     @wp.func
     def unbounded(m: Model, i: int, motor: T, q: T, qd: T):

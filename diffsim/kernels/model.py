@@ -275,7 +275,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         "Contact": of(vec3="p jar f tried pushes Hs", mat3="H", T="D on"),
     }
     if "clamp" in spec.features:
-        structs["Node"] |= of(T="driven free")
+        structs["Node"] |= of(T="motor free")
     if spec.constrained:
         structs["Node"] |= of(vec6="B", T="rate")
         structs["Adjoint"] |= of(vec6="b")

@@ -60,15 +60,20 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
         return join(wp.transpose(R) * wp.spatial_top(v), wp.transpose(R) * point_velocity(v, x))
 
     @wp.func
+    def between(m: Model, links: Links, pair: int):
+        """A pair of links, and the second one's turn and place in the frame of the first."""
+        i = m.pair_link[2 * pair]
+        j = m.pair_link[2 * pair + 1]
+        R = wp.transpose(links[i].R)
+        return i, j, R * links[j].R, R * (links[j].x - links[i].x)
+
+    @wp.func
     def add_muscles(m: Model, here: Lane, pull: array, links: Links, loads: t.Loads):
         """Adds the muscles to the links' bias forces."""
         for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):
-            i = m.pair_link[2 * pair]
-            j = m.pair_link[2 * pair + 1]
+            i, j, turn, shift = between(m, links, pair)
             R = links[i].R
             x = links[i].x
-            turn = wp.transpose(R) * links[j].R
-            shift = wp.transpose(R) * (links[j].x - x)
             force = vec3()
             torque = vec3()
             for s in range(m.pair_begin[pair], m.pair_begin[pair + 1]):
@@ -87,12 +92,9 @@ def muscle_law(spec: KernelSpec) -> SimpleNamespace:
     ):
         """Adds the muscles' part of phi to the adjoints of the links and of pull."""
         for pair in range(m.lane_begin[here.lane], m.lane_begin[here.lane + 1]):
-            i = m.pair_link[2 * pair]
-            j = m.pair_link[2 * pair + 1]
+            i, j, turn, shift = between(m, links, pair)
             R = links[i].R
             x = links[i].x
-            turn = wp.transpose(R) * links[j].R
-            shift = wp.transpose(R) * (links[j].x - x)
             w = inward(R, x, nodes[j].W - nodes[i].W)
             force = vec3()
             torque = vec3()

@@ -57,7 +57,6 @@ class Simulator:
             zero gradient. Other environments do not change.
         residual: (N,) on MuJoCo's contact, the acceleration that Newton's method still misses after its last pass,
             relative to sqrt(1 + |qacc|^2), in the substep of the last step where it is largest. Zeros on soft contact.
-        passes: (N,) passes of Newton's method in the last step, mean over substeps. Zeros on soft contact.
         unconverged: (N,) int32, number of control steps so far that ended with a residual above the tolerance.
         nonfinite_gradients: (N,) int32, number of control steps so far whose adjoint was not finite and was set to 0.
     """
@@ -90,10 +89,7 @@ class Simulator:
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
-        self._end_widths = (
-            scene.nq,
-            scene.nv + 2 * how.constrained,
-        )  # with constraints columns for residual and passes
+        self._end_widths = scene.nq, scene.nv + how.constrained  # with constraints a column for the residual
         check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
         if how.constrained:
             scene = constrained(scene, control_dt / how.substeps)
@@ -134,12 +130,7 @@ class Simulator:
     @property
     def residual(self) -> torch.Tensor:
         """(N,) largest residual of Newton's method among the substeps of the last step; zeros on soft contact."""
-        return self._end[:, self.nq + self.nv :][:, :1].sum(1)
-
-    @property
-    def passes(self) -> torch.Tensor:
-        """(N,) mean passes of Newton's method per substep of the last step; zeros on soft contact."""
-        return self._end[:, self.nq + self.nv :][:, 1:].sum(1) / self.integration.substeps
+        return self._end[:, self.nq + self.nv :].sum(1)
 
     @property
     def factors(self) -> torch.Tensor:

@@ -60,7 +60,7 @@ class Task:
     randomise: ClassVar[tuple[str, ...]] = ()  # ranges that learners draw unless told otherwise, as in --randomise
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
-    # Ranges of what `disturb` does, by names that --randomise may give: "latency" [control steps], "push" [m/s]
+    # Ranges of what `disturb` does, by names of --randomise: "latency" [control steps], "push" [m/s], "pull" [m/s^2]
     disturbances: Mapping[str, tuple[float, float]] = MappingProxyType({})
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: float = 1 / 60  # s

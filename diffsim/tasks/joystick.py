@@ -24,6 +24,7 @@ from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides
 FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
 NEAR, SLIP = 0.01, 0.05  # m over the ground, within which a foot's speed counts as slip; (m/s)^2, the score's scale
 STANDING = 0.1  # share of commands that are zero; each of the three numbers of others is with the same probability
+SPIN = 20.0  # rad/s^2 of yaw for a pull of 1 m/s^2: torque that the ground's friction puts on turning feet
 # Noise of the sensors, uniform to both sides: joints [rad], rates [rad/s], angular and linear velocity, gravity
 JOINT_NOISE, RATE_NOISE, GYRO_NOISE, VELOCITY_NOISE, GRAVITY_NOISE = 0.03, 0.5, 0.2, 0.1, 0.05
 
@@ -102,6 +103,7 @@ class Joystick(Task):
         "motor=0.8:1.2",
         "latency=0:1",
         "push=0:1",
+        "pull=0:0.6",
     )
     substeps = 4
     control_dt = 0.02
@@ -110,8 +112,9 @@ class Joystick(Task):
     forward_column = None  # what counts is the command
     alive: ClassVar[float] = 4.0  # reward of a perfect step
     smooth: ClassVar[float] = 2.2  # weight of changes of the action
-    # By how much the actions of an episode come late; how large the pushes are that come at random
-    disturbances = MappingProxyType({"latency": (0.0, 0.0), "push": (0.0, 0.0)})
+    # By how much the actions of an episode come late; how large the pushes are that come at random; how steadily
+    # something pulls, as a slope, a load or rolling feet do [m/s^2]
+    disturbances = MappingProxyType({"latency": (0.0, 0.0), "push": (0.0, 0.0), "pull": (0.0, 0.0)})
 
     def __init_subclass__(cls) -> None:
         """Its sizes: those of what `begin`, `remember` and `observe_with` say, in their order; names are mjlab's."""
@@ -126,7 +129,7 @@ class Joystick(Task):
         legs = len(cls.robot.legs)
         cls.obs_parts = *seen, *private, ("feet_from_reference", legs), ("feet_slip", legs)
         cls.actor_dim, cls.obs_dim = (sum(size for _, size in parts) for parts in (seen, cls.obs_parts))
-        cls.num_memory, cls.num_noise, cls.num_random = 16 + 4 * n, 20 + 2 * n, 22 + 2 * n
+        cls.num_memory, cls.num_noise, cls.num_random = 19 + 4 * n, 20 + 2 * n, 25 + 2 * n
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         robot, n = self.robot, len(self.robot.joints)
@@ -180,10 +183,17 @@ class Joystick(Task):
 
     def begin(self, rand: Tensor) -> Tensor:
         """A command, a phase and a latency; no action yet."""
-        drawn, phase, late = rand[..., len(self.start) :].split((7, 1, 1), dim=-1)
-        (least, most), empty = self.disturbances["latency"], torch.zeros_like(phase)
-        nothing = empty.expand(*phase.shape[:-1], 4 * self._n + 9), least + (most - least) * late, empty, empty
-        return torch.cat((self._draw(drawn), phase, *nothing), dim=-1)
+        drawn, phase, late, steady = rand[..., len(self.start) :].split((7, 1, 1, 3), dim=-1)
+        least, most = self.disturbances["latency"]
+        nothing = torch.zeros_like(phase).expand(*phase.shape[:-1], 4 * self._n + 9)
+        parts = phase, nothing, least + (most - least) * late, self._pull(steady), nothing[..., :2]
+        return torch.cat((self._draw(drawn), *parts), dim=-1)
+
+    def _pull(self, rand: Tensor) -> Tensor:
+        """What pulls during an episode, (..., 3) of rand (..., 3): along x and y [m/s^2], about z [rad/s^2]."""
+        (least, most), (way, turn) = self.disturbances["pull"], (2.0 * rand[..., :2] - 1.0).split(1, dim=-1)
+        size = least + (most - least) * rand[..., 2:]
+        return size * torch.cat(((math.pi * way).cos(), (math.pi * way).sin(), SPIN * turn), dim=-1)
 
     def _draw(self, rand: Tensor) -> Tensor:
         """A command (..., 3) from rand (..., 7)."""
@@ -191,26 +201,29 @@ class Joystick(Task):
         return (2.0 * size - 1.0) * self._most * kept * some
 
     def remember(self, memory: Tensor, action: Tensor, noise: Tensor) -> Tensor:
-        command, clock, last, _, late, _ = self._recall(memory)
+        command, clock, last, _, late, pull, _ = self._recall(memory)
         drawn, when, sensors, due = noise.split((7, 1, 9 + 2 * self._n, 3), dim=-1)
         command = torch.where(when < self.control_dt * FREQUENCY_OF_COMMANDS, self._draw(drawn), command)
         clock = (clock + self.control_dt * self.robot.cycle).remainder(1.0)
         kick = push(due, self.disturbances["push"], self.control_dt)
-        return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise, late, kick), dim=-1)
+        return torch.cat((command, clock, action, last, (2.0 * sensors - 1.0) * self._noise, late, pull, kick), dim=-1)
 
     def _recall(self, memory: Tensor) -> tuple[Tensor, ...]:
-        """Command, clock, the last action, the one before, latency, push; the noise lies before the last two."""
-        command, clock, last, before, _, late, kick = memory.split((3, 1, self._n, self._n, 9 + 2 * self._n, 1, 2), -1)
-        return command, clock, last, before, late, kick
+        """Command, clock, the last action, the one before, latency, pull, push; before the last three the noise."""
+        sizes = 3, 1, self._n, self._n, 9 + 2 * self._n, 1, 3, 2
+        command, clock, last, before, _, late, pull, kick = memory.split(sizes, -1)
+        return command, clock, last, before, late, pull, kick
 
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Pushes, and actions that come late: over a control step the mean of what the servos are given."""
+        """Pushes and pulls, and actions that come late: over a control step the mean of what the servos are given."""
         if not any(most for _, most in self.disturbances.values()):
             return qvel, action
-        *_, last, before, late, kick = self._recall(memory)
+        *_, last, before, late, pull, kick = self._recall(memory)
         whole = late.clamp(max=1.0)
         action = torch.lerp(torch.lerp(action, last, whole), before, late - whole)
-        return torch.cat((qvel[..., :2] + kick, qvel[..., 2:]), dim=-1), action
+        pull = self.control_dt * pull
+        moved = qvel[..., :2] + kick + pull[..., :2], qvel[..., 2:5], qvel[..., 5:6] + pull[..., 2:], qvel[..., 6:]
+        return torch.cat(moved, dim=-1), action
 
     def observe_with(self, qpos: Tensor, qvel: Tensor, action: Tensor, memory: Tensor) -> Tensor:
         """For the actor, with noise: linear and angular velocity, gravity's direction, in the body's frame; joints from
@@ -220,7 +233,7 @@ class Joystick(Task):
         position, quat, joints = qpos.split((3, 4, self._n), dim=-1)
         velocity, angular, rates = qvel.split((3, 3, self._n), dim=-1)
         command, clock, last, before, *_ = self._recall(memory)
-        noise = memory[..., 4 + 2 * self._n : -3]
+        noise = memory[..., 4 + 2 * self._n : -6]
         world = torch.stack((velocity, self._down.expand_as(velocity)), dim=-2)
         inverse = torch.cat((quat[..., :1], -quat[..., 1:]), dim=-1).unsqueeze(-2)
         velocity, gravity = rotate(inverse, world).unbind(dim=-2)
@@ -302,5 +315,5 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
-    alive, smooth, randomise = 2.5, 1.0, (*Joystick.randomise[:-1], "push=0:0.5")
+    alive, smooth, randomise = 2.5, 1.0, Joystick.randomise[:-1]
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise

@@ -119,7 +119,7 @@ class ParallelFlags(Flags):
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
     randomise: tuple[str, ...] = ()
-    """ranges from which environments draw: friction=0.7:1.3, stiffness, mass, motor; latency, push (per task)"""
+    """ranges from which environments draw: friction=0.7:1.3, stiffness, mass, motor; latency, push, pull (per task)"""
     redraw: Count = 10
     """iterations after which the ranges of --randomise are drawn again"""
     monitor: Natural = 50

@@ -80,7 +80,7 @@ def test_a_policy_is_shown_beside_the_guides_of_its_own_training() -> None:
     ]
     rows += [rows[0] | {"seed": "3", "walked": "0.4"}]
     first, second = controllers.table(rows)
-    assert first == {"terrain": "a", "rough": "80% / 0% / 50%", "incline": "50% / 25% / 100%"}
+    assert first == {"over": "a", "rough": "80% / 0% / 50%", "incline": "50% / 25% / 100%"}
     assert second["rough"] == "100% / 0% / 50%"
 
 

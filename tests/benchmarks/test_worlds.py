@@ -107,6 +107,8 @@ def test_another_file_of_the_robot_is_driven_as_the_task_s(tmp_path: Path) -> No
     assert (ends[2] - ends[0]).abs().max() < 0.05 * moved
     for servo in spec.actuators[3:5]:
         spec.delete(servo)
+    with pytest.raises(UsageError, match="no such file: .*nothing.xml"):
+        worlds.OtherFile(env, 2, tmp_path / "nothing.xml", 1.0)
     spec.compile()
     path.write_text(spec.to_xml())
     with pytest.raises(UsageError, match=r"motors\.xml: no actuator of the joints \w+, \w+$"):

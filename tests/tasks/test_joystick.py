@@ -11,7 +11,7 @@ from scenes import task_scene
 import diffsim
 from diffsim.env import DiffEnv
 from diffsim.tasks import TASKS
-from diffsim.tasks.joystick import NEAR, SLIP, Joystick
+from diffsim.tasks.joystick import NEAR, SLIP, SPIN, Joystick
 from diffsim.tasks.locomotion import FREQUENCY_OF_PUSHES, score
 
 NAMES = "go1", "go2", "g1"
@@ -127,17 +127,17 @@ def test_actions_come_late_and_the_robot_is_pushed() -> None:
     qvel, actions = torch.rand(400, 18, dtype=REAL), torch.rand(3, 400, n, dtype=REAL)
     same = task.disturb(qvel, action := actions[0], memory)
     assert same[0] is qvel and same[1] is action
-    task.disturbances = {"latency": (0.5, 2.0), "push": (0.2, 0.4)}
+    task.disturbances = {**task.disturbances, "latency": (0.5, 2.0), "push": (0.2, 0.4)}
     noise = torch.rand(3, 400, task.num_noise, dtype=REAL, generator=torch.Generator().manual_seed(1))
     noise[1, :, -3], noise[1, 0, -3] = 0.0, 1.0  # all are pushed, except one
     memory = task.begin(some(task, 400))
-    late = memory[:, -3:-2]
+    late = memory[:, -6:-5]
     assert 0.5 <= late.min() < 0.51 and 1.99 < late.max() <= 2
     for action, drawn in zip(actions[:2], noise, strict=False):
         memory = task.remember(memory, action, drawn)
     pushed, given = task.disturb(qvel, actions[2], memory)
     kick = pushed - qvel
-    assert torch.equal(memory[:, -3:-2], late) and (kick[0] == 0).all() and (kick[:, 2:] == 0).all()
+    assert torch.equal(memory[:, -6:-5], late) and (kick[0] == 0).all() and (kick[:, 2:] == 0).all()
     sizes = kick[1:].norm(dim=1)
     assert 0.2 <= sizes.min() < 0.21 and 0.39 < sizes.max() <= 0.4 and kick[1:, :2].mean(0).abs().max() < 0.05
     weights = torch.cat([(1 - (late - k).abs()).clamp(min=0) for k in range(3)], 1)
@@ -147,10 +147,26 @@ def test_actions_come_late_and_the_robot_is_pushed() -> None:
     assert share == pytest.approx(task.control_dt * FREQUENCY_OF_PUSHES, rel=0.2)
 
 
+def test_robots_are_pulled_steadily() -> None:
+    """In a direction of each episode, and about the vertical axis by as much as it says."""
+    task = task_of("go2")
+    task.disturbances = {**task.disturbances, "pull": (0.2, 0.4)}
+    memory, qvel = task.begin(some(task, 400)), torch.rand(400, 18, dtype=REAL)
+    for drawn in torch.rand(5, 400, task.num_noise, dtype=REAL):
+        pulled, _ = task.disturb(qvel, torch.zeros(400, 12, dtype=REAL), memory)
+        change = (pulled - qvel) / task.control_dt
+        memory = task.remember(memory, torch.zeros(400, 12, dtype=REAL), drawn)
+        size = change[:, :2].norm(dim=1)
+        assert 0.2 <= size.min() < 0.21 and 0.39 < size.max() <= 0.4 and change[:, :2].mean(0).abs().max() < 0.05
+        spin = change[:, 5] / (SPIN * size)
+        assert -1 <= spin.min() < -0.95 and 0.95 < spin.max() <= 1
+    assert change[:, 2:5].abs().max() < 1e-12 and change[:, 6:].abs().max() < 1e-12
+
+
 def test_gradients_pass_the_disturbances() -> None:
     """A command that comes a control step late moves the robot in the next one."""
     env = diffsim.make("go2", 4, seed=3, horizon=3)
-    env.task.disturbances = {"latency": (1.0, 1.0), "push": (0.5, 0.5)}
+    env.task.disturbances = {**env.task.disturbances, "latency": (1.0, 1.0), "push": (0.5, 0.5)}
     env.reset(seed=3)
     actions = torch.zeros(3, 4, 12).requires_grad_()
     states = [(env.step(action), env.qvel)[1] for action in actions.unbind()]
@@ -174,8 +190,8 @@ def test_memory_holds_command_clock_actions_and_noise() -> None:
     torch.testing.assert_close(after[::2, :3], task._most.expand(250, 3))
     torch.testing.assert_close(after[:, 3], (memory[:, 3] + 2 * 0.02 * task.robot.cycle) % 1.0)
     assert torch.equal(after[:, 4 : 4 + n], b) and torch.equal(after[:, 4 + n : 4 + 2 * n], a)
-    torch.testing.assert_close(after[:, 4 + 2 * n : -3], (0.5 * task._noise).expand(500, -1))
-    assert (after[:, -3:] == 0).all()  # no latency, no push
+    torch.testing.assert_close(after[:, 4 + 2 * n : -6], (0.5 * task._noise).expand(500, -1))
+    assert (after[:, -6:] == 0).all()  # no latency, no pull, no push
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -187,7 +203,7 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     qpos[:, 3:7] = np.sqrt(0.5) * torch.tensor([1.0, 0, 0, 1])
     velocity = torch.stack((qvel[:, 1], -qvel[:, 0], qvel[:, 2]), 1)
     memory = torch.rand(3, task.num_memory, dtype=REAL)
-    command, clock, last, before, noise, _ = memory.split((3, 1, n, n, 9 + 2 * n, 3), dim=-1)
+    command, clock, last, before, noise, _ = memory.split((3, 1, n, n, 9 + 2 * n, 6), dim=-1)
     obs = dict(zip(names, task.observe_with(qpos, qvel, last, memory).split(sizes, dim=-1), strict=True))
     down, joints = torch.tensor([0, 0, -1.0], dtype=REAL).expand(3, 3), qpos[:, 7:] - task._home
     sensed = dict(zip(names[:5], (velocity, qvel[:, 3:6], down, joints, 0.1 * qvel[:, 6:]), strict=True))
@@ -272,7 +288,7 @@ def test_the_image_follows_the_mirrored_command(name: str) -> None:
         torch.randn(n, 3, dtype=REAL, generator=generator),
         torch.rand(n, 1, dtype=REAL, generator=generator),
     )
-    noise, none = torch.randn(n, 9 + 2 * model.nu, dtype=REAL, generator=generator), torch.zeros(n, 3, dtype=REAL)
+    noise, none = torch.randn(n, 9 + 2 * model.nu, dtype=REAL, generator=generator), torch.zeros(n, 6, dtype=REAL)
     memory = torch.cat((command, clock, last, before, noise, none), dim=1)
     turned = command * torch.tensor([1.0, -1.0, -1.0]), (clock + 0.5) % 1.0
     sensed = mirror.obs(torch.cat((noise, torch.zeros(n, task.obs_dim - noise.shape[1], dtype=REAL)), 1))

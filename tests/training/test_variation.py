@@ -89,14 +89,14 @@ def test_disturbances_are_the_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     ranges = parse_ranges(asked, TASKS["go2"])
     env = diffsim.make("go2", 300, factors=True)
     Variation(env, ranges, 10, 1).set(1)
-    late = env.memory[:, -3]
+    late = env.memory[:, -6]
     assert 0.5 <= late.min() < 0.6 and 0.9 < late.max() <= 1 and env.task.disturbances["push"] == (0.0, 0.5)
     assert column(env, "mass").std() > 0.01 and (column(env, "motor") == 1).all()
     for item, message in (
         ("latency=0:3", "'latency=0:3': must be from 0 to 2, the smaller one first"),
         ("push=1:0.5", "'push=1:0.5': must be from 0 to inf, the smaller one first"),
         ("push=0:inf", "must be from 0 to inf"),
-        ("mu=1:2", "choose from friction, stiffness, mass, motor, latency, push"),
+        ("mu=1:2", "choose from friction, stiffness, mass, motor, latency, push, pull"),
     ):
         assert message in refusal(lambda item=item: shac.main(["--env", "go2", "--randomise", item]), capsys)
     assert "unknown 'push'" in refusal(lambda: shac.main(["--env", "ant", "--randomise", "push=0:1"]), capsys)
