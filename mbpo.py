@@ -57,6 +57,8 @@ HELD_OUT_BATCH = 1024
 class Args(ParallelFlags):
     """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
 
+    num_envs: Count = 64
+    """parallel environments N (per task)"""
     steps: Count = 16
     """control steps of an iteration"""
     seed_steps: Natural = 64

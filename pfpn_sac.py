@@ -64,6 +64,8 @@ class Args(ParallelFlags):
     dead: Decay = 0.05
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
 
+    num_envs: Count = 64
+    """parallel environments N (per task)"""
     horizon: Count = 32
     """control steps of a rollout"""
     hidden: SomeWidths = (512, 256)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import ClippedAdam, ObsNormalizer, Run, script
+from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import Chain, folded, make_even, mlp, seeing
 from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
@@ -103,6 +103,13 @@ class Args(WindowFlags):
         if self.device != "cpu":
             values |= ON_GPU.get(self.env, {})
         return super().task_defaults() | values | BEGINNING.get(self.env, {})
+
+    def check(self) -> None:
+        super().check()
+        if self.inverse_variance and self.deterministic_policy:
+            fail("--inverse-variance weights the density of a policy: one with --deterministic-policy has none")
+        if self.inverse_variance and self.num_envs < 2 * distributed.size():
+            fail("--inverse-variance takes variances over environments: --num-envs must be at least 2 per process")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

@@ -12,8 +12,7 @@ training, and a motor the torque that the task's servo would have. Nothing else 
 
 Writes tracking.csv, a row for each policy and world, or with --race tracking_race.csv, of checkpoints that were copied
 beside their run's progress.csv while it trained; with --update-results also the tables of docs/tracking.md. Trainings
-that shared a GPU have a folder whose name ends with _shared: their seconds do not count. What lies in a folder named
-ablation has a table of its own, by the runs' names.
+that shared a GPU have a folder whose name ends with _shared: their seconds do not count.
 """
 
 from __future__ import annotations
@@ -104,6 +103,10 @@ def least(rows: list[dict[str, str]]) -> str:
     return f"{min(found):.0%}" if (found := numbers(rows, "success")) else ""
 
 
+def alone(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    return [row for row in rows if "_shared/" not in row["checkpoint"]]
+
+
 def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str]], list[dict[str, str]]]]:
     """A policy's name for each clip, learner and machine, over seeds; its rows, and those with the file's friction and
     no push."""
@@ -118,30 +121,11 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each policy of one motion: medians over seeds on the file's friction. In brackets and of pushes the
     least share over seeds and frictions."""
     lines = list[Row]()
-    for policy, group, plain in groups([row for row in rows if row["motions"] == "1" and not is_ablation(row)]):
-        alone = [row for row in plain if "_shared/" not in row["checkpoint"]]
+    for policy, group, plain in groups([row for row in rows if row["motions"] == "1"]):
         calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
         lines.append(
             {"policy": policy, "seeds": len({row["checkpoint"] for row in group})}
-            | {"training (s)": middle(alone, "training s", ".0f")}
-            | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
-            | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
-        )
-    return lines
-
-
-def is_ablation(row: dict[str, str]) -> bool:
-    return row["checkpoint"].startswith("ablation/")
-
-
-def ablation(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each variant: success by friction, with and without pushes, and errors on the file's friction."""
-    lines = list[Row]()
-    for (name,), group in grouped(filter(is_ablation, rows), "checkpoint").items():
-        calm, pushed = ([row for row in group if (float(row["push"]) > 0) == push] for push in (False, True))
-        plain = [row for row in calm if float(row["friction"]) == 1]
-        lines.append(
-            {"variant": name.removeprefix("ablation/").replace("_", " "), "iterations": group[0]["iteration"]}
+            | {"training (s)": middle(alone(plain), "training s", ".0f")}
             | {"success": f"{middle(plain, 'success', '.0%')} ({least(calm)})", "pushed": least(pushed)}
             | {"joints (rad)": middle(plain, "joint error", ".3f"), "root (m)": middle(plain, "root error", ".3f")}
         )
@@ -152,7 +136,10 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
     """A line for each policy of several motions and what it was judged by, on the file's friction without pushes."""
     return [
         {"policy": policy, "motions": row["motions"], "success": f"{float(row['success']):.0%}"}
-        | {f"motions with {ENOUGH:.0%}": row["whole motions"], "training (s)": f"{float(row['training s']):.0f}"}
+        | {
+            f"motions with {ENOUGH:.0%}": row["whole motions"],
+            "training (s)": middle(alone([row]), "training s", ".0f"),
+        }
         | {"joints (rad)": row["joint error"], "root (m)": row["root error"]}
         for policy, _, plain in groups([row for row in rows if row["motions"] != "1"])
         for row in plain
@@ -162,11 +149,11 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
 def race(rows: list[dict[str, str]]) -> list[Row]:
     """Seconds of training until enough episodes succeed, from checkpoints along the way."""
     lines = list[Row]()
-    for (clip, learner, seed), group in grouped(rows, "clip", "learner", "seed").items():
+    for (_, learner, _), group in grouped(rows, "clip", "learner", "seed").items():
         group.sort(key=lambda row: float(row["training s"]))
         reached = (row["training s"] for row in group if float(row["success"]) >= ENOUGH)
         lines.append(
-            {"clip": clip, "learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner), "seed": seed}
+            {"learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner)}
             | {f"s to {ENOUGH:.0%}": next(reached, "never"), "in all (s)": group[-1]["training s"]}
             | {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
         )
@@ -180,7 +167,6 @@ def main(args: Args) -> None:
         return
     rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
     args.publish("many", markdown(many(rows)), PAGE)
-    args.publish("ablation", markdown(ablation(rows)), PAGE)
 
 
 if __name__ == "__main__":

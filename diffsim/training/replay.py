@@ -58,4 +58,7 @@ class ReplayBuffer(nn.Module):
         return self.rows[: min(int(self.count), self.size)]
 
     def set_extra_state(self, rows: Tensor) -> None:
+        """Raises a ValueError where they are of a buffer of another size that was full."""
+        if len(rows) != (filled := min(int(self.count), self.size)):
+            raise ValueError(f"{len(rows)} transitions, and a replay buffer that holds {filled}")
         self.rows[: len(rows)] = rows

@@ -154,7 +154,10 @@ class Run:
             torch.manual_seed(self.args.seed + rank * RANK_SEED)
         if state := self._state:
             own = state["ranks"][rank]
-            checkpoint.restore(learner, state, (self._env, own["env"]) if self._env is not None else None)
+            episodes = (self._env, own["env"]) if self._env is not None else None
+            if state["args"].get("clip") != self.args.clip:
+                episodes = None  # which stand on another clip's frames: new ones begin
+            checkpoint.restore(learner, state, episodes)
             self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]
             self.control_steps = state["control_steps"]

@@ -45,14 +45,11 @@ def test_tables_of_policies_variants_and_races() -> None:
     rows = [row | {"friction": f, "success": s} for f, s in (("0.7", "0.5"), ("1", "0.9"))]
     shared = row | {"checkpoint": "h100_shared/2", "friction": "1", "training s": "300"}
     several = row | {"checkpoint": "h100/all", "friction": "1", "motions": "44", "whole motions": "40"}
-    variant = row | {"checkpoint": "ablation/horizon_8", "friction": "1", "iteration": "600"}
-    (line,) = tracking.table([*rows, shared, several, variant])
+    (line,) = tracking.table([*rows, shared, several])
     assert (line["policy"], line["seeds"], line["training (s)"]) == ("walk, sapo, h100", 2, "100")
     assert (line["success"], line["pushed"]) == ("95% (50%)", "")
     (line,) = tracking.many([*rows, several, several | {"friction": "1.3"}])
     assert (line["motions"], line["motions with 95%"]) == ("44", "40")
-    (line,) = tracking.ablation([*rows, variant, variant | {"push": "0.5", "success": "0.5"}])
-    assert (line["variant"], line["success"], line["pushed"]) == ("horizon 8", "100% (100%)", "50%")
     way = [row | {"training s": str(s), "success": share} for s, share in ((90, "1"), (20, "0.5"), (60, "0.96"))]
     other = row | {"learner": "ppo --initial-log-std -1 in mujoco_warp", "success": "0.1"}
     sapo, ppo = tracking.race([*way, other])

@@ -100,6 +100,8 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
         ("--resume {trained}", "{trained}/checkpoint.pt is at iteration 2 already"),
         ("--resume {trained}/checkpoint.pt --iterations 20 --stop-after 2", "is at iteration 2 already"),
         ("--resume {file} --evaluate {file}", "--resume and --evaluate exclude each other"),
+        ("--inverse-variance --deterministic-policy", "--inverse-variance weights the density of a policy"),
+        ("--inverse-variance --num-envs 1", "--num-envs must be at least 2 per process"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp_path, capsys):

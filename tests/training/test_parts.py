@@ -153,6 +153,19 @@ def test_a_checkpoint_holds_the_filled_rows_alone() -> None:
     assert torch.equal(copy.rows, young.rows) and copy.count == 3
 
 
+def test_a_full_buffer_keeps_its_size() -> None:
+    """In a larger one rows would be sampled that nothing has filled."""
+    old, young = ReplayBuffer(4, 2, 1), ReplayBuffer(4, 2, 1)
+    young.add(transitions(0, 1, 2))
+    for _ in range(2):
+        old.add(transitions(0, 1, 2))
+    for size in (3, 5):
+        with pytest.raises(ValueError, match=f"4 transitions, and a replay buffer that holds {size}"):
+            ReplayBuffer(size, 2, 1).load_state_dict(old.state_dict())
+        (copy := ReplayBuffer(size, 2, 1)).load_state_dict(young.state_dict())  # not full: any that has room
+        assert torch.equal(copy.rows[:3], young.rows[:3])
+
+
 def test_more_than_it_keeps_is_refused() -> None:
     buffer = ReplayBuffer(3, 2, 1)
     with pytest.raises(ValueError, match="4 transitions at once do not fit into a replay buffer of 3"):

@@ -12,10 +12,12 @@ from scenes import task_scene
 from torch import Tensor
 
 import diffsim
+import ppo_baseline
 from diffsim import Clip, read_clip
 from diffsim.tasks.imitation.task import STRAY
 from diffsim.tasks.imitation.tracking import AHEAD, BEFORE_END, REACH, STANDING, TURNED, G1Track
 from diffsim.tasks.locomotion import FREQUENCY_OF_PUSHES
+from diffsim.training import checkpoint
 
 REAL = torch.float64
 N = 29
@@ -251,6 +253,18 @@ def test_episodes_start_anywhere_but_near_an_end(tmp_path: Path) -> None:
     assert frames[:3] == [[199, 202], [200, 203], [200, 204]] and frames[-1] == [200, 226]  # held at the ends
     assert torch.equal(memory[:, 1 : 1 + N], action) and torch.equal(memory[:, 1 + N : -2], action - 1)
     assert not memory[:, -2:].any()
+
+
+def test_a_run_goes_on_with_a_shorter_clip_by_new_episodes(tmp_path: Path) -> None:
+    """Those of the checkpoint stand on frames that it lacks."""
+    clip = str(write_csv(tmp_path / "short.csv", sway(2, 30)))
+    flags = "--env g1_track --num-envs 8 --horizon 1 --minibatch-size 8 --eval-episodes 1 --eval-every 0 --randomise"
+    words = [*flags.split(), "--device", "cpu", "--quiet", "--iterations", "2", "--stop-after", "1"]
+    ppo_baseline.main([*words, "--run-dir", str(tmp_path)])
+    assert checkpoint.load(path := tmp_path / "checkpoint.pt")["ranks"][0]["env"]["memory"][:, 0].max() > 120
+    ppo_baseline.main(["--resume", str(tmp_path), "--clip", clip, "--stop-after", "2", "--quiet"])
+    state = checkpoint.load(path)
+    assert state["iteration"] == 2 and state["ranks"][0]["env"]["memory"][:, 0].max() <= 120
 
 
 def test_pushes_come_at_random_and_as_large_as_asked() -> None:
