@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import refusal, run
+from learners import assert_resumes, refusal, run
 from torch import Tensor, nn
 
 import diffsim
@@ -107,6 +107,18 @@ def test_all_weights_have_gradients(script: str) -> None:
     for function, result in zip(functions, (policy(obs), values(learner, obs)), strict=True):
         weights = [p for name, p in function.named_parameters() if "mean" not in name and "log_std" not in name]
         assert all(g.abs().sum() > 0 for g in torch.autograd.grad(result.square().sum(), weights))
+
+
+def test_training_keeps_it_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = "--env ant --symmetric --num-envs 2 --horizon 4 --iterations 4 --device cpu --quiet --eval-episodes 1"
+    whole = assert_resumes(shac, tmp_path, f"{flags} --actor-hidden 16 --critic-hidden 16 --eval-every 0", 2)
+    mirror, obs = TASKS["ant"]().mirror, torch.randn(20, 37)
+    policy = load_policy(tmp_path / "whole" / "checkpoint.pt").network
+    assert_alike(policy(mirror.obs(obs)), mirror.action(policy(obs)))
+    mean, var = (whole["modules"]["actor"][f"normalizer.{name}"] for name in ("mean", "var"))
+    assert torch.equal(mirror.obs(mean), mean) and torch.equal(var[mirror.obs.index], var) and mean.abs().max() > 0.1
+    words = ["--resume", str(tmp_path / "whole"), "--iterations", "5", "--no-symmetric"]
+    assert "the checkpoint does not fit the flags" in refusal(lambda: shac.main(words), capsys)
 
 
 @pytest.mark.gpu
