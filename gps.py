@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -61,6 +61,8 @@ EXAMPLES = ASSETS / "examples"  # by task; benchmarks/gps_examples.py records th
 @dataclass
 class Args(Flags):
     """The algorithm. Defaults are those of a task that is not in the table."""
+
+    fixed: ClassVar = ("horizon", "action_cost", "demonstration", "noise")
 
     iterations: Count = 80
     """iterations K of the policy search"""
@@ -362,8 +364,6 @@ class Search:
         for name in ("guides", "adapted"):
             guides = [LinearGaussian(*(part.to(self.system.device) for part in guide)) for guide in state[name]]
             setattr(self, name, guides)
-        if (steps := len(self.guides[0].u)) != self.args.horizon:
-            raise ValueError(f"--horizon is {steps}")
         self.grounds = [self.system] * len(self.guides)
         self.rng.set_state(state["rng"])
 

@@ -375,10 +375,9 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
         ("--env ant", "--demonstration must be an example for ant; shipped are those of cartpole, hopper, "),
         ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
         ("--evaluate {file}", "{file} is not a complete checkpoint of gps.py"),
-        (
-            "--resume {trained}/checkpoint.pt --horizon 9 --iterations 9",
-            "does not fit the flags, or the script as it is now: ",
-        ),
+        ("--resume {trained}/checkpoint.pt --horizon 9 --iterations 9", "--horizon 30, which cannot change to 9"),
+        ("--resume {trained}/checkpoint.pt --noise 0.3 --iterations 9", "--noise 0.1, which cannot change to 0.3"),
+        ("--resume {trained}/checkpoint.pt --demonstration {hopper}", "cannot change to {hopper}"),
         (
             "--resume {trained}/checkpoint.pt --hidden 9 --iterations 9",
             "does not fit the flags, or the script as it is now: ",

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -69,6 +69,8 @@ class RunFlags:
 @dataclass
 class Flags(RunFlags):
     """What every script takes: the task and how it is simulated as well. Each extends it by its hyperparameters."""
+
+    fixed: ClassVar[tuple[str, ...]] = ()  # flags of a script that --resume keeps
 
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
     """task: one of diffsim.TASKS, or a file with your own, my_task.py or my_task.py:Class (docs/own_robot.md)"""
@@ -238,9 +240,9 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
-    for name in FIXED:
+    for name in FIXED + (kind.fixed if args.resume else ()):
         own, wanted = (getattr(each, name, None) for each in (defaults, args))
-        if own != wanted:
+        if str(own) != str(wanted):  # a saved path is a text
             fail(f"{path} has {flag(name)} {own}, which cannot change to {wanted}")
     if args.resume:
         last = min(args.iterations, args.stop_after or args.iterations)
