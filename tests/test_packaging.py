@@ -25,13 +25,14 @@ BUILD = "from hatchling.build import build_{0}; build_{0}('dist')"  # as pip doe
 
 @pytest.fixture(scope="module")
 def repository() -> list[str]:
-    """The files that belong to it."""
+    """The files that belong to it; an environment in the clone's folder does not."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     try:
         listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("what belongs to the repository, git alone knows")
-    return sorted(name for name in listed if (ROOT / name).is_file())
+    environments = {path.parent.name for path in ROOT.glob("*/pyvenv.cfg")}
+    return sorted(name for name in listed if name.split("/")[0] not in environments and (ROOT / name).is_file())
 
 
 @pytest.fixture(scope="module")
