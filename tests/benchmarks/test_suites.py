@@ -14,6 +14,7 @@ from tables import read_csv
 import pfpn
 import pfpn_sac
 import ppo_baseline
+import sac_baseline
 import sapo
 import shac
 from diffsim.training import parse
@@ -25,6 +26,7 @@ SCRIPTS = {
     "ppo_baseline": ppo_baseline.Args,
     "shac": shac.Args,
     "sapo": sapo.Args,
+    "sac_baseline": sac_baseline.Args,
 }
 
 
@@ -33,7 +35,7 @@ def test_each_run_of_the_page_is_a_command(group: str, monkeypatch: pytest.Monke
     monkeypatch.chdir(ROOT)
     suite, runs = suites.SUITES[suites.GROUPS[group]], list(suites.cases(suites.Args(), group))
     for case in {case.flags: case for _, case in runs}.values():  # seeds share them
-        args = parse(SCRIPTS[case.script], ["--env", case.env, "--device", "cpu", *case.flags])
+        args = parse(SCRIPTS[case.script.partition("@")[0]], ["--env", case.env, "--device", "cpu", *case.flags])
         assert args.iterations > 1
     every = read_csv(RESULTS / suite.machine / f"{suite.csv}.csv")
     rows = [row for row in every if row["group"] == group]
