@@ -11,6 +11,7 @@ from common import RESULTS, ROOT
 from gps_variants import VariantArgs
 from tables import read_csv
 
+import mbpo
 import pfpn
 import pfpn_sac
 import ppo_baseline
@@ -21,6 +22,7 @@ from diffsim.training import parse
 
 SCRIPTS = {
     "benchmarks/gps_variants": VariantArgs,
+    "mbpo": mbpo.Args,
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,
     "ppo_baseline": ppo_baseline.Args,
