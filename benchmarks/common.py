@@ -21,6 +21,7 @@ from diffsim.sim.options import check_device
 from diffsim.tasks import TaskError, find_task
 from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
+from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
 
 RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
@@ -166,7 +167,8 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
     """The command line, checked before anything is measured; what follows "--" goes to the scripts that it runs."""
     words = [*(sys.argv[1:] if argv is None else argv), "--"]
     end = words.index("--")
-    args = tyro.cli(kind, args=words[:end], description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    with in_one_line():
+        args = tyro.cli(kind, args=words[:end], description=description, config=(tyro.conf.FlagCreatePairsOff,))
     args.arguments = tuple(words[end + 1 : -1])
     check_ranges(args)
     if args.output and args.update_results:
