@@ -17,7 +17,6 @@ that shared a GPU have a folder whose name ends with _shared: their seconds do n
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,7 +95,11 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         row |= {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
         row |= {"success": success.mean(), "whole motions": np.sum(each >= ENOUGH)}
         row |= {"joint error": joints.mean(), "root error": root.mean(), "root turn": turn.mean()}
-        yield about | training(case) | row | {"episodes": args.episodes}
+        row |= {"episodes": args.episodes}
+        if args.race:
+            given = case.saved.args
+            row["control steps"] = case.saved.iteration * given["num_envs"] * given["horizon"]
+        yield about | training(case) | row
 
 
 def least(rows: list[dict[str, str]]) -> str:
@@ -146,24 +149,31 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
     ]
 
 
-def race(rows: list[dict[str, str]]) -> list[Row]:
-    """Seconds of training until enough episodes succeed, from checkpoints along the way."""
+def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
+    """Control steps and seconds of training until enough episodes succeed, from checkpoints along the way, of a GPU's
+    only trainings; or of those that shared one, whose seconds do not count."""
     lines = list[Row]()
-    for (_, learner, _), group in grouped(rows, "clip", "learner", "seed").items():
-        group.sort(key=lambda row: float(row["training s"]))
-        reached = (row["training s"] for row in group if float(row["success"]) >= ENOUGH)
-        lines.append(
-            {"learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner)}
-            | {f"s to {ENOUGH:.0%}": next(reached, "never"), "in all (s)": group[-1]["training s"]}
-            | {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
-        )
+    rows = [row | {"run": row["checkpoint"].partition("/")[0]} for row in rows]
+    for (name,), group in grouped(rows, "run").items():
+        if name.endswith("_shared") != shared:
+            continue
+        group.sort(key=lambda row: int(row["iteration"]))
+        first = next((row for row in group if float(row["success"]) >= ENOUGH), None)
+        line = {"training": name.removesuffix("_shared").partition("__")[0].replace("_", " ")}
+        for column, source, unit in (("M steps", "control steps", 1e6), ("seconds", "training s", 1)):
+            line[f"{column} to {ENOUGH:.0%}"] = f"{float(first[source]) / unit:.3g}" if first else "never"
+        line |= {"in all": group[-1]["training s"], "last success": f"{float(group[-1]['success']):.0%}"}
+        lines.append(line | {"joints (rad)": group[-1]["joint error"], "root (m)": group[-1]["root error"]})
+        if shared:
+            del lines[-1][f"seconds to {ENOUGH:.0%}"], lines[-1]["in all"]
     return lines
 
 
 def main(args: Args) -> None:
     key = (*ABOUT[:-1], "clip", "file", "friction", "push")
     if args.race:
-        measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
+        rows = measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
+        args.publish("ablation", markdown(race(rows, shared=True)), PAGE)
         return
     rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
     args.publish("many", markdown(many(rows)), PAGE)

@@ -50,8 +50,21 @@ def test_tables_of_policies_variants_and_races() -> None:
     assert (line["success"], line["pushed"]) == ("95% (50%)", "")
     (line,) = tracking.many([*rows, several, several | {"friction": "1.3"}])
     assert (line["motions"], line["motions with 95%"]) == ("44", "40")
-    way = [row | {"training s": str(s), "success": share} for s, share in ((90, "1"), (20, "0.5"), (60, "0.96"))]
-    other = row | {"learner": "ppo --initial-log-std -1 in mujoco_warp", "success": "0.1"}
-    sapo, ppo = tracking.race([*way, other])
-    assert (sapo["learner"], sapo["s to 95%"], sapo["in all (s)"]) == ("sapo", "60", "90")
-    assert (ppo["learner"], ppo["s to 95%"], ppo["last success"]) == ("ppo in mujoco_warp", "never", "10%")
+    way = [
+        row
+        | {"checkpoint": f"sapo__1/at_{k}", "iteration": str(k), "control steps": f"{k}e5"}
+        | {"training s": str(k + 10), "success": share}
+        for k, share in ((90, "1"), (20, "0.5"), (60, "0.96"))
+    ]
+    never = way[1] | {"checkpoint": "ppo_in_mujoco_warp__1/at_20", "success": "0.1"}
+    shared = way[2] | {"checkpoint": "window_8__1_shared/at_60"}
+    sapo, ppo = tracking.race([*way, never, shared])
+    assert (sapo["training"], sapo["M steps to 95%"], sapo["seconds to 95%"], sapo["in all"]) == (
+        "sapo",
+        "6",
+        "70",
+        "100",
+    )
+    assert (ppo["training"], ppo["seconds to 95%"], ppo["last success"]) == ("ppo in mujoco warp", "never", "10%")
+    (window,) = tracking.race([*way, never, shared], shared=True)
+    assert (window["training"], window["M steps to 95%"]) == ("window 8", "6") and "in all" not in window
