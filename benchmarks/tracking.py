@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import common
@@ -111,13 +112,12 @@ def alone(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str]], list[dict[str, str]]]]:
-    """A policy's name for each clip, learner and machine, over seeds; its rows, and those with the file's friction and
+    """A policy's name for each clip, learner and device, over seeds; its rows, and those with the file's friction and
     no push."""
-    rows = [row | {"machine": row["checkpoint"].partition("/")[0].removesuffix("_shared")} for row in rows]
-    for (clip, learner, machine), group in grouped(rows, "clip", "learner", "machine").items():
+    for (clip, learner, device), group in grouped(rows, "clip", "learner", "device").items():
         name, drawn, _ = learner.partition(" --randomise")
         plain = [row for row in group if float(row["friction"]) == 1 and float(row["push"]) == 0]
-        yield f"{clip}, {name}, {machine}{'' if drawn else ', not randomised'}", group, plain
+        yield f"{clip}, {name}, {device}{'' if drawn else ', not randomised'}", group, plain
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
@@ -150,22 +150,24 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
-    """Control steps and seconds of training until enough episodes succeed, from checkpoints along the way, of a GPU's
-    only trainings; or of those that shared one, whose seconds do not count."""
+    """Control steps and seconds of training until enough episodes succeed, for the first time and for two checkpoints
+    in a row, of a GPU's only trainings; or of those that shared one, whose seconds do not count."""
     lines = list[Row]()
     rows = [row | {"run": row["checkpoint"].partition("/")[0]} for row in rows]
     for (name,), group in grouped(rows, "run").items():
         if name.endswith("_shared") != shared:
             continue
         group.sort(key=lambda row: int(row["iteration"]))
-        first = next((row for row in group if float(row["success"]) >= ENOUGH), None)
+        enough = [row for row in group if float(row["success"]) >= ENOUGH]
+        twice = [row for row, after in pairwise(group) if row in enough and after in enough]
         line = {"training": name.removesuffix("_shared").partition("__")[0].replace("_", " ")}
-        for column, source, unit in (("M steps", "control steps", 1e6), ("seconds", "training s", 1)):
-            line[f"{column} to {ENOUGH:.0%}"] = f"{float(first[source]) / unit:.3g}" if first else "never"
-        line |= {"in all": group[-1]["training s"], "last success": f"{float(group[-1]['success']):.0%}"}
-        lines.append(line | {"joints (rad)": group[-1]["joint error"], "root (m)": group[-1]["root error"]})
-        if shared:
-            del lines[-1][f"seconds to {ENOUGH:.0%}"], lines[-1]["in all"]
+        line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
+        if not shared:
+            for column, found in ((f"s to {ENOUGH:.0%}", enough), ("to stay (s)", twice)):
+                line[column] = found[0]["training s"] if found else "never"
+            line["in all (s)"] = group[-1]["training s"]
+        line |= {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
+        lines.append(line)
     return lines
 
 
