@@ -108,6 +108,9 @@ def test_bad_clips_are_refused_in_one_line(tmp_path: Path) -> None:
         ValueError, match=r"clips of .*empty are for several robots: their qpos have \{36, 30\}|\{30, 36"
     ):
         read_clip(empty)
+    write_csv(empty / "b.csv", wide)
+    with pytest.raises(ValueError, match="clip empty, file 2: joint '.*' is up to"):
+        diffsim.make("g1_track", 1, clip=f"{empty}:60")
     with pytest.raises(ValueError, match="task 'humanoid_imitation' tracks one motion, not the 2 of two"):
         motion = read_clip("humanoid_run").qpos
         diffsim.make("humanoid_imitation", 1, clip=Clip("two", torch.cat((motion, motion)), False, (24, 24)))
