@@ -133,6 +133,7 @@ class Case(NamedTuple):
         learner = " ".join((self.saved.script, *(args[name] for name in ("policy",) if name in args)))
         learner += "".join(f" --{name}" for name in ("symmetric", "randomise") if args.get(name))
         learner += f" --initial-log-std {first:g}" if (first := args.get("initial_log_std")) else ""
+        learner += f" --rough {slope:g}" if (slope := args.get("rough")) else ""
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
         values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
         return dict(zip(ABOUT, values, strict=True))
