@@ -145,7 +145,8 @@ def checkpoint_of(path: Path) -> Path:
 
 
 def load_case(path: Path, num_envs: int, device: str) -> Case:
-    """The policy of a checkpoint or of a run's; one of another task than ours ends the benchmark with one line."""
+    """The policy of a checkpoint or of a run's, on a plane; one of another task than ours ends the benchmark with one
+    line."""
     path = checkpoint_of(path)
     saved = load_policy(path)
     try:
@@ -153,7 +154,9 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
     except TaskError as error:
         fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
-    return Case(f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device))
+    return Case(
+        f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device, rough=0.0)
+    )
 
 
 def machine(device: str) -> str:

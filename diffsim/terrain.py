@@ -63,7 +63,7 @@ def uneven(degrees: float, count: int, seed: int = 0) -> Array:
     steepest slope grows evenly from profile to profile; the last one's is `degrees`.
     """
     seeds = np.random.default_rng(abs(seed)).integers(2**31, size=(count, 2))
-    steepest = np.linspace(degrees / count, degrees, count)
+    steepest = np.linspace(degrees / count, degrees, count).tolist()
     sides = (
         [rough(each, SEGMENT, most, LENGTH, LEVEL)[1:] for each in pair]
         for most, pair in zip(steepest, seeds.tolist(), strict=True)
