@@ -163,7 +163,7 @@ def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
         line = {"training": name.removesuffix("_shared").partition("__")[0].replace("_", " ")}
         line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
         if not shared:
-            for column, found in ((f"s to {ENOUGH:.0%}", enough), ("to stay (s)", twice)):
+            for column, found in ((f"s to {ENOUGH:.0%}", enough), ("twice in a row (s)", twice)):
                 line[column] = found[0]["training s"] if found else "never"
             line["in all (s)"] = group[-1]["training s"]
         line |= {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
