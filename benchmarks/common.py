@@ -133,6 +133,7 @@ class Case(NamedTuple):
         learner = " ".join((self.saved.script, *(args[name] for name in ("policy",) if name in args)))
         learner += "".join(f" --{name}" for name in ("symmetric", "randomise") if args.get(name))
         learner += f" --initial-log-std {first:g}" if (first := args.get("initial_log_std")) else ""
+        learner += f" --rough {slope:g}" if (slope := args.get("rough")) else ""
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
         values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
         return dict(zip(ABOUT, values, strict=True))
@@ -144,7 +145,8 @@ def checkpoint_of(path: Path) -> Path:
 
 
 def load_case(path: Path, num_envs: int, device: str) -> Case:
-    """The policy of a checkpoint or of a run's; one of another task than ours ends the benchmark with one line."""
+    """The policy of a checkpoint or of a run's, on a plane; one of another task than ours ends the benchmark with one
+    line."""
     path = checkpoint_of(path)
     saved = load_policy(path)
     try:
@@ -152,7 +154,9 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
     except TaskError as error:
         fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
-    return Case(f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device))
+    return Case(
+        f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device, rough=0.0)
+    )
 
 
 def machine(device: str) -> str:

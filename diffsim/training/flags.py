@@ -32,8 +32,11 @@ ClipFile = Annotated[
 FIXED = ("env", "seed", "num_envs", "control_dt")  # with --resume; what else must fit, `restore` tells
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
 OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination clip control_dt".split()}
-EVALUATED = OPTIONS - {"control_dt"} | {*"accuracy device eval_episodes evaluate finer quiet run_dir threads".split()}
+EVALUATED = OPTIONS - {"control_dt"} | {
+    *"accuracy device eval_episodes evaluate finer quiet rough run_dir threads".split()
+}
 ENV = f"task: {', '.join(TASKS)}, or a file of your own, my_task.py or my_task.py:Class (docs/own_robot.md)"
+Slope = Annotated[float, Range("from 0 to 45", lambda degrees: 0 <= degrees <= 45)]
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -124,6 +127,8 @@ class ParallelFlags(Flags):
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
     randomise: tuple[str, ...] = ()
     """ranges from which environments draw: friction=0.7:1.3, stiffness, mass, motor; latency, push, pull (per task)"""
+    rough: Slope = 0.0
+    """steepest slope of rough ground along x in degrees, another profile for each environment (0: a plane)"""
     redraw: Count = 10
     """iterations after which the ranges of --randomise are drawn again"""
     monitor: Natural = 50
