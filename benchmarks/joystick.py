@@ -225,8 +225,8 @@ def rough(rows: list[dict[str, str]]) -> list[Row]:
     rows = [row | {"trained on": row["learner"].partition(" --rough ")[2] or "0"} for row in rows]
     lines = list[Row]()
     for (task, slope, ground), group in sorted(grouped(rows, "task", "rough", "trained on").items()):
-        line = {"task": task, "slopes (degrees)": slope, "trained on": ground, "seeds": len(group)}
-        errors = {"error (m/s)": "error", "worst command (m/s)": "worst error", "yaw rate (rad/s)": "yaw error"}
+        line = {"task": task, "slopes up to": f"{slope}°", "trained on": f"{ground}°", "seeds": len(group)}
+        errors = {"error (m/s)": "error", "worst command (m/s)": "worst error"}
         line |= {"without a fall": with_worst(group, "whole", ".0%", min)}
         lines.append(line | {title: with_worst(group, column, ".3f", max) for title, column in errors.items()})
     return lines
