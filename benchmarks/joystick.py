@@ -221,14 +221,18 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def rough(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each steepest slope, and the ground on which policies were trained."""
+    """A line for each task, learner and ground of the training, with each ground of the judge."""
     rows = [row | {"trained on": row["learner"].partition(" --rough ")[2] or "0"} for row in rows]
-    lines = list[Row]()
-    for (task, slope, ground), group in sorted(grouped(rows, "task", "rough", "trained on").items()):
-        line = {"task": task, "slopes up to": f"{slope}°", "trained on": f"{ground}°", "seeds": len(group)}
-        errors = {"error (m/s)": "error", "worst command (m/s)": "worst error"}
-        line |= {"without a fall": with_worst(group, "whole", ".0%", min)}
-        lines.append(line | {title: with_worst(group, column, ".3f", max) for title, column in errors.items()})
+    rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
+    slopes, lines = sorted({row["rough"] for row in rows}, key=float), list[Row]()
+    for (task, learner, ground), group in sorted(grouped(rows, "task", "by", "trained on").items()):
+        own = {slope: [row for row in group if row["rough"] == slope] for slope in slopes}
+        line: dict[str, object] = {"task": task, "learner": learner, "trained on": f"{ground}°"}
+        line["seeds"] = len({row["checkpoint"] for row in group})
+        line |= {f"whole on {slope}°": with_worst(own[slope], "whole", ".0%", min) for slope in slopes}
+        lines.append(
+            line | {f"error (m/s) on {slope}°": with_worst(own[slope], "error", ".3f", max) for slope in slopes}
+        )
     return lines
 
 

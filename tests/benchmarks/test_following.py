@@ -87,8 +87,11 @@ def test_rough_ground_is_made_of_boxes_and_judged_apart(tmp_path: Path, capsys: 
     plane, hilly = read_csv(tmp_path / "joystick_rough.csv")
     assert (plane["rough"], hilly["rough"], plane["whole"]) == ("0", "15", "1")
     assert 0 < float(plane["error"]) < float(hilly["error"]) < 0.3
-    begins = [line.split(" | ")[:4] for line in out.splitlines()[-3:-1]]
-    assert begins == [["| go2", slope, "0°", "1"] for slope in ("0°", "15°")]
+    errors = " | ".join(f"{float(row['error']):.3f} ({float(row['error']):.3f})" for row in (plane, hilly))
+    assert "| seeds | whole on 0° | whole on 15° | error (m/s) on 0° | error (m/s) on 15° |" in out
+    assert f"| go2 | shac | 0° | 1 | 100% (100%) | 100% (100%) | {errors} |" in out
+    (line,) = joystick.rough([row | {"learner": "ppo --symmetric --rough 20"} for row in (plane, hilly)])
+    assert (line["learner"], line["trained on"]) == ("ppo", "20°")
     spec, profile = mujoco.MjSpec.from_file(TASKS["go2"].load_robot().path), uneven(15.0, 1)[0]
     flat, model = spec.compile(), worlds.on_terrain(spec, profile)
     floor, boxes = (m.geom_bodyid == 0 for m in (flat, model))
