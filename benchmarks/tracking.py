@@ -83,6 +83,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     clip = own.clip if args.clip is None else read_clip(args.clip)
     task = type(own)(dtype=torch.float64, clip=clip)
     task.bind(case.env.scene)
+    task.low, task.high = own.low.double(), own.high.double()  # other clips do not move the servos' range
     count, about = len(task.motions[0]), case.about
     if case.saved.simulator != HOME:
         about["learner"] = f"{about['learner']} in {case.saved.simulator}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 import tracking
 from torch import Tensor, nn
@@ -37,6 +38,13 @@ def test_who_stands_succeeds_and_who_is_to_fly_fails() -> None:
     success, (root, turn, joints) = tracking.track(saved, task, OtherFile(env, 6, None, 1.0), args)
     assert success.tolist() == [True] * 3 + [False] * 3
     assert (root[:3] < 0.05).all() and (root[3:] > 0.1).all() and (turn[:3] < 0.1).all() and (joints < 0.1).all()
+
+
+def test_another_clip_leaves_the_servos_their_range(tmp_path: Path) -> None:
+    karate = diffsim.read_clip("g1_karate").qpos[:91]  # whose joints move less than in all of it
+    np.savez(file := tmp_path / "beginning.npz", qpos=karate, fps=60, loop=False)
+    (row,) = tracking.measure(tracking.Args(clip=file, episodes=2, friction=(1.0,)), POLICIES / "g1_track.pt")
+    assert row["success"] == 1 and row["joint error"] < 0.05
 
 
 def test_tables_of_policies_variants_and_races() -> None:
