@@ -221,18 +221,17 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def rough(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each task, learner and ground of the training, with each ground of the judge."""
-    rows = [row | {"trained on": row["learner"].partition(" --rough ")[2] or "0"} for row in rows]
+    """A line for each number and ground, a column for each task, learner and ground of the training."""
     rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
-    slopes, lines = sorted({row["rough"] for row in rows}, key=float), list[Row]()
-    for (task, learner, ground), group in sorted(grouped(rows, "task", "by", "trained on").items()):
-        own = {slope: [row for row in group if row["rough"] == slope] for slope in slopes}
-        line: dict[str, object] = {"task": task, "learner": learner, "trained on": f"{ground}°"}
-        line["seeds"] = len({row["checkpoint"] for row in group})
-        line |= {f"whole on {slope}°": with_worst(own[slope], "whole", ".0%", min) for slope in slopes}
-        lines.append(
-            line | {f"error (m/s) on {slope}°": with_worst(own[slope], "error", ".3f", max) for slope in slopes}
-        )
+    rows = [row | {"on": f"{row['learner'].partition(' --rough ')[2] or 0}°"} for row in rows]
+    columns = {", ".join(key): group for key, group in sorted(grouped(rows, "task", "by", "on").items())}
+    lines = list[Row]()
+    for title, column, form, worst in (("whole", "whole", ".0%", min), ("error (m/s)", "error", ".3f", max)):
+        for slope in sorted({row["rough"] for row in rows}, key=float):
+            line = {"ground": f"{title}, {slope}°"}
+            for policy, group in columns.items():
+                line[policy] = with_worst([row for row in group if row["rough"] == slope], column, form, worst)
+            lines.append(line)
     return lines
 
 
