@@ -163,12 +163,14 @@ def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
         enough = [row for row in group if float(row["success"]) >= ENOUGH]
         twice = [row for row, after in pairwise(group) if row in enough and after in enough]
         line = {"training": name.removesuffix("_shared").partition("__")[0].replace("_", " ")}
-        if not shared:
+        if shared:
+            line["M steps"] = f"{float(group[-1]['control steps']) / 1e6:.3g}"
+        else:
+            line["joints (rad)"] = group[-1]["joint error"]
             line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
             for column, found in ((f"s to {ENOUGH:.0%}", enough), ("twice in a row (s)", twice)):
                 line[column] = found[0]["training s"] if found else "never"
-            line["in all (s)"] = group[-1]["training s"]
-        line |= {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
+        line["last success"] = f"{float(group[-1]['success']):.0%}"
         lines.append(line)
     return lines
 
