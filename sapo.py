@@ -54,6 +54,7 @@ ON_CPU: dict[str, dict[str, Any]] = {
     "ant": {"iterations": 1500},
     "humanoid": {"critic_iterations": 4},
     "humanoid_mtu": {"critic_iterations": 4, "iterations": 1000},
+    "g1": {"critic_iterations": 4, "iterations": 1000},
     "g1_track": {"critic_hidden": (256, 128), "critic_iterations": 4, "iterations": 1300},
 }
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}

@@ -315,5 +315,5 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
-    alive, smooth, randomise = 2.5, 1.0, Joystick.randomise[:-1]
+    alive, smooth, randomise = 2.5, 1.0, (*Joystick.randomise[:4], "push=0.5:1.5")
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise
