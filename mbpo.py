@@ -30,7 +30,7 @@ from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Few, Fraction, Natural, Positive, Repeats, SomeWidths, Widths
+from diffsim.training.ranges import Batch, Count, Few, Fraction, Natural, Positive, Repeats, Several, SomeWidths, Widths
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # Policies and values: as SAC's, from Table 3 of the SHAC paper. Rollout lengths: MBPO's released settings.
@@ -57,15 +57,13 @@ HELD_OUT_BATCH = 1024
 class Args(ParallelFlags):
     """The algorithm. Defaults are those of half_cheetah and of tasks that are not in the table."""
 
-    num_envs: Count = 64
-    """parallel environments N (per task)"""
     steps: Count = 16
     """control steps of an iteration"""
     seed_steps: Natural = 64
-    """control steps of each environment with random actions before training starts"""
+    """control steps of each environment with random actions before the first update"""
     buffer_size: Count = 1_000_000
-    """size of the buffer of real transitions, over all environments"""
-    models: Few = 7
+    """real transitions in the replay buffer, over all environments"""
+    models: Several = 7
     """networks of the ensemble"""
     elites: Few = 5
     """networks that make the rollouts: those that predict held-out transitions best"""
@@ -73,7 +71,7 @@ class Args(ParallelFlags):
     """units of the models' hidden layers (per task)"""
     model_updates: Repeats = 50
     """gradient updates of the models in an iteration"""
-    model_batch_size: Count = 256
+    model_batch_size: Batch = 256
     """samples per model in each of these updates"""
     model_lr: Positive = 1e-3
     """learning rate of the models"""
@@ -89,7 +87,7 @@ class Args(ParallelFlags):
     """distance of added states, in root mean square changes of a control step, and of actions before tanh"""
     updates: Repeats = 160
     """gradient updates of actor, critics and temperature in an iteration"""
-    batch_size: Count = 256
+    batch_size: Batch = 256
     """samples of each of these updates"""
     real_ratio: Fraction = 0.05
     """share of these samples that are real transitions; models predict the others"""
@@ -116,7 +114,6 @@ class Args(ParallelFlags):
         wrong = {
             "start it without torchrun: processes do not share a replay buffer": distributed.size() > 1,
             "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
-            "--models must be at least 2: of an ensemble some are chosen": self.models < 2,
             f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
             f"--rollout-lengths {first} {last}: the first must not exceed the second": first > last,
             f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step": self.buffer_size < rows,

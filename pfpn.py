@@ -77,14 +77,14 @@ class Args(ParallelFlags):
     """smallest and largest learning rate; two equal numbers fix it"""
     gamma: Fraction = 0.99
     """discount factor"""
-    trace_decay: Fraction = 0.95
-    """lambda of the advantages"""
+    gae_lambda: Fraction = 0.95
+    """lambda of the advantage estimation"""
     epochs: Repeats = 5
     """passes over the samples of a rollout (per task)"""
     minibatch_size: Count = 8192
     """samples of an update (per task; on a CPU at most 2048)"""
     entropy_coef: NonNegative = 0.0
-    """weight of the entropy bonus (per task)"""
+    """weight of the entropy bonus, which keeps the policy's noise from vanishing (per task)"""
 
     def task_defaults(self) -> dict[str, Any]:
         values: dict[str, Any] = dict(zip(COLUMNS, PER_TASK.get(self.env, PER_TASK["humanoid"]), strict=True))
@@ -371,7 +371,7 @@ class PPO:
         rollout = Rollout(*(torch.stack(tensors) for tensors in zip(*steps, strict=True)))
         mixture, next_value = self.actor(normalizer(rollout.next_obs))
         next_value = self.return_normalizer.inverse(next_value).masked_fill(rollout.terminated, 0.0)
-        target = td_lambda(rollout.reward, next_value, rollout.done, args.gamma, args.trace_decay)
+        target = td_lambda(rollout.reward, next_value, rollout.done, args.gamma, args.gae_lambda)
         advantage = target - self.return_normalizer.inverse(rollout.value)
         explained = 1 - advantage.var() / target.var()
         self.return_normalizer.update(target)

@@ -27,7 +27,7 @@ from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.ranges import Batch, Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of sac_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
@@ -64,8 +64,6 @@ class Args(ParallelFlags):
     dead: Decay = 0.05
     """a particle is dead if its mean weight since the last resampling is below this share of 1 / particles"""
 
-    num_envs: Count = 64
-    """parallel environments N (per task)"""
     horizon: Count = 32
     """control steps of a rollout"""
     hidden: SomeWidths = (512, 256)
@@ -75,15 +73,15 @@ class Args(ParallelFlags):
     lr: Positive = 3e-4
     """learning rate of policy and critics (per task)"""
     temperature_lr: Positive = 2e-4
-    """learning rate of the logarithm of the entropy's weight (per task)"""
+    """learning rate of the temperature's logarithm (per task)"""
     gamma: Fraction = 0.99
     """discount factor"""
     epochs: Repeats = 1
     """updates per control step"""
-    minibatch_size: Count = 2048
+    minibatch_size: Batch = 2048
     """samples of an update (per task)"""
-    target_rate: Fraction = 0.005
-    """target critics <- (1 - rate) target critics + rate critics, after each update"""
+    tau: Fraction = 0.005
+    """target critics <- (1 - tau) target critics + tau critics, after each update"""
     buffer_size: Count = 1_000_000
     """transitions in the replay buffer, over all environments"""
 
@@ -365,7 +363,7 @@ class SAC:
         loss = (value - target).square().mean(1).sum()
         self.critic_optimizer.step(loss)
         for slow, fast in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
-            slow.lerp_(fast.detach(), self.args.target_rate)
+            slow.lerp_(fast.detach(), self.args.tau)
         return {"losses/critic": loss.detach() / 2, "charts/value": value.detach().mean()}
 
     def update_actor(self, obs: Tensor) -> dict[str, Tensor]:

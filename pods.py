@@ -55,7 +55,7 @@ class Args(Flags):
     """action sequences N of an iteration (per order)"""
     horizon: Count = 50
     """control steps T of a sequence; an episode must be a multiple of them (per task)"""
-    improvements: Count = 1
+    improvements: Repeats = 1
     """line-searched steps of each sequence in an iteration (per order)"""
     candidates: Repeats = 8
     """first order: step sizes of the line search, each half the one before"""
@@ -67,7 +67,7 @@ class Args(Flags):
     """second order: cost of the squared action before tanh, which bounds it where tanh is flat"""
     imitate: Literal["visited", "improved"] = "visited"
     """states at which improved actions are taught: those visited by the policy, or by these actions (per order)"""
-    epochs: Count = 4
+    epochs: Repeats = 4
     """passes of the imitation over the sequences (per order)"""
     batch_size: Count = 512
     """states of an imitation update"""

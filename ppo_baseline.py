@@ -50,19 +50,19 @@ class Args(SymmetricFlags):
     """The algorithm. Defaults are those of a task that is not in the table."""
 
     iterations: Count = 5000
-    """learning iterations, a rollout and its updates each (per task)"""
+    """learning iterations (per task)"""
     num_envs: Count = 1024
     """parallel environments N, over all processes of torchrun (per task; on a CPU at most 256)"""
     horizon: Count = 32
     """control steps of a rollout (per task)"""
     hidden: Widths = (256, 128, 64)
-    """units of the hidden layers that policy and value share (per task)"""
+    """units of the hidden layers, which policy and value share (per task)"""
     lr: Positive = 3e-4
-    """initial learning rate"""
+    """initial learning rate, which then follows the KL divergence of the updates"""
     target_kl: Positive = 0.008
     """the learning rate falls if a minibatch's KL divergence is above twice this, and rises if it is below half"""
     lr_bounds: tuple[Positive, Positive] = (1e-6, 1e-2)
-    """smallest and largest learning rate"""
+    """smallest and largest learning rate; two equal numbers fix it"""
     max_grad_norm: Positive = 1.0
     """gradients are clipped to this norm"""
     gamma: Fraction = 0.99
@@ -72,17 +72,17 @@ class Args(SymmetricFlags):
     epochs: Repeats = 5
     """passes over the samples of a rollout (per task)"""
     minibatch_size: Count = 8192
-    """samples of a minibatch (per task; on a CPU at most 2048)"""
+    """samples of an update (per task; on a CPU at most 2048)"""
     clip_coef: Positive = 0.2
     """the probability ratio counts only within 1 - clip and 1 + clip"""
     value_coef: NonNegative = 2.0
     """weight of the value's squared error, in units of its standard deviation"""
     entropy_coef: NonNegative = 0.0
-    """weight of the policy's entropy, which keeps its noise from vanishing (per task)"""
+    """weight of the entropy bonus, which keeps the policy's noise from vanishing (per task)"""
     bound_coef: NonNegative = 1e-4
     """weight of the squared excess of the policy's mean beyond 1.1, where the action is clipped"""
     initial_log_std: Finite = 0.0
-    """initial log standard deviation of the policy"""
+    """initial log standard deviation of the policy's noise"""
     eval_every: Natural = 500
     """evaluate the deterministic policy every this many iterations (0: only at the end)"""
 

@@ -26,7 +26,7 @@ from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
+from diffsim.training.ranges import Batch, Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
 from diffsim.training.replay import ReplayBuffer, Transition
 
 # Table 3 of the SHAC paper; networks, seed steps, hopper and half_cheetah: its authors' released settings.
@@ -57,15 +57,13 @@ class Args(ParallelFlags):
     """learning iterations: --steps control steps of all environments, each followed by updates (per task)"""
     large_batch: bool = False
     """many environments, large batches, layer-normalized critics: hopper, ant and humanoid in minutes of a GPU"""
-    num_envs: Count = 64
-    """parallel environments N (per task)"""
     steps: Count = 32
     """control steps of an iteration"""
     updates_per_step: Repeats = 1
     """gradient updates of the critics after each control step of all environments"""
     actor_updates: Repeats = 1
     """the last so many of these updates also update the actor and the temperature"""
-    batch_size: Count = 2048
+    batch_size: Batch = 2048
     """samples of an update (per task)"""
     buffer_size: Count = 1_000_000
     """transitions in the replay buffer, over all environments"""
@@ -112,6 +110,8 @@ class Args(ParallelFlags):
             fail("start it without torchrun: processes do not share a replay buffer")
         if self.critic_subset > self.critics:
             fail(f"--critic-subset {self.critic_subset} is larger than --critics {self.critics}")
+        if self.actor_updates > self.updates_per_step:
+            fail(f"--actor-updates {self.actor_updates} are more than --updates-per-step {self.updates_per_step}")
         if self.buffer_size < self.steps * self.num_envs:
             fail(f"--buffer-size {self.buffer_size} holds no iteration of {self.steps} steps of {self.num_envs}")
 

@@ -26,7 +26,7 @@ from diffsim.training import Run, distributed, fail, script
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, seeing
-from diffsim.training.ranges import Count, Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths
+from diffsim.training.ranges import Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths
 
 # SHAC's networks, and the settings of the best results (docs/sapo.md).
 # fmt: off
@@ -87,8 +87,6 @@ class Args(WindowFlags):
     """initial weight of the entropy in the reward"""
     temperature_lr: Positive = 5e-3
     """learning rate of the temperature's logarithm"""
-    horizon: Count = 32
-    """control steps h of a rollout"""
     actor_hidden: SomeWidths = (256, 128)
     """units of the actor's hidden layers (per task)"""
     critic_hidden: SomeWidths = (128, 128)
@@ -111,8 +109,6 @@ class Args(WindowFlags):
     """target critics <- alpha target critics + (1 - alpha) critics, each iteration (per task)"""
     critic_iterations: Repeats = 16
     """passes over the samples of a rollout to fit the critics (per task)"""
-    critic_minibatches: Repeats = 4
-    """minibatches of a pass, contiguous in time"""
     initial_log_std: Finite = -1.0
     """initial log standard deviation of the policy's noise, before tanh (per task)"""
 
@@ -284,7 +280,8 @@ class SAPO:
     def update_critic(self) -> dict[str, Tensor]:
         """Fit the critics to the rollout's soft TD(lambda) returns, and let the target critics follow."""
         args = self.args
-        batches = self.obs.chunk(args.critic_minibatches, -2), self.value.chunk(args.critic_minibatches, -1)
+        parts = args.critic_minibatches
+        batches = self.obs.tensor_split(parts, -2), self.value.tensor_split(parts, -1)
         for _ in range(args.critic_iterations):
             losses = []
             for obs, value in zip(*batches, strict=True):

@@ -25,7 +25,7 @@ from diffsim.tasks.mirror import Mirror
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import Chain, folded, make_even, mlp, seeing
-from diffsim.training.ranges import Count, Decay, Finite, Fraction, Positive, Repeats, Widths
+from diffsim.training.ranges import Decay, Finite, Fraction, Positive, Repeats, Widths
 
 # Tables 1 and 4; hopper and half_cheetah: the authors' released settings.
 # fmt: off
@@ -55,8 +55,6 @@ ON_GPU = dict.fromkeys(("go1", "go2"), {"num_envs": 1024, "iterations": 1000})  
 class Args(WindowFlags):
     """The algorithm. Defaults: one setting for all tasks, Table 5 with the networks of A.4.3."""
 
-    horizon: Count = 32
-    """control steps h of a rollout"""
     general_hyperparameters: bool = False
     """one setting for all tasks (Table 5) instead of the per-task ones"""
     deterministic_policy: bool = False
@@ -85,8 +83,6 @@ class Args(WindowFlags):
     """target critic <- alpha target critic + (1 - alpha) critic, each iteration (per task)"""
     critic_iterations: Repeats = 16
     """passes over the samples of a rollout to fit the critic"""
-    critic_minibatches: Repeats = 4
-    """minibatches of a pass, contiguous in time"""
     inverse_variance: bool = False
     """weight each step's gradient and that of the policy's density by their variances (arXiv 2604.18161)"""
     initial_log_std: Finite = -1.0
@@ -228,7 +224,8 @@ class SHAC:
         """Fit the critic to the rollout's TD(lambda) returns (Eq. 6), and let the target critic follow."""
         args = self.args
         losses = [torch.zeros_like(self.critic_optimizer.skipped)]
-        batches = list(zip(*(part.chunk(args.critic_minibatches) for part in (self.obs, self.value)), strict=True))
+        parts = (part.tensor_split(args.critic_minibatches) for part in (self.obs, self.value))
+        batches = list(zip(*parts, strict=True))
         for _ in range(args.critic_iterations if args.critic else 0):
             losses = []
             for obs, value in batches:

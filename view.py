@@ -1,4 +1,4 @@
-"""Film the policy of any script's checkpoint: the beginning of the median one of several episodes.
+"""Film the policy of any script's checkpoint: the beginning of an episode, of several the one of median return.
 
     python view.py runs/<run> --video ant.mp4                   .gif as well
 
@@ -18,6 +18,7 @@ import tyro
 
 from diffsim.tasks import find_task
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
+from diffsim.training.errors import in_one_line
 from diffsim.training.evaluation import SEED, VIDEO_SECONDS, gait_lines
 from diffsim.view import render
 
@@ -54,7 +55,8 @@ class Args:
 
 @command
 def main(argv: Sequence[str] | None = None) -> None:
-    args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
+    with in_one_line():
+        args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
     args.check()
     torch.set_num_threads(1)  # operations this small gain nothing from more
     try:

@@ -21,6 +21,7 @@ from diffsim.sim.options import check_device
 from diffsim.tasks import TaskError, find_task
 from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
+from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
 
 RESULTS, DOCS = ROOT / "results", ROOT / "docs"  # written with --update-results alone
@@ -132,6 +133,7 @@ class Case(NamedTuple):
         learner = " ".join((self.saved.script, *(args[name] for name in ("policy",) if name in args)))
         learner += "".join(f" --{name}" for name in ("symmetric", "randomise") if args.get(name))
         learner += f" --initial-log-std {first:g}" if (first := args.get("initial_log_std")) else ""
+        learner += f" --rough {slope:g}" if (slope := args.get("rough")) else ""
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
         values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
         return dict(zip(ABOUT, values, strict=True))
@@ -143,7 +145,8 @@ def checkpoint_of(path: Path) -> Path:
 
 
 def load_case(path: Path, num_envs: int, device: str) -> Case:
-    """The policy of a checkpoint or of a run's; one of another task than ours ends the benchmark with one line."""
+    """The policy of a checkpoint or of a run's, on a plane; one of another task than ours ends the benchmark with one
+    line."""
     path = checkpoint_of(path)
     saved = load_policy(path)
     try:
@@ -151,7 +154,9 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
     except TaskError as error:
         fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
-    return Case(f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device))
+    return Case(
+        f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device, rough=0.0)
+    )
 
 
 def machine(device: str) -> str:
@@ -166,7 +171,8 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
     """The command line, checked before anything is measured; what follows "--" goes to the scripts that it runs."""
     words = [*(sys.argv[1:] if argv is None else argv), "--"]
     end = words.index("--")
-    args = tyro.cli(kind, args=words[:end], description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    with in_one_line():
+        args = tyro.cli(kind, args=words[:end], description=description, config=(tyro.conf.FlagCreatePairsOff,))
     args.arguments = tuple(words[end + 1 : -1])
     check_ranges(args)
     if args.output and args.update_results:

@@ -9,7 +9,8 @@ targets, and a motor the torque that the task's servo would have. Nothing else o
 at 0.5 m/s forward; the change of actions that of all commands.
 
 Writes joystick.csv, a row for each policy and world, and with --update-results the tables of docs/joystick.md; with
---race joystick_race.csv, of checkpoints that were copied beside their run's progress.csv while it trained.
+--race joystick_race.csv, of checkpoints that were copied beside their run's progress.csv while it trained; with
+--rough joystick_rough.csv, of ground of boxes, the same for all policies, on which each command starts elsewhere.
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ from tables import Row, grouped, middle, numbers
 from worlds import Array, OtherFile, State, in_double, pushes, rollout
 
 from diffsim.tasks.joystick import Joystick
+from diffsim.terrain import Elevation, uneven
 from diffsim.training import NonNegative, Positive, fail, gait
 from diffsim.training.checkpoint import HOME
+from diffsim.training.flags import Slope
 from diffsim.training.ranges import Range
 
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
@@ -38,6 +41,7 @@ COMMANDS = [(0.0, 0.0, 0.0), *((v, 0.0, 0.0) for v in FORWARD), *((0.0, v, 0.0) 
 COMMANDS += [(0.0, 0.0, w) for w in TURNING] + [(v, 0.0, w) for v in (0.5, -0.5) for w in TURNING]
 WALK = COMMANDS.index((0.5, 0.0, 0.0))
 RACE = (0.1, 0.05)  # m/s, errors to which learners race
+PROFILE, STARTS, NEAR = 1_000_000, 4.0, 0.3  # seed of the rough ground; m, where commands start, and how long they are
 PAGE = "joystick.md"
 Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # the first second does not count
 
@@ -51,17 +55,22 @@ class Args(common.CheckpointFlags):
     latency: Annotated[float, Range("from 0 to 40", lambda ms: 0 <= ms <= 40)] = 0.0  # ms by which actions come late
     push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
     seconds: Long = 20.0  # of an episode
+    rough: tuple[Slope, ...] = ()  # degrees, steepest slopes of rough ground, 0: the file's plane
     race: bool = False  # checkpoints are those along the way of runs: seconds of training to an error
 
 
-def follow(case: Case, world: OtherFile, args: Args) -> tuple[Array, Array, Array, Array]:
+def follow(case: Case, world: OtherFile, args: Args, profile: Array | None = None) -> tuple[Array, Array, Array, Array]:
     """The root's velocities (T, n, 3), vx and vy in its frame and its yaw rate, of each command; states before a step
     (T, n, nq), actions (T, n, nu), falls (n,)."""
     task, scene, n = in_double(case.env), case.env.scene, len(COMMANDS)
     late = args.latency / 1e3 / task.control_dt
     task.disturbances = {**task.disturbances, "latency": (late, late)}
     push = pushes(args.push, task.control_dt, np.random.default_rng(1))
-    rest = torch.tensor(task.start).double().expand(n, -1)  # the keyframe
+    rest = torch.tensor(task.start).double().repeat(n, 1)  # the keyframe
+    if profile is not None:  # above the highest ground near it
+        task.ground = Elevation(scene.with_terrain(profile), "cpu", torch.float64)
+        rest[:, 0] = torch.linspace(-STARTS, STARTS, n)
+        rest[:, 2] += task.ground.at(rest[:, :1] + torch.linspace(-NEAR, NEAR, 25)).amax(1)
     memory = task.begin(rest.new_full((n, task.num_random), 0.5))
     memory[:, :3] = torch.tensor(COMMANDS)
     start = State(rest[:, : scene.nq], rest.new_zeros(n, scene.nv), rest.new_zeros(n, scene.nu), memory)
@@ -95,13 +104,15 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         about["learner"] = f"{about['learner']} in {case.saved.simulator}"
     if not isinstance(task, Joystick):
         fail(f"{path} was trained on {task.name}, which follows no command")
-    for friction, mass, gains in product(args.friction, args.mass, args.gains):
-        world = OtherFile(case.env, len(COMMANDS), args.file, friction, mass, gains)
-        velocities, qpos, action, fallen = follow(case, world, args)
+    for slope, friction, mass, gains in product(args.rough or (0.0,), args.friction, args.mass, args.gains):
+        profile = uneven(slope, 1, PROFILE)[0] if slope else None
+        world = OtherFile(case.env, len(COMMANDS), args.file, friction, mass, gains, profile)
+        velocities, qpos, action, fallen = follow(case, world, args, profile)
         error, yaw = errors(velocities, round(1 / task.control_dt))
         print("  " + "; ".join(f"{c} {e:.2f}" for c, e in zip(COMMANDS, error, strict=True)))
         row = {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
-        row |= {"mass": mass, "gains": gains, "latency": args.latency, **walk(case, qpos, action)}
+        row |= {"mass": mass, "gains": gains, "latency": args.latency}
+        row |= {"rough": slope} if args.rough else walk(case, qpos, action)
         row |= {"error": error.mean(), "worst error": error.max(), "yaw error": yaw.mean()}
         yield about | training(case) | row | {"whole": 1 - fallen.mean(), "seconds": args.seconds}
 
@@ -209,10 +220,25 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
     return lines
 
 
+def rough(rows: list[dict[str, str]]) -> list[Row]:
+    """A line for each steepest slope, and the ground on which policies were trained."""
+    rows = [row | {"trained on": row["learner"].partition(" --rough ")[2] or "0"} for row in rows]
+    lines = list[Row]()
+    for (task, slope, ground), group in sorted(grouped(rows, "task", "rough", "trained on").items()):
+        line = {"task": task, "slopes (degrees)": slope, "trained on": ground, "seeds": len(group)}
+        errors = {"error (m/s)": "error", "worst command (m/s)": "worst error", "yaw rate (rad/s)": "yaw error"}
+        line |= {"without a fall": with_worst(group, "whole", ".0%", min)}
+        lines.append(line | {title: with_worst(group, column, ".3f", max) for title, column in errors.items()})
+    return lines
+
+
 def main(args: Args) -> None:
     key = (*ABOUT[:-1], "file", "friction", "push", "mass", "gains", "latency")
     if args.race:
         measured(args, Part("joystick_race", measure, key, "race", PAGE, race))
+        return
+    if args.rough:
+        measured(args, Part("joystick_rough", measure, (*key, "rough"), "rough", PAGE, rough))
         return
     rows = measured(args, Part("joystick", measure, key, "joystick", PAGE, table))
     args.publish("whole", tables.markdown(whole(rows)), PAGE)

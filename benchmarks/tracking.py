@@ -17,9 +17,9 @@ that shared a GPU have a folder whose name ends with _shared: their seconds do n
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import common
@@ -96,7 +96,11 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         row |= {"file": args.file.parent.name if args.file else "", "friction": friction, "push": args.push}
         row |= {"success": success.mean(), "whole motions": np.sum(each >= ENOUGH)}
         row |= {"joint error": joints.mean(), "root error": root.mean(), "root turn": turn.mean()}
-        yield about | training(case) | row | {"episodes": args.episodes}
+        row |= {"episodes": args.episodes}
+        if args.race:
+            given = case.saved.args
+            row["control steps"] = case.saved.iteration * given["num_envs"] * given["horizon"]
+        yield about | training(case) | row
 
 
 def least(rows: list[dict[str, str]]) -> str:
@@ -108,13 +112,12 @@ def alone(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str]], list[dict[str, str]]]]:
-    """A policy's name for each clip, learner and machine, over seeds; its rows, and those with the file's friction and
+    """A policy's name for each clip, learner and device, over seeds; its rows, and those with the file's friction and
     no push."""
-    rows = [row | {"machine": row["checkpoint"].partition("/")[0].removesuffix("_shared")} for row in rows]
-    for (clip, learner, machine), group in grouped(rows, "clip", "learner", "machine").items():
+    for (clip, learner, device), group in grouped(rows, "clip", "learner", "device").items():
         name, drawn, _ = learner.partition(" --randomise")
         plain = [row for row in group if float(row["friction"]) == 1 and float(row["push"]) == 0]
-        yield f"{clip}, {name}, {machine}{'' if drawn else ', not randomised'}", group, plain
+        yield f"{clip}, {name}, {device}{'' if drawn else ', not randomised'}", group, plain
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
@@ -146,24 +149,33 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
     ]
 
 
-def race(rows: list[dict[str, str]]) -> list[Row]:
-    """Seconds of training until enough episodes succeed, from checkpoints along the way."""
+def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
+    """Control steps and seconds of training until enough episodes succeed, for the first time and for two checkpoints
+    in a row, of a GPU's only trainings; or of those that shared one, whose seconds do not count."""
     lines = list[Row]()
-    for (_, learner, _), group in grouped(rows, "clip", "learner", "seed").items():
-        group.sort(key=lambda row: float(row["training s"]))
-        reached = (row["training s"] for row in group if float(row["success"]) >= ENOUGH)
-        lines.append(
-            {"learner": re.sub(r" --\S+( -?[\d.]+)?", "", learner)}
-            | {f"s to {ENOUGH:.0%}": next(reached, "never"), "in all (s)": group[-1]["training s"]}
-            | {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
-        )
+    rows = [row | {"run": row["checkpoint"].partition("/")[0]} for row in rows]
+    for (name,), group in grouped(rows, "run").items():
+        if name.endswith("_shared") != shared:
+            continue
+        group.sort(key=lambda row: int(row["iteration"]))
+        enough = [row for row in group if float(row["success"]) >= ENOUGH]
+        twice = [row for row, after in pairwise(group) if row in enough and after in enough]
+        line = {"training": name.removesuffix("_shared").partition("__")[0].replace("_", " ")}
+        line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
+        if not shared:
+            for column, found in ((f"s to {ENOUGH:.0%}", enough), ("twice in a row (s)", twice)):
+                line[column] = found[0]["training s"] if found else "never"
+            line["in all (s)"] = group[-1]["training s"]
+        line |= {"last success": f"{float(group[-1]['success']):.0%}", "joints (rad)": group[-1]["joint error"]}
+        lines.append(line)
     return lines
 
 
 def main(args: Args) -> None:
     key = (*ABOUT[:-1], "clip", "file", "friction", "push")
     if args.race:
-        measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
+        rows = measured(args, Part("tracking_race", measure, key, "track_race", PAGE, race))
+        args.publish("ablation", markdown(race(rows, shared=True)), PAGE)
         return
     rows = measured(args, Part("tracking", measure, key, "tracking", PAGE, table))
     args.publish("many", markdown(many(rows)), PAGE)

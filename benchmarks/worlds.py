@@ -21,10 +21,13 @@ from diffsim.sim.launcher import available_cores
 from diffsim.tasks import Imitation, Task
 from diffsim.training import fail
 from diffsim.training.evaluation import SEED
+from diffsim.view.render import slabs
 
 Array = NDArray[np.float64]
 FASTEST = 1e5  # m/s or rad/s; beyond it a robot is lost, as in Simulator
 PUSHED_EVERY = 4.0  # s
+FAR_ASIDE = 50.0  # m to each side, where a terrain ends
+GROUND_LAW = "condim friction solref solimp solmix priority margin gap contype conaffinity".split()
 
 mujoco.set_mju_user_warning(lambda _: None)  # that a simulation is unstable, which World.step says
 
@@ -120,20 +123,45 @@ class MuJoCo:
         return torch.from_numpy(new_qpos).to(qpos), torch.from_numpy(new_qvel).to(qvel), torch.from_numpy(lost)
 
 
+def on_terrain(spec: mujoco.MjSpec, profile: Array) -> mujoco.MjModel:
+    """A file's model with a profile (K, 2) in the place of its planes: boxes whose upper faces are the segments, with
+    all numbers of the first plane."""
+    planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    law = {name: getattr(planes[0], name) for name in GROUND_LAW}
+    for (length, _, thickness), centre, rotation in slabs(profile):
+        mujoco.mju_mat2Quat(quat := np.empty(4), rotation.ravel())
+        size = [length, FAR_ASIDE, thickness]
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=centre, quat=quat, **law)
+    for plane in planes:
+        spec.delete(plane)
+    return spec.compile()
+
+
 class OtherFile(MuJoCo):
     """MuJoCo on any file of a robot, driven as the task's own; joints are those of the same names.
 
     Servos get the policy's targets, and a motor the torque that the task's servo would have: the file's passive damping
     of its joint acts there, and so do its clamps. A file that lacks a joint or its actuator ends the benchmark.
+
+    On a profile (K, 2) the ground is made of boxes, see on_terrain.
     """
 
     def __init__(
-        self, env: DiffEnv, num_envs: int, file: Path | None, friction: float, mass: float = 1.0, gains: float = 1.0
+        self,
+        env: DiffEnv,
+        num_envs: int,
+        file: Path | None,
+        friction: float,
+        mass: float = 1.0,
+        gains: float = 1.0,
+        profile: Array | None = None,
     ) -> None:
         own = env.scene.mj_model
         if file and not file.is_file():
             fail(f"no such file: {file}; MuJoCo Menagerie is at github.com/google-deepmind/mujoco_menagerie")
         model = copy.copy(own) if file is None else mujoco.MjModel.from_xml_path(str(file))
+        if profile is not None:
+            model = on_terrain(mujoco.MjSpec.from_file(str(file or env.scene.path)), profile)
         model.geom_friction[:, 0] *= friction
         model.pair_friction[:, :2] *= friction
         model.body_mass *= mass
@@ -234,13 +262,18 @@ def rollout(
     """
     state, n = start, len(start.qpos)
     fallen = torch.zeros(n, dtype=torch.bool, device=start.qpos.device)
-    obs, middle = task.observe_with(*state), start.qpos.new_full((n, task.num_noise), 0.5)
+    ground = task.ground
+
+    def observe(state: State) -> Tensor:
+        return task.observe_with(state.qpos if ground is None else ground.lower(state.qpos), *state[1:])
+
+    obs, middle = observe(state), start.qpos.new_full((n, task.num_noise), 0.5)
     for step in range(steps):
         action = policy(obs.float()).clamp(-1.0, 1.0).to(obs.dtype)
         state = push(step, state)
         qpos, qvel, lost = world.step(state.qpos, *task.disturb(state.qvel, action, state.memory))
         state = State(qpos, qvel, action, task.remember(state.memory, action, middle))
-        obs = task.observe_with(*state)
+        obs = observe(state)
         fallen = fallen | (lost := lost.to(fallen.device)) | task.terminated(obs)
         yield Step(state, obs, task.reward(obs, action).masked_fill(lost, 0.0), fallen)
 

@@ -23,6 +23,7 @@ from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, TaskError, find_task, tracking
 from diffsim.tasks.imitation.clip import Clip, read_clip
+from diffsim.terrain import uneven
 
 __all__ = [
     "TASKS",
@@ -98,7 +99,7 @@ def make(
             clip of the package.
         terrain: replaces the plane z = 0: vertices (x, z) [m] of one profile, (K, 2), or of one for each environment,
             (N, K, 2), see Scene.with_terrain and diffsim.terrain. The task then measures heights from the ground below
-            the root.
+            the root. A number: the steepest slope [degrees] of `uneven` ground, which the seed draws.
         control_dt: seconds of a control step. Default: the task's.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task reports a fall.
@@ -141,6 +142,8 @@ def make(
     if penalty and integration.constrained:
         raise ValueError("penalty sets constants of the penalty law, but the contact is mujoco")
     scene = scene.with_penalty(penalty or {})
+    if isinstance(terrain, int | float):
+        terrain = uneven(terrain, num_envs, seed or 0)
     scene = scene if terrain is None else scene.with_terrain(terrain)
     episodes: Any = dict(stochastic_init=stochastic_init, early_termination=early_termination)
     episodes |= dict(max_episode_steps=max_episode_steps, adjoint_clip=adjoint_clip, render_mode=render_mode)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import runpy
@@ -11,6 +12,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import distributions, version
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal, get_args
 
 import torch
 import tyro
@@ -24,11 +26,13 @@ from diffsim.sim.launcher import available_cores
 from diffsim.tasks import FILE, Contact, find_task
 from diffsim.training import command, evaluate, export_onnx, export_policy, fail, load_policy, make_policy_env
 from diffsim.training.checkpoint import POLICIES
+from diffsim.training.errors import in_one_line
 from diffsim.tune import tune
 from diffsim.view import render
 
 PACKAGE = Path(str(files("diffsim")))
-LEARNERS = ("shac", "sapo", "bptt", "pods", "ppo_baseline", "sac_baseline", "mbpo", "pfpn", "pfpn_sac", "gps")
+Learner = Literal["shac", "sapo", "bptt", "pods", "ppo_baseline", "sac_baseline", "mbpo", "pfpn", "pfpn_sac", "gps"]
+LEARNERS = get_args(Learner)
 DEMO_EPISODES = 8  # the one of median return is filmed
 DEMO_SECONDS = 4.0  # of it
 
@@ -37,9 +41,7 @@ DEMO_SECONDS = 4.0  # of it
 def main(argv: Sequence[str] | None = None) -> None:
     sys.argv[0] = "diffsim"  # in messages
     argv = sys.argv[1:] if argv is None else argv
-    commands: dict[str, Callable[..., object]] = {
-        each.__name__: each for each in (demo, drive, train, view, check, tune, export)
-    }
+    commands = {each.__name__: _later(each) for each in (demo, drive, train, view, check, tune, export)}
     match [*argv]:  # a script heeds its own flags and errors
         case ["view", *flags]:
             return run_script("view", flags)
@@ -47,7 +49,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             return run_script(learner, flags)
     try:
         if argv:
-            tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="diffsim", description=__doc__)
+            with in_one_line():
+                call = tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="diffsim", description=__doc__)
+            call()
         else:
             print(report())
     except BrokenPipeError:
@@ -56,11 +60,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         fail(error)
 
 
+def _later(function: Callable[..., object]) -> Callable[..., Callable[[], object]]:
+    """Of the same signature: the call, to be made."""
+    return functools.wraps(function)(lambda *args, **kwargs: functools.partial(function, *args, **kwargs))
+
+
 def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None:
     """Film a shipped policy; needs no display.
 
     Args:
-        task: name of a task.
+        task: one whose policy is shipped: `diffsim` lists them.
         output: video to write, .mp4 or .gif.
     """
     policy = shipped(find_task(task).name)
@@ -94,8 +103,8 @@ def drive(
     """Watch or drive a robot in your browser with keys, a gamepad and the mouse; needs no display.
 
     Args:
-        robot: name or file of a task.
-        checkpoint: policy of any script. Default: the shipped one.
+        robot: a task, or a file with your own, my_task.py.
+        checkpoint: policy of any script. Default: the one that is shipped.
         host: address of the page; 0.0.0.0 lets other machines drive, too.
         port: port of the page; 0 takes a free one.
     """
@@ -112,12 +121,16 @@ def drive(
         serve(make_policy_env(saved, 1, forces=True, env=own), saved.network, caption, host, port)
 
 
-def train(learner: Positional[str]) -> None:
-    """Train: diffsim train shac --env ant. `diffsim train shac --help` lists the learner's flags."""
+def train(learner: Positional[Learner]) -> None:
+    """Train a policy, e.g. diffsim train shac --env ant; `diffsim train shac --help` lists the learner's flags.
+
+    Args:
+        learner: the algorithm.
+    """
 
 
 def view() -> None:
-    """Film a run: diffsim view runs/<run> --video ant.mp4. `diffsim view --help` lists flags."""
+    """Film a run, e.g. diffsim view runs/<run> --video ant.mp4."""
 
 
 def check(robot: Positional[Path], contact: Contact = "mujoco") -> None:
@@ -140,8 +153,8 @@ def export(checkpoint: Positional[Path], output: Positional[Path], env: str | No
     """Write only the policy of a checkpoint, for diffsim (.pt) or for other programs (.onnx).
 
     Args:
-        checkpoint: file of any script.
-        output: file to write, .pt or .onnx.
+        checkpoint: checkpoint of any script.
+        output: file to write, which ends in .pt or .onnx.
         env: file of your own task, for .onnx; its code runs.
         half: round the weights of a .pt file to 16 bits, which halves its size.
     """

@@ -110,7 +110,7 @@ class DiffEnv(VectorEnv):
         if not is_real(adjoint_clip) or not 0 <= adjoint_clip < math.inf:
             raise ValueError(f"adjoint_clip is {adjoint_clip!r}, must be a factor of at least 0")
         self.adjoint_clip = float(adjoint_clip)
-        self._elevation = None if scene.terrain is None else Elevation(scene, self.device, self.dtype)
+        self.task.ground = None if scene.terrain is None else Elevation(scene, self.device, self.dtype)
         real = np.float32 if self.dtype == torch.float32 else np.float64
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.obs_dim,), real)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (scene.nu,), real)
@@ -314,8 +314,8 @@ class DiffEnv(VectorEnv):
 
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         """The task's observation (N, obs_dim) of states, with its memory."""
-        if self._elevation is not None:
-            qpos = self._elevation.lower(qpos)
+        if self.task.ground is not None:
+            qpos = self.task.ground.lower(qpos)
         return self.task.observe_with(qpos, qvel, action, self.memory)
 
     def state_dict(self) -> dict[str, Any]:
@@ -350,7 +350,7 @@ class DiffEnv(VectorEnv):
             rand.fill_(0.5)
         (qpos, qvel), memory = self.task.reset(rand), self.task.begin(rand)
         obs = self.task.observe_with(qpos, qvel, self._no_action.expand(steps, -1, -1), memory)
-        qpos = qpos if self._elevation is None else self._elevation.lift(qpos)
+        qpos = qpos if self.task.ground is None else self.task.ground.lift(qpos)
         return [*zip(*(part.unbind() for part in (qpos, qvel, obs, memory)), strict=True)]
 
     def _uniform(self, *size: int) -> Tensor:

@@ -20,6 +20,7 @@ from torch import Tensor
 from diffsim.robot.scene import Array, Scene
 
 MOST_SEGMENTS = 10_000  # of rough ground
+SEGMENT, LENGTH, LEVEL = 0.4, 30.0, 0.5  # m, of uneven ground: its segments, its sides, its level middle
 
 
 def incline(degrees: float, start: float = 1.0) -> Array:
@@ -55,6 +56,21 @@ def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float 
     return np.stack([start + np.array(x), z], 1)
 
 
+def uneven(degrees: float, count: int, seed: int = 0) -> Array:
+    """(count, K, 2) profiles of ground that is rough before and behind the robot; a seed has the same ones always.
+
+    Within 0.5 m of x = 0 they are level. Then come segments of 0.4 m as of `rough`, for 30 m to both sides. The
+    steepest slope grows evenly from profile to profile; the last one's is `degrees`.
+    """
+    seeds = np.random.default_rng(abs(seed)).integers(2**31, size=(count, 2))
+    steepest = np.linspace(degrees / count, degrees, count).tolist()
+    sides = (
+        [rough(each, SEGMENT, most, LENGTH, LEVEL)[1:] for each in pair]
+        for most, pair in zip(steepest, seeds.tolist(), strict=True)
+    )
+    return np.stack([np.concatenate([behind[::-1] * [-1.0, 1.0], before]) for behind, before in sides])
+
+
 def _slope(degrees: float) -> float:
     if not -90 < degrees < 90:
         raise ValueError(f"degrees is {degrees!r}, must lie between -90 and 90")
@@ -80,26 +96,33 @@ class Elevation:
         slope = np.divide(np.diff(z), run, out=np.zeros_like(run), where=run > 0)  # of a wall nobody asks
         self._profiles = tensor(np.stack([x[:, :-1], z[:, :-1], slope]))  # (3, M, K - 1)
 
+    def at(self, x: Tensor) -> Tensor:
+        """z (..., N, L) [m] of the terrain at x (..., N, L) [m] of N environments, of any number if one serves all."""
+        start, level, slope = self._below(x)
+        return level + slope * (x - start)
+
     def height(self, qpos: Tensor) -> Tensor:
         """z (...) [m] of the terrain at the root's x, of qpos (..., nq).
 
         The dimension before the last of qpos is that of the environments, unless one terrain serves all.
         """
-        x, (start, level, slope) = self._below(qpos)
-        return (level + slope * (x - start)).squeeze(-1)
+        return self.at(self._root(qpos)).squeeze(-1)
 
     def gradient(self, qpos: Tensor) -> Tensor:
         """(..., nq, nq) by which qpos (..., nq) of the root's `lift` changes beside itself; walls do not count."""
-        return self._below(qpos)[1][2].unsqueeze(-1) * torch.outer(self._up, self._along)
+        return self._below(self._root(qpos))[2].unsqueeze(-1) * torch.outer(self._up, self._along)
 
-    def _below(self, qpos: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The root's x (..., 1), and (..., 1) each: where the segment below begins, its height there, its slope."""
+    def _root(self, qpos: Tensor) -> Tensor:
+        """x (..., 1) of the root."""
+        return (self._x0 + qpos @ self._along).unsqueeze(-1)
+
+    def _below(self, x: Tensor) -> tuple[Tensor, ...]:
+        """(..., N, L) each: where the segment below begins, its height there, its slope."""
         profiles = self._profiles
         if profiles.shape[1] == 1:
             profiles = profiles[:, 0]
-        x = (self._x0 + qpos @ self._along).unsqueeze(-1)
-        segment = ((x >= profiles[0]).sum(-1, keepdim=True) - 1).clamp(min=0)
-        return x, tuple(p.expand(*x.shape[:-1], -1).gather(-1, segment) for p in profiles)
+        segment = ((x.unsqueeze(-1) >= profiles[0].unsqueeze(-2)).sum(-1) - 1).clamp(min=0)
+        return tuple(p.expand(*x.shape[:-1], -1).gather(-1, segment) for p in profiles)
 
     def lift(self, qpos: Tensor) -> Tensor:
         """World qpos (..., nq) of one over the plane."""

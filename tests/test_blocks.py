@@ -30,6 +30,7 @@ from diffsim.sim.simulator import Simulator
 
 CONTROL_DT = 1 / 60
 SEMI, IMPLICIT, EXTRAPOLATED = (Integration(name, 8) for name in ("semi_implicit", "implicit", "extrapolated"))
+MUJOCO = Integration("mujoco", 4, passes=60, tolerance=1e-6, touchdown=False)
 _, SMALL, BLOCK = BLOCKS
 COUNT = BLOCK + 1
 
@@ -77,6 +78,7 @@ def step(scene, states, dtype, integration, weights=None, **options):
         pytest.param("leg", SEMI, {"factors": True}, marks=pytest.mark.slow),
         pytest.param("hopper on hills", SEMI, {}, marks=pytest.mark.slow),
         pytest.param("ball on hills", IMPLICIT, {}, marks=pytest.mark.slow),
+        ("ball on hills", MUJOCO, {}),
     ],
 )
 def test_laws_are_those_of_float64(name, integration, options, rng):

@@ -25,15 +25,17 @@ from scenes import (
     random_tree,
     robot,
     task_scene,
+    unit,
 )
 from test_gradient import differences, gradients, weights
+from test_terrain import HILLS, everywhere, hopping, pressed
 
 import diffsim
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import FACTORS, SceneError
+from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.terrain import rough
+from diffsim.terrain import incline
 from diffsim.training.checkpoint import load_policy
 
 ROBOTS = ("hopper", "half_cheetah", "ant", "humanoid")
@@ -99,9 +101,9 @@ def mujoco_model(scene):
     return m
 
 
-def in_mujoco(scene, qpos, qvel, ctrl, steps=1, substeps=1):
+def in_mujoco(scene, qpos, qvel, ctrl, steps=1, substeps=1, model=None):
     """qpos, qvel after control steps of MuJoCo's, and the set of its constraints' states."""
-    m = mujoco_model(scene)
+    m = model or mujoco_model(scene)
     low, high = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-1.0, 1.0]).T
     data, ends, kinds = mujoco.MjData(m), [], set()
     for q, v, u in zip(qpos, qvel, np.broadcast_to(ctrl, (steps, *np.shape(ctrl)[-2:])).swapaxes(0, 1), strict=True):
@@ -127,9 +129,9 @@ def step(scene, states, passes=PASSES, substeps=1, tolerance=TOLERANCE, **option
     return *(x.double().numpy() for x in ends), sim.residual.double().numpy()
 
 
-def check_step(scene, states, enough):
+def check_step(scene, states, enough, model=None):
     _, qvel, residual = step(scene, states)
-    _, expected, kinds = in_mujoco(scene, *states)
+    _, expected, kinds = in_mujoco(scene, *states, model=model)
     error = abs(qvel - expected).max(1) / abs(expected - states[1]).max(1)
     converged = residual < 1e-10
     assert converged.mean() >= enough
@@ -211,6 +213,67 @@ def test_control_steps_stay_with_mujoco(name, rng):
             obs = env.task.observe(qpos, qvel, actions[-1])
     expected = in_mujoco(env.scene, *start, np.array([a.numpy() for a in actions]), steps=100, substeps=4)
     assert abs(qpos.numpy() - expected[0]).max() < 1e-3
+
+
+# Terrain
+
+
+@pytest.mark.parametrize("name", ["sphere", "hopper", pytest.param("ant", marks=SLOW)])
+def test_an_incline_is_mujocos_tilted_plane(name, rng):
+    """At rest and sliding, up and down and across the slope."""
+    flat = parse(BALL) if name == "sphere" else task_scene(name)
+    scene = flat.with_terrain(incline(20.0, start=-50.0))
+    qpos, qvel, ctrl = acting_states(flat, 64, rng)
+    up, along = (2, 0) if scene.floating else (1, 0)
+    qpos[:, along] = rng.uniform(-3, 3, 64)
+    for _ in range(3):
+        qpos[:, up] -= [reference.contacts(scene, *state)[0].min() + 0.01 for state in zip(qpos, qvel, strict=True)]
+    m = mujoco_model(scene)
+    ground = np.flatnonzero(m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    turn = np.radians(-20.0) / 2
+    m.geom_sameframe[ground], m.geom_quat[ground] = 0, [np.cos(turn), 0, np.sin(turn), 0]
+    m.geom_pos[ground] = [-50.0, 0, 0]
+    assert check_step(scene, (qpos, qvel, ctrl), 1.0, m) >= {STATES["quadratic"], STATES["cone"]}
+
+
+def test_faces_and_edges_are_mujocos_box(rng):
+    """A ball on top, beside and at both edges of a box on the plane."""
+    profile = np.array([[-1, 0], [0, 0], [0, 0.5], [1, 0.5], [1, 0], [2, 0]])
+    scene, n = parse(BALL).with_terrain(profile), 64
+    depth, turn, side = rng.uniform(0, 0.02, n), rng.uniform(0, np.pi / 2, n), np.resize([-1, 1], n)
+    turn[:10], turn[10:20] = 0, np.pi / 2
+    reach = 0.1 - depth
+    qpos, qvel = np.zeros((n, 7)), rng.normal(size=(n, 6)) * np.resize([0.02, 0.02, 1, 1], n)[:, None]
+    qpos[:, 0] = 0.5 + side * (0.5 + reach * np.cos(turn))
+    qpos[:, 2] = 0.5 + reach * np.sin(turn)
+    qpos[:10, 2], qpos[10:20, 0] = 0.3, 0.4
+    qpos[-5:, 0], qpos[-5:, 2], qpos[:, 3:] = -0.4, 0.09, unit(rng.normal(size=(n, 4)))
+    box = '<geom type="box" size="0.5 9 0.25" pos="0.5 0 0.25" contype="0" conaffinity="1"/>'
+    m = mujoco_model(parse(BALL))
+    with_box = mujoco.MjModel.from_xml_string(BALL.replace("<body pos", f"{box}<body pos"))
+    for name in "cone timestep iterations tolerance ls_iterations ls_tolerance".split():
+        setattr(with_box.opt, name, getattr(m.opt, name))
+    check_step(scene, (qpos, qvel, np.zeros((n, 0))), 1.0, with_box)
+
+
+@pytest.mark.parametrize("name", ["sphere", pytest.param("hopper", marks=SLOW)])
+def test_gradients_on_hills_are_those_of_differences(name, rng):
+    """On slopes and ridges, in valleys and at a wall, all of which turn the frame of the contact."""
+    if name == "hopper":
+        scene, states = hopping(HILLS, 16, rng)
+    else:
+        scene = parse(BALL).with_terrain(HILLS)
+        states = pressed(scene, everywhere(rng), rng)
+    check_gradients(scene, states, rng, enough=0.8)
+    check_gradients(scene, states, rng, {"factors": rng.uniform(0.7, 1.4, (len(states[0]), len(FACTORS)))}, enough=0.8)
+
+
+def test_a_level_terrain_is_the_plane(rng):
+    scene = parse(BALL)
+    level = np.stack([np.linspace(-9, 9, 40), np.zeros(40)], 1)
+    states = acting_states(scene, 32, rng)
+    for value, expected in zip(step(scene.with_terrain(level), states), step(scene, states), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-10)
 
 
 # Gradients
@@ -493,11 +556,6 @@ def test_bad_input_is_named(scene, integration, why):
     with pytest.raises(ValueError, match=why) as error:
         Simulator(parse(scene), 1, integration)
     assert "\n" not in str(error.value)
-
-
-def test_terrain_is_refused():
-    with pytest.raises(SceneError, match="the ground is a plane, no terrain"):
-        Simulator(task_scene("hopper").with_terrain(rough(0)), 1, Integration("mujoco", 4))
 
 
 def test_frictionless_contact_and_friction_of_zero():

@@ -377,10 +377,11 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
         ("--evaluate {file}", "{file} is not a complete checkpoint of gps.py"),
         ("--resume {trained}/checkpoint.pt --horizon 9 --iterations 9", "--horizon 30, which cannot change to 9"),
         ("--resume {trained}/checkpoint.pt --noise 0.3 --iterations 9", "--noise 0.1, which cannot change to 0.3"),
+        ("--evaluate {trained}/checkpoint.pt --noise 0.3", "--noise 0.1, which cannot change to 0.3; --evaluate takes"),
         ("--resume {trained}/checkpoint.pt --demonstration {hopper}", "cannot change to {hopper}"),
         (
             "--resume {trained}/checkpoint.pt --hidden 9 --iterations 9",
-            "does not fit the flags, or the script as it is now: ",
+            "does not fit the flags, or the script as it is now: network.theta has shape (",
         ),
         ("--resume {trained}/checkpoint.pt", "is at iteration 4 already"),
     ],

@@ -366,7 +366,7 @@ def test_ppo_bandit_stays_on_both_peaks_with_entropy() -> None:
 def test_sac_bandit_has_its_soft_optimum() -> None:
     """The policy proportional to exp(r / alpha), which has two peaks of unequal height."""
     flags = "--horizon 8 --num-envs 16 --minibatch-size 128 --critic-hidden 64 --particles 15"
-    flags += " --lr 4e-3 --temperature-lr 1e-9 --target-rate 0.05 --buffer-size 5000"
+    flags += " --lr 4e-3 --temperature-lr 1e-9 --tau 0.05 --buffer-size 5000"
 
     def reward(_: Tensor, action: Tensor) -> Tensor:
         return 2 * (action + 0.6).square() - 2 * torch.cos(5 * (action + 0.6))
@@ -460,8 +460,7 @@ def test_a_gaussian_is_trained_as_by_ppo_baseline(tmp_path: Path) -> None:
     torch.testing.assert_close(*weights, rtol=1e-3, atol=2e-5)
 
 
-SAME = {"gae_lambda": "trace_decay", "actor_lr": "lr", "steps": "horizon", "tau": "target_rate"}
-SAME |= {"updates_per_step": "epochs", "batch_size": "minibatch_size"}
+SAME = {"actor_lr": "lr", "steps": "horizon", "updates_per_step": "epochs", "batch_size": "minibatch_size"}
 CONSTANTS = {"target_kl": "TARGET_KL", "clip_coef": "CLIP", "value_coef": "VALUE_COEF", "bound_coef": "BOUND_COEF"}
 CONSTANTS |= {"max_grad_norm": "MAX_GRAD_NORM"}
 

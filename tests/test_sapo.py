@@ -210,7 +210,8 @@ def test_members_must_share_the_environments_evenly(capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize(
-    "arguments", [" ".join(PLAIN), "--critics 3 --population 3 --selection 0", "--num-envs 1 --horizon 1"]
+    "arguments",
+    [" ".join(PLAIN), "--critics 3 --population 3 --selection 0", "--num-envs 1 --horizon 1 --critic-minibatches 1"],
 )
 def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:
     words = SMALL["shac"] + ["--iterations", "3", *arguments.split()]

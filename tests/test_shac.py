@@ -151,7 +151,7 @@ def test_the_critic_is_fitted_to_the_returns_and_the_target_follows_slowly() -> 
 @pytest.mark.parametrize(
     "arguments",
     [
-        "--num-envs 1 --horizon 1",
+        "--num-envs 1 --horizon 1 --critic-minibatches 1",
         "--num-envs 3 --horizon 5 --critic-minibatches 7 --deterministic-policy --general-hyperparameters",
         "--num-envs 2 --integrator extrapolated --substeps 2 --eval-every 2 --threads 1",
     ],

@@ -17,7 +17,7 @@ import diffsim
 from diffsim.robot.scene import Scene, TerrainError
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.terrain import Elevation, incline, rough, step
+from diffsim.terrain import LENGTH, LEVEL, Elevation, incline, rough, step, uneven
 from diffsim.view import render, web
 from diffsim.view.render import slabs
 
@@ -205,6 +205,32 @@ def test_the_elevation_is_that_of_the_profile(rng):
         assert torch.autograd.gradcheck(elevation.lower, qpos[0].requires_grad_())
 
 
+def test_heights_at_several_places(rng):
+    """Of each environment's own profile, and with dimensions before."""
+    profiles = uneven(15.0, 3, seed=4)
+    elevation = Elevation(task_scene("ant").with_terrain(profiles), "cpu", torch.float64)
+    x = rng.uniform(-5, 5, (2, 3, 4))
+    expected = [[np.interp(x[k, e], *profiles[e].T) for e in range(3)] for k in range(2)]
+    np.testing.assert_allclose(elevation.at(torch.tensor(x)), expected, atol=1e-12)
+
+
+def test_feet_of_a_joystick_task_are_seen_over_the_ground_below_them():
+    """A Go2 whose hind feet stand 10 cm higher than its front feet."""
+    name, n = "go2", 2
+    flat, there = (
+        diffsim.make(name, n, dtype=torch.float64, seed=1, terrain=ground) for ground in (None, step(-0.1, 0.05))
+    )
+    seen = [env.set_state(flat.qpos, flat.qvel)[:, -8:-4] for env in (flat, there)]
+    assert (flat.qpos[:, 0] == 0).all()
+    torch.testing.assert_close(seen[1] - seen[0], torch.tensor([0.1, 0.1, 0.0, 0.0]).double().expand(n, 4))
+
+
+def test_a_number_of_degrees_makes_uneven_ground():
+    env = diffsim.make("hopper", 3, terrain=12.0, seed=5)
+    np.testing.assert_array_equal(env.scene.terrain, uneven(12.0, 3, 5))
+    assert diffsim.make("hopper", 3, terrain=None, seed=5).scene.terrain is None
+
+
 # Input and pictures ---------------------------------------------------------------------------------------------------
 
 
@@ -252,7 +278,16 @@ def test_generated_profiles():
     assert np.array_equal(profile, rough(7, 2.0, 15.0, 20.0, 3.0)) and not np.array_equal(
         profile, rough(8, 2.0, 15.0, 20.0, 3.0)
     )
+    profiles = uneven(20.0, 4, seed=-3)
+    x, z = np.moveaxis(profiles, 2, 0)
+    assert (z[abs(x) <= LEVEL] == 0).all()
+    np.testing.assert_allclose([-x.min(), x.max()], LENGTH + LEVEL + 1)
+    angles = np.degrees(np.arctan(np.diff(z) / np.diff(x)))
+    assert 18 < abs(angles).max() < 20 and abs(angles.mean()) < 3
+    assert len(np.unique(z[:, -1])) == len(np.unique(z[:, 0])) == 4
+    assert np.array_equal(profiles, uneven(20.0, 4, -3)) and not np.array_equal(profiles, uneven(20.0, 4, 4))
     for make, message in (
+        (lambda: uneven(95.0, 1), "degrees is 95.0, must lie between -90 and 90"),
         (lambda: incline(90.0), "degrees is 90.0, must lie between -90 and 90"),
         (lambda: step(0.0), "height is 0.0, must be finite and not 0"),
         *(

@@ -15,6 +15,8 @@ MuJoCo's convex problem,
 is one pass of the articulated-body algorithm with each contact's block X'HX added to its link's inertia, and D to its
 joint's: `add_contacts` and `joint_constraint`.
 
+On a terrain (terrain.py) a contact's law and its adjoint act in the frame E of the feature that the sphere touches.
+
 The adjoint begins at phi = -f . w with w the velocity of the point under lambda: `add_contacts_adjoint`.
 
 A contact begins with a jump of its force, which no derivative within the law sees: where a sphere that sinks by s in a
@@ -34,6 +36,7 @@ from diffsim.kernels.kinematics import kinematics
 from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
+from diffsim.kernels.terrain import terrain_contact
 from diffsim.kernels.wide import blocks
 
 LEAST_SINKING = 1e-3  # m in a substep: a sphere that grazes the ground has a jump without bound, which is noise
@@ -45,6 +48,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     T, U, vec2, vec3, vec4, vec6, mat3 = t.T, t.U, t.vec2, t.vec3, t.vec4, t.vec6, t.mat3
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
     Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
+    Place, Frame, ground, TERRAIN = t.Place, t.Frame, terrain_contact(spec), "terrain" in spec.features
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
     @wp.func
@@ -110,11 +114,36 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return change * w[2] + (Ds * over - friction * change) * along
 
     @wp.func
-    def place(m: Model, c: int, link: Link, height: T):
-        """Centre of contact sphere c, its distance from the ground, and 1 where that is within its margin, else 0."""
+    def place(m: Model, here: Lane, c: int, link: Link, carrier: Place):
+        """Centre of contact sphere c, its distance from the ground, 1 where that is within its margin, else 0; the
+        frame of the contact, and the ground's curvature in it."""
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
-        distance = height + centre[2] - T(m.contact_radius[c])
-        return centre, distance, pick(distance, T(m.contact_numbers[c][10]), T(1.0), T(0.0))
+        if wp.static(TERRAIN):
+            x = carrier[0] + centre[0]
+            z = carrier[1] + centre[2]
+            reach = T(m.contact_radius[c] + m.contact_numbers[c][10])
+            hit = ground.nearest_of_each(m, here.e, x, z, m.contact_radius[c], reach)
+            distance = hit[0]
+            E = ground.frame_of(hit)
+            curvature = hit[3]
+        else:
+            distance = carrier + centre[2] - T(m.contact_radius[c])
+            E = T(1.0)
+            curvature = T(0.0)
+        return centre, distance, pick(distance, T(m.contact_numbers[c][10]), T(1.0), T(0.0)), E, curvature
+
+    @wp.func
+    def in_frame(E: Frame, v: vec3):
+        """A world vector in the frame of a contact, in which the law acts."""
+        if wp.static(TERRAIN):
+            return wp.transpose(E) * v
+        return v
+
+    @wp.func
+    def in_world(E: Frame, v: vec3):
+        if wp.static(TERRAIN):
+            return E * v
+        return v
 
     @wp.func
     def constants(m: Model, here: Lane, c: int):
@@ -125,21 +154,21 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec3(T(1.0), T(numbers[1]), T(numbers[2]))
 
     @wp.func
-    def contact_state(m: Model, here: Lane, c: int, centre: vec3, distance: T, on: T, V: vec6, B: vec6):
+    def contact_state(m: Model, here: Lane, c: int, centre: vec3, distance: T, on: T, E: Frame, V: vec6, B: vec6):
         """MuJoCo's contact point, jar, what row and what constants return; D is 0 where the sphere does not touch."""
         numbers = m.contact_numbers[c]
         # The point lies in the middle between the two surfaces.
-        p = centre - vec3(T(0.0), T(0.0), T(m.contact_radius[c]) + T(0.5) * distance)
+        p = centre - in_world(E, vec3(T(0.0), T(0.0), T(m.contact_radius[c]) + T(0.5) * distance))
         of = constants(m, here, c)
         state = row(numbers, of[0], wp.min(distance - T(numbers[10]), T(0.0)))
-        jar = point_velocity(B, p) + of[1] * point_velocity(V, p) + vec3(T(0.0), T(0.0), state[2])
+        jar = in_frame(E, point_velocity(B, p) + of[1] * point_velocity(V, p)) + vec3(T(0.0), T(0.0), state[2])
         D = on * state[0]
         if wp.static(VARIED):
             D = here.k_d * D
         return p, jar, vec4(D, state[1], state[2], state[3]), of
 
     @wp.func
-    def touch(m: Model, here: Lane, links: t.Links, height: T, touches: t.Contacts):
+    def touch(m: Model, here: Lane, links: t.Links, carrier: Place, touches: t.Contacts):
         """The contacts of a lane at the start of a substep, without acceleration.
 
         They are linear about where they were in the last substep, and stick if they did not touch there.
@@ -148,11 +177,11 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         for i in range(here.n):
             for c in range(m.contact_begin[here.at + i], m.contact_begin[here.at + i + 1]):
                 s = c - first
-                centre, distance, on = place(m, c, links[i], height)
+                centre, distance, on, E, _ = place(m, here, c, links[i], carrier)
                 stuck = T(1.0) - on * touches[s].on
                 touches[s].on = on
                 if block.any_of(on):
-                    p, jar, state, of = contact_state(m, here, c, centre, distance, on, links[i].V, vec6())
+                    p, jar, state, of = contact_state(m, here, c, centre, distance, on, E, links[i].V, vec6())
                     was = vec3()
                     for r in range(3):
                         was[r] = pick(T(0.0), stuck, jar[r], touches[s].jar[r])
@@ -162,6 +191,8 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                     touches[s].D = state[0]
                     touches[s].f = f + H * (was - jar)
                     touches[s].H = H
+                    if wp.static(TERRAIN):
+                        touches[s].E = E
 
     @wp.func
     def add_contacts(m: Model, here: Lane, k: int, touches: t.Contacts, load: Load):
@@ -171,11 +202,15 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             if block.any_of(touches[s].on):
                 p = touches[s].p
                 H = touches[s].H
+                f = touches[s].f
+                if wp.static(TERRAIN):
+                    f = touches[s].E * f
+                    H = touches[s].E * H * wp.transpose(touches[s].E)
                 PH = wp.skew(p) * H
                 load.a = load.a - PH * wp.skew(p)
                 load.b = load.b + PH
                 load.d = load.d + H
-                load.f = load.f - force_at(p, touches[s].f)
+                load.f = load.f - force_at(p, f)
         return load
 
     @wp.func
@@ -204,6 +239,8 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
             s = c - m.contact_begin[here.at]
             if block.any_of(touches[s].on):
                 by = point_velocity(step, touches[s].p)
+                if wp.static(TERRAIN):
+                    by = in_frame(touches[s].E, by)
                 if tries == 0:
                     touches[s].Hs = touches[s].H * by
                 jar = touches[s].jar + part * by
@@ -247,31 +284,44 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def add_contacts_adjoint(
-        m: Model, here: Lane, k: int, link: Link, node: t.Node, height: T, ck: t.Checkpoint, adj: t.Adjoint, by: t.Ts
+        m: Model,
+        here: Lane,
+        k: int,
+        link: Link,
+        node: t.Node,
+        carrier: Place,
+        ck: t.Checkpoint,
+        adj: t.Adjoint,
+        by: t.Ts,
     ):
         """The adjoints of link k with its contacts' part of phi added; by: those of factors."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            centre, distance, on = place(m, c, link, height)
+            centre, distance, on, E, curvature = place(m, here, c, link, carrier)
             if block.any_of(on):
-                p, _, state, of = contact_state(m, here, c, centre, distance, on, link.V, node.B)
+                p, _, state, of = contact_state(m, here, c, centre, distance, on, E, link.V, node.B)
                 jar = vec3()
                 for r in range(3):
                     jar[r] = kin.load(ck.a, here.row, 2 * NV + 3 * c + r, here.e)
                 f, H = cone(state[0], of[2], T(m.contact_numbers[c][3]), jar, T(0.0))
-                w = point_velocity(node.W, p)
+                w = in_frame(E, point_velocity(node.W, p))
+                moves = in_frame(E, point_velocity(link.V, p))
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
                 if here.touchdown == 1:
                     numbers = m.contact_numbers[c]
-                    sinks = wp.max(-here.h * point_velocity(link.V, p)[2], T(LEAST_SINKING))
+                    sinks = wp.max(-here.h * moves[2], T(LEAST_SINKING))
                     jump = wp.dot(f, w + T(numbers[4]) * g_jar) / sinks
                     g_r = g_r + pick(T(numbers[10]) - distance, sinks, jump, T(0.0))
                 if wp.static(VARIED):
-                    by_k = T(0.5) * of[1] * wp.dot(g_jar, point_velocity(link.V, p)) + g_jar[2] * state[2]
+                    by_k = T(0.5) * of[1] * wp.dot(g_jar, moves) + g_jar[2] * state[2]
                     by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)
                     by[K_N] = by[K_N] + by_k / of[0]
                     by[K_D] = by[K_D] - wp.dot(f, w) / here.k_d
                     by[MU] = by[MU] - T(m.contact_numbers[c][2]) * by_mu
+                if wp.static(TERRAIN):  # the adjoint of the frame's angle
+                    turns = wp.cross(g_jar, jar - vec3(T(0.0), T(0.0), state[2]))[1] - wp.cross(f, w)[1]
+                f = in_world(E, f)
+                g_jar = in_world(E, g_jar)
                 G = force_at(p, g_jar)
                 wrench = force_at(p, f)
                 g_p = wp.cross(g_jar, wp.spatial_top(node.B) + of[1] * wp.spatial_top(link.V)) - wp.cross(
@@ -280,8 +330,13 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 adj.w = adj.w - wrench
                 adj.v = adj.v + of[1] * G
                 adj.b = adj.b + G
-                # The point follows the sphere's centre, at half its speed up and down.
-                adj.p = adj.p + force_at(centre, vec3(g_p[0], g_p[1], T(0.5) * g_p[2] + g_r))
+                # The point follows the sphere's centre, at half its speed along the normal, which turns with it.
+                g_p = in_frame(E, g_p)
+                g_p[2] = T(0.5) * g_p[2] + g_r
+                if wp.static(TERRAIN):
+                    arm = T(m.contact_radius[c]) + T(0.5) * distance
+                    g_p[0] = g_p[0] + curvature * (turns - arm * g_p[0])
+                adj.p = adj.p + force_at(centre, in_world(E, g_p))
                 adj.p = (
                     adj.p + wp.spatial_cross_dual(of[1] * link.V + node.B, G) - wp.spatial_cross_dual(node.W, wrench)
                 )

@@ -32,7 +32,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, vec4, Model, Lane, Link = t.T, t.vec3, t.vec4, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
     Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
-    sphere_on_terrain, TERRAIN = terrain_contact(spec), "terrain" in spec.features
+    sphere_on_terrain, TERRAIN = terrain_contact(spec).sphere_on_terrain, "terrain" in spec.features
     IMPLICIT, VARIED = spec.implicit, spec.varied
 
     @wp.func

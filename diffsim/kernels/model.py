@@ -283,6 +283,8 @@ def types(spec: KernelSpec) -> SimpleNamespace:
     if spec.damped:
         structs["Node"] |= of(vec6="D W1")
         structs["Adjoint"] |= of(vec6="d w1")
+    if "terrain" in spec.features:
+        structs["Contact"] |= of(mat3="E")  # the frame in which jar, forces and H are
     kinds |= {name: struct(name, members) for name, members in structs.items()}
     return SimpleNamespace(
         **kinds,
@@ -291,6 +293,7 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         scene=scene_types(U),
         Model=scene_types(U).Model,
         Place=vec2 if "terrain" in spec.features else T,  # the carrier's: (x, z), or its height
+        Frame=mat3 if "terrain" in spec.features else T,  # of a contact: E of terrain.py, or the world's, of which is 1
     )
 
 

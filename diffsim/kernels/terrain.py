@@ -12,21 +12,23 @@ by both. So d and n are continuous, d's gradient is n, and dn = k t (t . dc) wit
 two features are equally near: for a centre that is itself below a ridge, which is a depth of r or more, and in a notch
 that the sphere does not fit into.
 
-The law of contact acts in the frame E = (t, y, n) of the feature. Its adjoint gains what turns that frame.
+The law of contact, be it contact.py's or constraint.py's, acts in the frame E = (t, y, n) of the feature. Its adjoint
+gains what turns that frame.
 """
 
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
-from diffsim.kernels.model import types
+from diffsim.kernels.model import functions, types
 from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
 
 @cache
-def terrain_contact(spec: KernelSpec) -> wp.Function:
+def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
     t, sp, block, BLOCK = types(spec), spatial(spec), blocks(spec), spec.block
     T, U, vec2, vec3, vec4, mat3, Model = t.T, t.U, t.vec2, t.vec3, t.vec4, t.mat3, t.Model
     uvec4 = t.scene.vec4
@@ -138,6 +140,11 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
         return result
 
     @wp.func
+    def frame_of(hit: vec4):
+        """E of what nearest() returns."""
+        return mat3(hit[2], T(0.0), hit[1], T(0.0), T(1.0), T(0.0), -hit[1], T(0.0), hit[2])
+
+    @wp.func
     def sphere_on_terrain(m: Model, here: t.Lane, c: int, link: t.Link, place: vec2):
         """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
         theta h ahead if implicit), E and the curvature k."""
@@ -148,13 +155,12 @@ def terrain_contact(spec: KernelSpec) -> wp.Function:
             fastest = wp.length(point_velocity(link.V, centre)) + r * wp.length(wp.spatial_top(link.V))
             reach = r + here.theta * here.h * fastest
         hit = nearest_of_each(m, here.e, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
-        n = vec3(hit[1], T(0.0), hit[2])
-        E = mat3(n[2], T(0.0), n[0], T(0.0), T(1.0), T(0.0), -n[0], T(0.0), n[2])
-        p = centre - r * n
+        E = frame_of(hit)
+        p = centre - r * vec3(hit[1], T(0.0), hit[2])
         v = wp.transpose(E) * point_velocity(link.V, p)
         depth = hit[0]
         if wp.static(IMPLICIT):
             depth = depth + here.theta * here.h * v[2]
         return p, v, depth, E, hit[3]
 
-    return sphere_on_terrain
+    return functions(locals())

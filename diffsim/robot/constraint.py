@@ -72,8 +72,6 @@ def _contact(m: mujoco.MjModel, ground: int, geom: int, fastest: float) -> Array
 
 def _obstacles(scene: Scene) -> Iterator[str]:
     m = scene.mj_model
-    if scene.terrain is not None:
-        yield "the ground is a plane, no terrain"
     if "diagexact" in enabled_flags(m):
         yield "the option flag diagexact cannot be enabled"
     width = m.jnt_range[:, 1] - m.jnt_range[:, 0]

@@ -24,6 +24,7 @@ from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import TOLERANCE, Integration
 from diffsim.tasks.mirror import Mirror
+from diffsim.terrain import Elevation
 
 Accuracy = Literal["fast", "default", "accurate"]
 Contact = Literal["soft", "mujoco"]
@@ -65,6 +66,7 @@ class Task:
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: float = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
+    ground: Elevation | None = None  # the terrain, if it is on one; heights that it sees are those over the root's
     start: tuple[float, ...] = ()  # by default the robot's keyframe "home", its first one, or qpos0; at rest
     spread: tuple[float, ...] | float = 0.0
 

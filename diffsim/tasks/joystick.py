@@ -20,6 +20,7 @@ from diffsim.tasks.base import Contact, Task
 from diffsim.tasks.feet import Feet
 from diffsim.tasks.locomotion import push, rotate, score
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, partners, reflections
+from diffsim.terrain import Elevation
 
 FREQUENCY_OF_COMMANDS = 0.2  # 1/s, how often a new command comes on average
 NEAR, SLIP = 0.01, 0.05  # m over the ground, within which a foot's speed counts as slip; (m/s)^2, the score's scale
@@ -247,12 +248,19 @@ class Joystick(Task):
         place, speed = self._feet.motion(joints, rates)
         speed = speed + velocity.unsqueeze(-2) + torch.linalg.cross(angular.unsqueeze(-2), place)
         high = position[..., 2:] - (place * gravity.unsqueeze(-2)).sum(-1)
+        if self.ground is not None:
+            high = high - self._rise(self.ground, position[..., :1], quat, place)
         along = speed.square().sum(-1) - (speed * gravity.unsqueeze(-2)).sum(-1).square()
         swing = self._moving(command) * (turn + 2.0 * math.pi * self._phases).sin().clamp(min=0.0).square()
         slip = (1.0 - swing) * torch.exp(-(high.clamp(min=0.0) / NEAR).square()) * score(along, SLIP)
         gap = (place[..., :1, 1] - place[..., 1:2, 1],) * bool(self.robot.apart)
         feet = *gap, high - self._rest - self.robot.lift * swing, slip
         return torch.cat((sensed + noise, last, command, turn.sin(), turn.cos(), *private, *feet), dim=-1)
+
+    @staticmethod
+    def _rise(ground: Elevation, x: Tensor, quat: Tensor, place: Tensor) -> Tensor:
+        """By how much (..., L) [m] the ground is higher below the feet than below the root, which is at x (..., 1)."""
+        return ground.at(x + rotate(quat.unsqueeze(-2), place)[..., 0]) - ground.at(x)
 
     @staticmethod
     def _moving(command: Tensor) -> Tensor:

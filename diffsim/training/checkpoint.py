@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import re
 import warnings
 import zipfile
 from collections import Counter
@@ -243,6 +244,8 @@ def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any]
             env[0].load_state_dict(env[1])
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         why = f"{type(error).__name__} {' '.join(str(error).split())}"
+        if sizes := re.search(r"size mismatch for (\S+): .*?\[(.*?)\].*?\[(.*?)\]", why):  # the first of many
+            why = "{}.{} has shape ({}), not ({})".format(name, *sizes.groups())
         fail(f"the checkpoint does not fit the flags, or the script as it is now: {why}")
 
 

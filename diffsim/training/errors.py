@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr
 from typing import NoReturn
 
 import torch
@@ -22,6 +26,20 @@ EXPECTED = (
     *(UsageError, SceneError, TaskError, TerrainError, TooLargeError, KernelCacheError, ActionError),
     *(FloatingPointError, torch.OutOfMemoryError),
 )
+
+
+@contextmanager
+def in_one_line() -> Iterator[None]:
+    """Around a call of tyro: what it cannot parse is told like other errors, instead of in a box of several lines."""
+    try:
+        with redirect_stderr(io.StringIO()) as box:
+            yield
+    except SystemExit as end:
+        if not end.code:  # --help
+            raise
+        rows = re.sub(r"\x1b\[[\d;]*m", "", box.getvalue()).splitlines()[1:-1]  # without colours, title and border
+        parts = re.split("[─-]{5,}", " ".join(" ".join(row.strip("│|").split()) for row in rows))  # between rules
+        fail("; ".join(part.strip(" .") for part in parts if part and not part.startswith(" Argument helptext")))
 
 
 def fail(message: object) -> NoReturn:

@@ -26,7 +26,7 @@ from diffsim.training import checkpoint, gait, graph
 from diffsim.training.checkpoint import Learner, SavedPolicy
 from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
-from diffsim.training.flags import Args, Flags
+from diffsim.training.flags import OPTIONS, Args, Flags
 
 L = TypeVar("L", bound=Learner)
 
@@ -35,9 +35,7 @@ SEED = 1_000_000  # of the start states: the same for every policy, and far from
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
 ENOUGH = 0.97  # of the return, kept there
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
-# Flags that diffsim.make takes as they are; control_dt is one of gps.py.
-OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination clip control_dt".split()}
-SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
+SETTINGS = OPTIONS | {"env", "device", "eval_episodes", "rough"}
 
 
 @dataclass
@@ -218,7 +216,7 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, seed: int = 0, **others: Any) -> DiffEnv:
     """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
     options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
-    options["threads"] = args.threads or None
+    options |= dict(threads=args.threads or None, terrain=getattr(args, "rough", 0.0) or None)
     try:
         return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options | others)
     except ValueError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -12,11 +12,11 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 
 from diffsim.sim.integration import PASSES, TOLERANCE
-from diffsim.tasks import FILE, Contact, Imitation, Task, find_task, tracking
+from diffsim.tasks import FILE, TASKS, Contact, Imitation, Task, find_task, tracking
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
-from diffsim.training.errors import fail
-from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Range, check_ranges, flag
+from diffsim.training.errors import fail, in_one_line
+from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Range, Repeats, check_ranges, flag
 from diffsim.training.variation import parse_ranges
 
 ClipFile = Annotated[
@@ -29,8 +29,14 @@ ClipFile = Annotated[
         str_from_instance=lambda clip: [str(clip)],
     ),
 ]
-# Of a run that goes on or is evaluated; what else must fit, `restore` tells.
-FIXED = ("env", "seed", "num_envs", "control_dt")
+FIXED = ("env", "seed", "num_envs", "control_dt")  # with --resume; what else must fit, `restore` tells
+# Flags that diffsim.make takes as they are; control_dt is one of gps.py.
+OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination clip control_dt".split()}
+EVALUATED = OPTIONS - {"control_dt"} | {
+    *"accuracy device eval_episodes evaluate finer quiet rough run_dir threads".split()
+}
+ENV = f"task: {', '.join(TASKS)}, or a file of your own, my_task.py or my_task.py:Class (docs/own_robot.md)"
+Slope = Annotated[float, Range("from 0 to 45", lambda degrees: 0 <= degrees <= 45)]
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -63,7 +69,7 @@ class RunFlags:
     track: bool = False
     """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
-    """no progress bar"""
+    """no progress bar, and no messages until the end"""
 
 
 @dataclass
@@ -72,8 +78,7 @@ class Flags(RunFlags):
 
     fixed: ClassVar[tuple[str, ...]] = ()  # flags of a script that --resume keeps
 
-    env: Annotated[str, tyro.conf.arg(aliases=["--env-id"])] = "ant"
-    """task: one of diffsim.TASKS, or a file with your own, my_task.py or my_task.py:Class (docs/own_robot.md)"""
+    env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
     accuracy: Literal["fast", "default", "accurate"] = "default"
     """preset of integrator, substeps and theta (docs/numerics.md); default: the papers' settings"""
     integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
@@ -122,6 +127,8 @@ class ParallelFlags(Flags):
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
     randomise: tuple[str, ...] = ()
     """ranges from which environments draw: friction=0.7:1.3, stiffness, mass, motor; latency, push, pull (per task)"""
+    rough: Slope = 0.0
+    """steepest slope of rough ground along x in degrees, another profile for each environment (0: a plane)"""
     redraw: Count = 10
     """iterations after which the ranges of --randomise are drawn again"""
     monitor: Natural = 50
@@ -163,6 +170,16 @@ class WindowFlags(SymmetricFlags):
 
     adjoint_clip: NonNegative = 0.0
     """clip gradients with respect to a state to this many times the batch's median (0: do not clip)"""
+    horizon: Count = 32
+    """control steps h of a rollout (per task)"""
+    critic_minibatches: Repeats = 4
+    """minibatches of a pass over a rollout's samples, contiguous in time"""
+
+    def check(self) -> None:
+        super().check()
+        samples = self.num_envs * self.horizon // (distributed.size() * getattr(self, "population", 1))
+        if self.critic_minibatches > samples:
+            fail(f"--critic-minibatches {self.critic_minibatches} are more than the {samples} samples of a rollout")
 
 
 Args = TypeVar("Args", bound=Flags)
@@ -240,10 +257,12 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
-    for name in FIXED + (kind.fixed if args.resume else ()):
+    fixed: Iterable[str] = FIXED + kind.fixed if args.resume else [name for name in hints if name not in EVALUATED]
+    may = f"; --evaluate takes {', '.join(map(flag, sorted(EVALUATED)))}" if args.evaluate else ""
+    for name in fixed:
         own, wanted = (getattr(each, name, None) for each in (defaults, args))
         if str(own) != str(wanted):  # a saved path is a text
-            fail(f"{path} has {flag(name)} {own}, which cannot change to {wanted}")
+            fail(f"{path} has {flag(name)} {own}, which cannot change to {wanted}{may}")
     if args.resume:
         last = min(args.iterations, args.stop_after or args.iterations)
         if saved["iteration"] >= last:
@@ -256,7 +275,8 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
-    args = tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
+    with in_one_line():
+        args = tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
     try:
         args.clip = read_clip(args.clip) if isinstance(args.clip, str) else args.clip
     except ValueError as error:

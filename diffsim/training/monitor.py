@@ -24,7 +24,8 @@ class Monitor:
         self.env, self.warned, how = env, False, env.sim.integration
         count = min(WATCHED, env.num_envs)
         finer = how._replace(substeps=FINER * how.substeps)
-        self.envs = [make_env(args, count, substeps=each.substeps, **ENDLESS) for each in (how, finer)]
+        ground = None if env.scene.terrain is None else env.scene.terrain[:count]
+        self.envs = [make_env(args, count, substeps=each.substeps, terrain=ground, **ENDLESS) for each in (how, finer)]
 
     @torch.no_grad()
     def replay(self, policy: torch.nn.Module) -> dict[str, float]:

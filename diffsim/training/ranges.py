@@ -33,6 +33,7 @@ def _whole(least: int, most: int) -> Range:
 
 Count = Annotated[int, _whole(1, 10**9)]
 Natural = Annotated[int, _whole(0, 10**9)]
+Batch = Annotated[int, _whole(1, 10**6)]  # samples drawn at once
 Repeats = Annotated[int, _whole(1, 10_000)]  # what takes time one after the other
 Few = Annotated[int, _whole(1, 1_000)]  # networks side by side
 Several = Annotated[int, _whole(2, 1_000)]  # parts of which one alone is none

@@ -6,14 +6,19 @@ import shutil
 from pathlib import Path
 
 import joystick
+import mujoco
 import numpy as np
 import pytest
+import worlds
 from common import parse
 from learners import refusal
 from tables import read_csv
 
 import diffsim
+from diffsim.tasks import TASKS
+from diffsim.terrain import uneven
 
+BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 POLICIES = Path(diffsim.__file__).parent / "policies"
 
 
@@ -74,6 +79,26 @@ def test_a_race_is_won_by_the_first_checkpoint_that_is_good_enough(
     first = row | {"training s": "8", "error": "0.07"}
     (line,) = joystick.race([*later, first])
     assert line["s to 0.1 m/s"] == "8" and line["s to 0.05 m/s"] == "80" and line["in all (s)"] == "80"
+
+
+def test_rough_ground_is_made_of_boxes_and_judged_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the plane's own numbers, and heights that are the profile's."""
+    out = judged(f"{POLICIES / 'go2.pt'} --rough 0 15", tmp_path, capsys)
+    plane, hilly = read_csv(tmp_path / "joystick_rough.csv")
+    assert (plane["rough"], hilly["rough"], plane["whole"]) == ("0", "15", "1")
+    assert 0 < float(plane["error"]) < float(hilly["error"]) < 0.3
+    assert [line.split(" | ")[:4] for line in out.splitlines()[-3:-1]] == [["| go2", n, "0", "1"] for n in ("0", "15")]
+    spec, profile = mujoco.MjSpec.from_file(TASKS["go2"].load_robot().path), uneven(15.0, 1)[0]
+    flat, model = spec.compile(), worlds.on_terrain(spec, profile)
+    floor, boxes = (m.geom_bodyid == 0 for m in (flat, model))
+    assert floor.sum() == 1 and boxes.sum() == len(profile) - 1 and set(model.geom_type[boxes]) == {BOX}
+    for name in ("geom_friction", "geom_solref", "geom_solimp", "geom_condim", "geom_conaffinity"):
+        assert (getattr(model, name)[boxes] == getattr(flat, name)[floor]).all()
+    mujoco.mj_kinematics(model, data := mujoco.MjData(model))
+    for x in np.linspace(-9.9, 9.9, 41):
+        start, found = np.array([x, 3.0, 20.0]), np.zeros(1, np.int32)
+        fallen = mujoco.mj_ray(model, data, start, np.array([0.0, 0.0, -1.0]), None, 1, -1, found)
+        assert 20.0 - fallen == pytest.approx(np.interp(x, *profile.T), abs=1e-9)
 
 
 def test_an_episode_that_is_too_short_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import get_type_hints
@@ -58,6 +59,8 @@ def save(args: flags.Flags, **further: object) -> Path:
         (shac, "--actor-hidden 4611686018427387904", "from 1 to 16,384"),
         (shac, "--critic-hidden -1", "from 1 to 16,384"),
         (sapo, "--critics 2147483648", "from 1 to 1,000"),
+        (sac_baseline, "--batch-size 1000000000", "from 1 to 1,000,000"),
+        (pods, "--epochs 1000000000", "from 1 to 10,000"),
         (shac, "--seed 99999999999999999999", "below 2^62 in size"),
         (shac, "--actor-lr inf", "finite"),
         (shac, "--gamma nan", "finite"),
@@ -84,6 +87,8 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
     [
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant, humanoid"),
         ("--env walker --accuracy fast", "task 'walker' has no preset 'fast' on soft contact; choose from default"),
+        ("--env cartpole --rough 10", "cartpole touches no ground, so it has no terrain"),
+        ("--env walker --rough 50", "--rough must be from 0 to 45, not 50.0"),
         ("--substeps 5 --integrator extrapolated", "substeps is 5, must be even"),
         ("--device nonsense", "nonsense"),
         ("--device cuda", "device 'cuda' asked for, but PyTorch sees 0 CUDA GPUs here; choose cpu"),
@@ -102,10 +107,25 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
         ("--resume {file} --evaluate {file}", "--resume and --evaluate exclude each other"),
         ("--inverse-variance --deterministic-policy", "--inverse-variance weights the density of a policy"),
         ("--inverse-variance --num-envs 1", "--num-envs must be at least 2 per process"),
+        (
+            "--env cartpole --num-envs 3 --horizon 4 --critic-minibatches 13",
+            "13 are more than the 12 samples",
+        ),
+        ("--num_env 3", "Unrecognized options: --num_env, 3; Perhaps you meant: --num-envs INT parallel"),
+        ("--seed 1.5", "Error parsing --seed: invalid literal for int() with base 10: '1.5'; For full helptext, see "),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp_path, capsys):
     assert_refuses(shac, arguments, message, tiny_run, tmp_path, capsys)
+
+
+def test_what_tyro_cannot_parse_is_told_without_boxes_and_colours(tiny_run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    for encoding in ("utf-8", "ascii"):
+        monkeypatch.setattr(type(sys.stdout), "encoding", encoding)
+        message = "script.py: Missing value for argument '--gamma'. Expected 1 values; For full helptext, run script.py"
+        assert refusal(lambda: parse(shac.Args, ["--gamma"]), capsys).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -198,16 +218,17 @@ def test_what_a_checkpoint_decides(capsys):
         ("--num-envs 4", "--num-envs 3, which cannot change to 4"),
         ("--seed 2", "--seed 1, which cannot change to 2"),
     ):
-        for mode in ("--resume", "--evaluate"):
+        for mode, more in ("--resume", ""), ("--evaluate", "; --evaluate takes --accuracy, --clip, --contact, "):
             command = [mode, str(path), *argument.split()]
             line = refusal(lambda command=command: parse(shac.Args, command), capsys)
-            assert line == f"script.py: {path} has {saved}"
+            assert line.startswith(f"script.py: {path} has {saved}{more}") and bool(more) == ("--eval-episodes" in line)
+    assert parse(shac.Args, ["--evaluate", str(path), *"--eval-episodes 9 --substeps 8 --quiet".split()]).substeps == 8
 
 
 def test_networks_keep_their_sizes_and_other_flags_may_change(tiny_run, tmp_path, capsys):
     words = ["--resume", str(tiny_run / "checkpoint.pt"), "--run-dir", str(tmp_path / "run"), "--iterations", "3"]
     line = refusal(lambda: shac.main([*words, "--actor-hidden", "5"]), capsys)
-    assert "the checkpoint does not fit the flags, or the script as it is now: RuntimeError" in line
+    assert line.endswith("the script as it is now: actor.mean.0.weight has shape (64, 5), not (5, 5)")
     assert not (tmp_path / "run").exists()
     shac.main([*words, "--gamma", "0.9", "--eval-episodes", "2", "--quiet"])
     assert checkpoint.load(tmp_path / "run" / "checkpoint.pt")["args"]["gamma"] == 0.9

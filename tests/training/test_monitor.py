@@ -38,6 +38,13 @@ def test_a_replay_is_what_two_simulators_make_of_the_same_actions():
     assert found["sim/return_lost"] == pytest.approx((rewards[0] - rewards[1]) / abs(rewards[0]), rel=1e-4)
 
 
+def test_it_replays_on_the_ground_of_the_training():
+    args = parse(shac.Args, [*FLAGS, "--rough", "20"])
+    env = diffsim.make("hopper", 4, seed=3, horizon=4, terrain=20.0)
+    for each in monitor.Monitor(args, env).envs:
+        np.testing.assert_array_equal(each.scene.terrain, env.scene.terrain)
+
+
 def test_it_changes_nothing_and_warns_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(monitor, "SUSPECT", 0.0)
     weights = []

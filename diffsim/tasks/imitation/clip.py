@@ -72,8 +72,10 @@ class Clip:
         return self if frames == len(self.qpos) else Clip(self.name, _resample(self.qpos, frames), self.loop)
 
     def motions(self) -> list[Clip]:
-        """Each motion, of which none is a loop."""
-        return [Clip(self.name, part, loop=False) for part in self.qpos.split(self.lengths or (len(self.qpos),))]
+        """Each motion, of which none is a loop; those of a folder have their number in the order of its files."""
+        if not self.lengths:
+            return [Clip(self.name, self.qpos, loop=False)]
+        return [Clip(f"{self}, file {k}", part, loop=False) for k, part in enumerate(self.qpos.split(self.lengths), 1)]
 
     def smoothed(self, frames: int) -> Clip:
         """The mean over so many frames around each, so that single bad ones do no harm; at the ends over fewer."""

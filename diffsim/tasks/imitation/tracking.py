@@ -28,7 +28,24 @@ STANDING = 0.05  # share of a clip's frames in which a foot may be in the ground
 REACH = 0.4  # rad, by how much an action changes a servo's target: its range is the clip's and so much to both sides
 BEFORE_END = 60  # frames, at least, that an episode has of its clip, if this is longer
 AHEAD = 3  # frames, how much earlier the reference is seen
+SLIPPING = 2.5  # recorded feet slip less than a fourth of what they seem to with another order of the quaternion
+STILL = 0.01  # m/s of the feet, below which a clip may stand still in any order
 TURNED = 1.0  # rad; the episode ends when the root is turned from the reference's by more
+
+
+def soles(scene: Scene, kinematics: Kinematics, qpos: Tensor) -> Tensor:
+    """(T, points, 3) m, where the robot's points of contact are with qpos (T, nq)."""
+    positions, rotations = kinematics(qpos)
+    link, point = torch.from_numpy(scene.contact_link).long(), torch.from_numpy(scene.contact_position)
+    places = positions[:, link] + (rotations[:, link] * point.unsqueeze(-2)).sum(-1)
+    return places - torch.from_numpy(scene.contact_radius).unsqueeze(-1) * places.new_tensor((0.0, 0.0, 1.0))
+
+
+def slip(points: Tensor) -> float:
+    """The median way [m] that the lowest of the points (T, points, 3) goes in a frame: one that bears the robot stays
+    where it is."""
+    lowest = points[:-1, :, 2:].argmin(1, keepdim=True).expand(-1, -1, 3)
+    return float(points.diff(dim=0).gather(1, lowest).norm(dim=-1).median())
 
 
 class Tracking(Imitation):
@@ -99,11 +116,16 @@ class Tracking(Imitation):
                 f"joint {scene.mj_model.joint(int(rates.argmax()) + 1).name!r} turns by up to {rates.max():.3g} rad/s"
             )
             raise ValueError(f"clip {motion}: {which}, more than a motor's {FASTEST:g}; is it played too fast?")
-        positions, rotations = kinematics(found.qpos)
-        link, point = torch.from_numpy(scene.contact_link).long(), torch.from_numpy(scene.contact_position)
-        heights = positions[:, link, 2] + (rotations[:, link, 2] * point).sum(-1)
-        lowest = (heights - torch.from_numpy(scene.contact_radius)).amin(1).quantile(STANDING)
-        found.qpos[:, :3] -= torch.stack((*found.qpos[0, :2], lowest))
+        root, quat, joints = found.qpos.split((3, 4, self.joints), dim=1)
+        shifts = {0: "", 1: "xyzw, but is read as wxyz", -1: "wxyz, but is read as xyzw"}
+        points = {k: soles(scene, kinematics, torch.cat((root, quat.roll(k, 1), joints), 1)) for k in shifts}
+        slips = {k: slip(each) / self.control_dt for k, each in points.items()}
+        best = min(slips, key=slips.__getitem__)
+        if slips[0] > max(SLIPPING * slips[best], STILL):
+            raise ValueError(
+                f"clip {motion}: feet slip by {slips[0]:.2g} m/s; the root's quaternion seems to be {shifts[best]}"
+            )
+        found.qpos[:, :3] -= torch.stack((*root[0, :2], points[0][..., 2].amin(1).quantile(STANDING)))
         return found
 
     def _within_reach(self, scene: Scene) -> Scene:

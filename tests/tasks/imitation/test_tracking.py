@@ -108,9 +108,29 @@ def test_bad_clips_are_refused_in_one_line(tmp_path: Path) -> None:
         ValueError, match=r"clips of .*empty are for several robots: their qpos have \{36, 30\}|\{30, 36"
     ):
         read_clip(empty)
+    write_csv(empty / "b.csv", wide)
+    with pytest.raises(ValueError, match="clip empty, file 2: joint '.*' is up to"):
+        diffsim.make("g1_track", 1, clip=f"{empty}:60")
     with pytest.raises(ValueError, match="task 'humanoid_imitation' tracks one motion, not the 2 of two"):
         motion = read_clip("humanoid_run").qpos
         diffsim.make("humanoid_imitation", 1, clip=Clip("two", torch.cat((motion, motion)), False, (24, 24)))
+
+
+@pytest.mark.parametrize("name", ["g1_karate", "g1_jazz_walk"])
+def test_a_quaternion_in_another_order_is_told_by_the_feet(tmp_path: Path, name: str) -> None:
+    qpos, about = read_clip(name).qpos.numpy(), np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x: upside down
+    shifted = np.concatenate((qpos[:, :3], np.roll(qpos[:, 3:7], -1, 1), qpos[:, 7:]), 1)
+    np.savez(npz := tmp_path / "bad.npz", qpos=shifted, fps=60, loop=False)
+    np.savetxt(csv := tmp_path / "bad.csv", qpos, delimiter=",")  # wxyz
+    for source, order in ((npz, "xyzw, but is read as wxyz"), (f"{csv}:60", "wxyz, but is read as xyzw")):
+        with pytest.raises(
+            ValueError, match=f"^clip bad: feet slip by .* m/s; the root's quaternion seems to be {order}$"
+        ):
+            diffsim.make("g1_track", 1, clip=source)
+    for row in qpos:
+        row[1:3] *= -1
+        mujoco.mju_mulQuat(row[3:7], about, row[3:7].copy())
+    diffsim.make("g1_track", 1, clip=Clip("handstand", torch.from_numpy(qpos), loop=False))
 
 
 # The reference --------------------------------------------------------------------------------------------------------
