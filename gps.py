@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -33,7 +33,7 @@ from diffsim.training import distributed, evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import SEED, Evaluation
 from diffsim.training.flags import Flags
 from diffsim.training.layers import ObsNormalizer
-from diffsim.training.ranges import Count, Natural, NonNegative, Positive, Repeats, Several
+from diffsim.training.ranges import ORDERED, Count, Natural, NonNegative, Positive, Repeats, Several
 from diffsim.training.run import Run
 
 STORED = 3  # times --active, the samples of S that are kept to choose from
@@ -96,7 +96,7 @@ class Args(Flags):
     """trajectories in the active set S_k"""
     lbfgs_iterations: Repeats = 60
     """L-BFGS iterations of each of an iteration's two optimisations"""
-    regularizer_bounds: tuple[NonNegative, NonNegative] = (1e-6, 1e-2)
+    regularizer_bounds: Annotated[tuple[NonNegative, NonNegative], ORDERED] = (1e-6, 1e-2)
     """w_r starts at their geometric mean and is changed by factors of ten between them; 0 0: no regularizer"""
 
     def task_defaults(self) -> dict[str, Any]:
@@ -120,8 +120,6 @@ class Args(Flags):
             fail(f"--demonstration must be an example for {self.env}; shipped are those of {', '.join(PER_TASK)}")
         if self.active < (least := self.guiding_samples + self.samples):
             fail(f"--active must be at least {least}, for the guides' and the policy's samples, not {self.active}")
-        if self.regularizer_bounds[0] > self.regularizer_bounds[1]:
-            fail(f"--regularizer-bounds must be two numbers in order, not {self.regularizer_bounds}")
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from diffsim.training import Run, distributed, fail, script
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
+from diffsim.training.ranges import Bounds, Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
 
 # The settings of ppo_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
 # fmt: off
@@ -73,7 +73,7 @@ class Args(ParallelFlags):
     """units of the hidden layers, which policy and value share (per task)"""
     lr: Positive = 3e-4
     """initial learning rate, which then follows the KL divergence of the updates"""
-    lr_bounds: tuple[Positive, Positive] = (1e-6, 1e-2)
+    lr_bounds: Bounds = (1e-6, 1e-2)
     """smallest and largest learning rate; two equal numbers fix it"""
     gamma: Fraction = 0.99
     """discount factor"""
@@ -94,9 +94,6 @@ class Args(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        least, largest = self.lr_bounds
-        if least > largest:
-            fail(f"--lr-bounds {least} {largest}: the first must not exceed the second")
         if not LOG_STD[0] <= (self.initial_log_std or 0.0) <= LOG_STD[1]:
             fail(f"--initial-log-std must be from {LOG_STD[0]:g} to {LOG_STD[1]:g}, not {self.initial_log_std}")
 

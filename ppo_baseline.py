@@ -20,11 +20,11 @@ from torch import Tensor, nn
 
 from diffsim import DiffEnv
 from diffsim.tasks.mirror import Mirror
-from diffsim.training import Run, distributed, fail, script
+from diffsim.training import Run, distributed, script
 from diffsim.training.flags import SymmetricFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, moments, seeing
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
+from diffsim.training.ranges import Bounds, Count, Finite, Fraction, Natural, NonNegative, Positive, Repeats, Widths
 
 # Table 2 of the SHAC paper; networks, iterations, hopper and half_cheetah: its authors' released settings. They have no
 # entropy bonus, with which hopper and ant learn more (docs/ppo.md).
@@ -61,7 +61,7 @@ class Args(SymmetricFlags):
     """initial learning rate, which then follows the KL divergence of the updates"""
     target_kl: Positive = 0.008
     """the learning rate falls if a minibatch's KL divergence is above twice this, and rises if it is below half"""
-    lr_bounds: tuple[Positive, Positive] = (1e-6, 1e-2)
+    lr_bounds: Bounds = (1e-6, 1e-2)
     """smallest and largest learning rate; two equal numbers fix it"""
     max_grad_norm: Positive = 1.0
     """gradients are clipped to this norm"""
@@ -91,12 +91,6 @@ class Args(SymmetricFlags):
         if self.device == "cpu":
             values |= {name: min(values.get(name, getattr(self, name)), most) for name, most in CPU.items()}
         return super().task_defaults() | values | BALANCING.get(self.env, {})
-
-    def check(self) -> None:
-        super().check()
-        least, largest = self.lr_bounds
-        if least > largest:
-            fail(f"--lr-bounds {least} {largest}: the first must not exceed the second")
 
 
 # Networks -------------------------------------------------------------------------------------------------------------

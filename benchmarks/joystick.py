@@ -221,14 +221,17 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def rough(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each steepest slope, and the ground on which policies were trained."""
-    rows = [row | {"trained on": row["learner"].partition(" --rough ")[2] or "0"} for row in rows]
+    """A line for each number and ground, a column for each task, learner and ground of the training."""
+    rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
+    rows = [row | {"on": f"{row['learner'].partition(' --rough ')[2] or 0}°"} for row in rows]
+    columns = {", ".join(key): group for key, group in sorted(grouped(rows, "task", "by", "on").items())}
     lines = list[Row]()
-    for (task, slope, ground), group in sorted(grouped(rows, "task", "rough", "trained on").items()):
-        line = {"task": task, "slopes (degrees)": slope, "trained on": ground, "seeds": len(group)}
-        errors = {"error (m/s)": "error", "worst command (m/s)": "worst error", "yaw rate (rad/s)": "yaw error"}
-        line |= {"without a fall": with_worst(group, "whole", ".0%", min)}
-        lines.append(line | {title: with_worst(group, column, ".3f", max) for title, column in errors.items()})
+    for title, column, form, worst in (("whole", "whole", ".0%", min), ("error (m/s)", "error", ".3f", max)):
+        for slope in sorted({row["rough"] for row in rows}, key=float):
+            line = {"ground": f"{title}, {slope}°"}
+            for policy, group in columns.items():
+                line[policy] = with_worst([row for row in group if row["rough"] == slope], column, form, worst)
+            lines.append(line)
     return lines
 
 

@@ -83,6 +83,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     clip = own.clip if args.clip is None else read_clip(args.clip)
     task = type(own)(dtype=torch.float64, clip=clip)
     task.bind(case.env.scene)
+    task.low, task.high = own.low.double(), own.high.double()  # other clips do not move the servos' range
     count, about = len(task.motions[0]), case.about
     if case.saved.simulator != HOME:
         about["learner"] = f"{about['learner']} in {case.saved.simulator}"
@@ -112,12 +113,13 @@ def alone(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str]], list[dict[str, str]]]]:
-    """A policy's name for each clip, learner and device, over seeds; its rows, and those with the file's friction and
-    no push."""
+    """A policy's name for each clip, learner (if not sapo) and device (if not a GPU), over seeds; its rows, and those
+    with the file's friction and no push."""
     for (clip, learner, device), group in grouped(rows, "clip", "learner", "device").items():
         name, drawn, _ = learner.partition(" --randomise")
+        policy = ", ".join((clip, *(() if name == "sapo" else (name,)), *(() if device == "cuda" else (device,))))
         plain = [row for row in group if float(row["friction"]) == 1 and float(row["push"]) == 0]
-        yield f"{clip}, {name}, {device}{'' if drawn else ', not randomised'}", group, plain
+        yield policy + ("" if drawn else ", not randomised"), group, plain
 
 
 def table(rows: list[dict[str, str]]) -> list[Row]:
@@ -151,7 +153,7 @@ def many(rows: list[dict[str, str]]) -> list[Row]:
 
 def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
     """Control steps and seconds of training until enough episodes succeed, for the first time and for two checkpoints
-    in a row, of a GPU's only trainings; or of those that shared one, whose seconds do not count."""
+    in a row, of a GPU's only trainings; or how those end that shared one."""
     lines = list[Row]()
     rows = [row | {"run": row["checkpoint"].partition("/")[0]} for row in rows]
     for (name,), group in grouped(rows, "run").items():
@@ -161,8 +163,8 @@ def race(rows: list[dict[str, str]], shared: bool = False) -> list[Row]:
         enough = [row for row in group if float(row["success"]) >= ENOUGH]
         twice = [row for row, after in pairwise(group) if row in enough and after in enough]
         line = {"training": name.removesuffix("_shared").partition("__")[0].replace("_", " ")}
-        line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
         if not shared:
+            line[f"M steps to {ENOUGH:.0%}"] = f"{float(enough[0]['control steps']) / 1e6:.3g}" if enough else "never"
             for column, found in ((f"s to {ENOUGH:.0%}", enough), ("twice in a row (s)", twice)):
                 line[column] = found[0]["training s"] if found else "never"
             line["in all (s)"] = group[-1]["training s"]

@@ -362,7 +362,7 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
         ("--guiding-samples 1", "--guiding-samples must be from 2 to 1,000, not 1"),
         ("--active 20", "--active must be at least 50, for the guides' and the policy's samples, not 20"),
         ("--resume {trained}/checkpoint.pt --control-dt 0.02", "has --control-dt 0.016666666666666666, which cannot "),
-        ("--regularizer-bounds 1 0.1", "--regularizer-bounds must be two numbers in order"),
+        ("--regularizer-bounds 1 0.1", "--regularizer-bounds must be two numbers, the first not above"),
         ("--demonstration {file}.npz", "no such trajectory: {file}.npz"),
         ("--demonstration {file}", "{file} is not an .npz with qpos, qvel and action"),
         (

@@ -480,7 +480,7 @@ def test_settings_are_those_of_the_baselines(script: Any, baseline: Any, env: st
     ("script", "arguments", "message"),
     [
         (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
-        (pfpn, "--lr-bounds 1e-2 1e-3", "the first must not exceed the second"),
+        (pfpn, "--lr-bounds 1e-2 1e-3", "must be two numbers, the first not above the second, not (0.01, 0.001)"),
         (pfpn, "--initial-log-std nan", "--initial-log-std must be from -5 to 2, not nan"),
         (pfpn, "--initial-log-std 2.5", "--initial-log-std must be from -5 to 2, not 2.5"),
         (pfpn_sac, "--buffer-size 10", "--buffer-size 10 is smaller than a rollout of 4096 steps"),

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 # Four threads that make the same environment and step it for the first time. Optimisation would take ten seconds.
 THREADS = """
 import threading, torch, warp
-warp.config.optimization_level = 0
+warp.config.optimization_level, warp.config.use_precompiled_headers = 0, False
 import diffsim
 torch.set_num_threads(1)
 start, results = threading.Barrier(4), []

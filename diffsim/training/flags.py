@@ -258,7 +258,7 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     args = _cli(kind, argv, defaults)
     args.device = distributed.choose_device(args.device)
     fixed: Iterable[str] = FIXED + kind.fixed if args.resume else [name for name in hints if name not in EVALUATED]
-    may = f"; --evaluate takes {', '.join(map(flag, sorted(EVALUATED)))}" if args.evaluate else ""
+    may = f"; --evaluate takes {', '.join(map(flag, sorted(EVALUATED & hints.keys())))}" if args.evaluate else ""
     for name in fixed:
         own, wanted = (getattr(each, name, None) for each in (defaults, args))
         if str(own) != str(wanted):  # a saved path is a text

@@ -43,6 +43,8 @@ Positive = Annotated[float, Range("positive", lambda value: value > 0)]
 NonNegative = Annotated[float, Range("at least 0", lambda value: value >= 0)]
 Fraction = Annotated[float, Range("in [0, 1]", lambda value: 0 <= value <= 1)]
 Decay = Annotated[float, Range("in [0, 1)", lambda value: 0 <= value < 1)]
+ORDERED = Range("two numbers, the first not above the second", lambda value: value[0] <= value[1])
+Bounds = Annotated[tuple[Positive, Positive], ORDERED]
 Widths = tuple[Width, ...]
 SomeWidths = Annotated[Widths, Range("at least one number", lambda value: len(value) > 0)]
 

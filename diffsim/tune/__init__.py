@@ -11,9 +11,10 @@ from torch import Tensor
 from tyro.conf import Positional
 
 import diffsim
+from diffsim.sim.integration import check_count
 from diffsim.sim.options import check_device
 from diffsim.tasks import FILE, Contact, Task, find_task
-from diffsim.training import Count, fail, load_policy
+from diffsim.training import fail, load_policy
 from diffsim.training.checkpoint import POLICIES
 from diffsim.tune.extremes import stress
 from diffsim.tune.front import Row, choice, flags, front, measure, settings
@@ -29,7 +30,7 @@ def tune(
     checkpoint: Path | None = None,
     contact: Contact | None = None,
     device: str = "cpu",
-    states: Count = 32,
+    states: int = 32,
     csv: Path | None = None,
     extremes: bool = False,
 ) -> None:
@@ -46,6 +47,7 @@ def tune(
         extremes: also find the values with which each integrator fails.
     """
     check_device(device)
+    check_count("--states", states)
     if not error > 0:
         fail(f"--error is {error:g}, must be positive")
     task = subject(robot)

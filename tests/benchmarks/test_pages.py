@@ -14,7 +14,11 @@ from learners import refusal
 from diffsim.training.checkpoint import POLICIES
 
 MADE = "gradients", "joystick", "numerics", "suites", "tracking", "transfer", "gps_controllers"
-CASES = [*((name, {}) for name in MADE), ("joystick", {"race": True}), ("numerics", {"parts": ("promise",)})]
+CASES = [
+    *((name, {}) for name in MADE),
+    *((name, {"race": True}) for name in ("joystick", "tracking")),
+    ("numerics", {"parts": ("promise",)}),
+]
 
 
 @pytest.mark.parametrize(("name", "flags"), CASES)

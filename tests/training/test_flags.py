@@ -71,14 +71,13 @@ def save(args: flags.Flags, **further: object) -> Path:
         (shac, "--theta 1.5", "in [0, 1]"),
         (bptt, "--betas 0.9 1.0", "in [0, 1)"),
         (sac_baseline, "--hidden ()", "at least one number"),
-        (ppo_baseline, "--lr-bounds 0.01 1e-06", ": the first must not exceed the second"),
     ],
 )
 def test_a_number_out_of_range_is_named_before_anything_is_written(script, arguments, allowed, tmp_path, capsys):
     name, *values = arguments.split()
-    complaint = f"{arguments}{allowed}" if "exceed" in allowed else f"{name} must be {allowed}, not {values[-1]}"
     words = [word for word in arguments.split() if word != "()"]
-    assert refusal(lambda: script.main(words), capsys) == f"script.py: {complaint}"
+    complaint = f"script.py: {name} must be {allowed}, not {values[-1]}"
+    assert refusal(lambda: script.main(words), capsys) == complaint
     assert not list(tmp_path.iterdir())
 
 

@@ -55,6 +55,7 @@ class Tracking(Imitation):
 
     Attributes:
         motions: the first frame of each motion, and how many control steps it lasts, int64 on the CPU.
+        low, high: (joints,) rad, between which the servos' targets are.
     """
 
     joints: ClassVar[int]
@@ -97,7 +98,7 @@ class Tracking(Imitation):
         self._qvel = qvel.to(device, dtype)
         self._down = torch.tensor((0.0, 0.0, -1.0), device=device, dtype=dtype)
         self._scene = self._within_reach(scene)
-        self._low, self._high = (
+        self.low, self.high = (
             torch.tensor(bound, device=device, dtype=dtype) for bound in self._scene.mj_model.actuator_ctrlrange.T
         )
 
@@ -163,7 +164,7 @@ class Tracking(Imitation):
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Pushes, and the servos' targets: the joints of the reference's next frame, and up to REACH more or less."""
         target = self.reference(memory, 1)[0][..., 7:] + REACH * action
-        middle, half = (self._high + self._low) / 2, (self._high - self._low) / 2
+        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         qvel = torch.cat((qvel[..., :2] + memory[..., -2:], qvel[..., 2:]), dim=-1)
         return qvel, ((target - middle) / half).clamp(-1.0, 1.0)
 
@@ -246,7 +247,7 @@ class Program(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         action = self.policy(self.task.see(qpos, qvel, last, before, frames[:, 0], speed, frames[:, AHEAD]))
         target = frames[:, 1, 7:] + REACH * action
-        return action, target.clamp(self.task._low, self.task._high)
+        return action, target.clamp(self.task.low, self.task.high)
 
 
 class G1Track(Tracking):

@@ -278,7 +278,7 @@ def test_episodes_start_anywhere_but_near_an_end(tmp_path: Path) -> None:
 def test_a_run_goes_on_with_a_shorter_clip_by_new_episodes(tmp_path: Path) -> None:
     """Those of the checkpoint stand on frames that it lacks."""
     clip = str(write_csv(tmp_path / "short.csv", sway(2, 30)))
-    flags = "--env g1_track --num-envs 8 --horizon 1 --minibatch-size 8 --eval-episodes 1 --eval-every 0 --randomise"
+    flags = "--env g1_track --num-envs 8 --horizon 1 --minibatch-size 8 --eval-episodes 2 --eval-every 0 --randomise"
     words = [*flags.split(), "--device", "cpu", "--quiet", "--iterations", "2", "--stop-after", "1"]
     ppo_baseline.main([*words, "--run-dir", str(tmp_path)])
     assert checkpoint.load(path := tmp_path / "checkpoint.pt")["ranks"][0]["env"]["memory"][:, 0].max() > 120
