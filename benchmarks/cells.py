@@ -68,7 +68,7 @@ class Case(NamedTuple):
     folder: Path
     env: str
     seed: int
-    script: str
+    script: str  # "shac@2": two processes of torchrun
     flags: tuple[str, ...] = ()
 
 
@@ -98,7 +98,10 @@ class Runner:
         left = self.stop_at - time.monotonic()
         if left <= 0:
             return False
-        command = [sys.executable, str(ROOT / f"{case.script}.py"), *map(str, arguments), "--device", self.args.device]
+        script, _, ranks = case.script.partition("@")
+        torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}", "--"] if ranks else []
+        command = [sys.executable, *torchrun, str(ROOT / f"{script}.py"), *map(str, arguments)]
+        command += ["--device", self.args.device]
         case.folder.mkdir(parents=True, exist_ok=True)
         with (case.folder / "output.txt").open("a") as output:
             process = subprocess.Popen(command, stdout=output, stderr=output)

@@ -1,4 +1,4 @@
-"""Trainings that are compared by what their progress says: PFPN's dog, guided policy search, trials of PPO.
+"""Trainings that are compared by what their progress says: PFPN's dog, guided policy search, trials of PPO, GPUs.
 
     python benchmarks/suites.py                                  all of cases.json; what has finished is kept
     python benchmarks/suites.py --only walker --cells full adaptive --seeds 1
@@ -14,7 +14,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from typing import NamedTuple
 
 from cells import Case, Runner, ScriptFlags, spread
@@ -27,12 +27,14 @@ READ: dict[str, Callable[[Sequence[float]], float]] = {
     "first": lambda values: values[0],
     "last": lambda values: values[-1],
     "mean": mean,
+    "middle": median,
     "most": max,
     "sum": sum,
     "count": len,
 }
 SHOW: dict[str, Callable[[Sequence[float]], str]] = {
     "mean": lambda values: f"{mean(values):.0f}",
+    "thousandths": lambda values: f"{1e3 * mean(values):.0f}",
     "tenth": lambda values: f"{mean(values):.1f}",
     "spread": spread,
     "share": lambda values: f"{max(values):.0%}",

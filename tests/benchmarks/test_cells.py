@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import time
+from pathlib import Path
 
 import cells
 import numpy as np
@@ -50,6 +51,25 @@ def test_a_picture_has_steps_for_all_and_seconds_for_those_alone():
     steps, seconds = (paper.panel(group, found, "hopper", x) for x in ("control_steps", "seconds"))
     assert [line.label for line in steps.lines] == ["", "", "shac", "", "sapo", "shac, published"]
     assert [line.label for line in seconds.lines] == ["", "", "shac", "shac, published"]
+
+
+def test_a_script_may_be_several_processes(tmp_path_factory, monkeypatch):
+    """Of torchrun, to which --monitor would be a flag of its own without the dashes before the script."""
+    called, folder = list[list[str]](), tmp_path_factory.getbasetemp()
+    monkeypatch.setattr(cells.subprocess, "Popen", lambda command, **_: called.append(command) or Ended())
+    for script in ("shac", "shac@2"):
+        assert cells.Runner(cells.ScriptFlags(device="cpu")).train(cells.Case(folder, "ant", 1, script))
+    alone, both = called
+    at = both.index("--")
+    assert both[1:3] == ["-m", "torch.distributed.run"] and "--nproc-per-node=2" in both[:at]
+    assert both[at + 1 :] == alone[1:] and Path(alone[1]).is_file()
+
+
+class Ended:
+    returncode = 0
+
+    def wait(self, _: float | None) -> int:
+        return 0
 
 
 def test_a_stopped_call_goes_on_where_it_was(tmp_path, monkeypatch):

@@ -33,7 +33,7 @@ def test_each_run_of_the_page_is_a_command(group: str, monkeypatch: pytest.Monke
     monkeypatch.chdir(ROOT)
     suite, runs = suites.SUITES[suites.GROUPS[group]], list(suites.cases(suites.Args(), group))
     for case in {case.flags: case for _, case in runs}.values():  # seeds share them
-        args = parse(SCRIPTS[case.script], ["--env", case.env, "--device", "cpu", *case.flags])
+        args = parse(SCRIPTS[case.script.partition("@")[0]], ["--env", case.env, "--device", "cpu", *case.flags])
         assert args.iterations > 1
     every = read_csv(RESULTS / suite.machine / f"{suite.csv}.csv")
     rows = [row for row in every if row["group"] == group]
