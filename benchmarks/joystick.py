@@ -221,7 +221,7 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def rough(rows: list[dict[str, str]]) -> list[Row]:
-    """Who is whole on the steepest ground, and errors on each. A column for each task, learner and training's ground."""
+    """Who is whole on the steepest ground, and errors on each. A column for each task, learner and trained slope."""
     rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
     rows = [row | {"on": f"{row['learner'].partition(' --rough ')[2] or 0}°"} for row in rows]
     columns = {", ".join(key): group for key, group in sorted(grouped(rows, "task", "by", "on").items())}
