@@ -39,7 +39,7 @@ PER_TASK = {
     "ant":          ((128, 64, 32), (64, 64),   "elu",  2e-3, 2e-3, 0.2,  -1.0,  0.0, -3.0, 16, 2048, 2500, 16),
     "humanoid":     ((256, 128),    (128, 128), "silu", 2e-3, 5e-4, 0.2,  -1.0, -0.5, -0.5,  4, 1024, 1200,  8),
     "humanoid_mtu": ((512, 256),    (256, 256), "silu", 1e-3, 5e-4, 0.95, -0.5, -0.5, -0.5,  2, 1024, 1400, 16),
-    "g1":           ((256, 128),    (256, 128), "silu", 2e-3, 1e-3, 0.9,  -2.0, -1.0, -1.0,  1, 1024,  800, 16),
+    "g1":           ((256, 128),    (256, 128), "silu", 2e-3, 1e-3, 0.9,  -2.0, -1.0, -1.0,  1, 1024, 1200,  4),
     "g1_track":     ((256, 128),    (512, 256), "silu", 2e-3, 1e-3, 0.9,  -2.0, -1.0, -2.0,  1, 1024,  700,  8),
 }
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
@@ -54,6 +54,7 @@ ON_CPU: dict[str, dict[str, Any]] = {
     "ant": {"iterations": 1500},
     "humanoid": {"critic_iterations": 4},
     "humanoid_mtu": {"critic_iterations": 4, "iterations": 1000},
+    "g1": {"iterations": 700},
     "g1_track": {"critic_hidden": (256, 128), "critic_iterations": 4, "iterations": 1300},
 }
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "silu": nn.SiLU}

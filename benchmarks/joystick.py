@@ -221,13 +221,13 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def rough(rows: list[dict[str, str]]) -> list[Row]:
-    """A line for each number and ground, a column for each task, learner and ground of the training."""
+    """Who is whole on the steepest ground, and errors on each. A column for each task, learner and trained slope."""
     rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
     rows = [row | {"on": f"{row['learner'].partition(' --rough ')[2] or 0}°"} for row in rows]
     columns = {", ".join(key): group for key, group in sorted(grouped(rows, "task", "by", "on").items())}
-    lines = list[Row]()
+    slopes, lines = sorted({row["rough"] for row in rows}, key=float), list[Row]()
     for title, column, form, worst in (("whole", "whole", ".0%", min), ("error (m/s)", "error", ".3f", max)):
-        for slope in sorted({row["rough"] for row in rows}, key=float):
+        for slope in slopes[-1:] if column == "whole" else slopes:
             line = {"ground": f"{title}, {slope}°"}
             for policy, group in columns.items():
                 line[policy] = with_worst([row for row in group if row["rough"] == slope], column, form, worst)

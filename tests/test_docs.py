@@ -103,7 +103,7 @@ def test_every_csv_file_is_shown_or_needed() -> None:
 def test_tables_that_no_benchmark_fills_agree_with_their_files() -> None:
     """In the columns that the csv file has, too. What benchmarks fill: tests/benchmarks/test_pages.py."""
     checked = 0
-    for page, names in {"performance": ("speed_physics", "speed_scaling"), "transfer": ("learning",)}.items():
+    for page, names in {"performance": ("speed_physics", "speed_scaling")}.items():
         for table in tables(ROOT / "docs" / f"{page}.md"):
             if table.source and table.source.stem in names:
                 measured = read_csv(table.source)
@@ -112,7 +112,7 @@ def test_tables_that_no_benchmark_fills_agree_with_their_files() -> None:
                     shown, checked = dict(zip(table.header, row, strict=True)), checked + 1
                     found = [line for line in measured if all(same(shown[name], line[name]) for name in own)]
                     assert len(own) > 2 and found, f"{table.source.name} lacks {shown}"
-    assert checked > 20
+    assert checked >= 17
 
 
 def test_the_page_of_tasks_has_their_sizes() -> None:

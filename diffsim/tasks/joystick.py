@@ -50,6 +50,7 @@ class Robot(NamedTuple):
     lift: float  # m, of a foot in the middle of the swing
     cycle: float  # Hz, of the gait; legs of the two sides are half a cycle apart
     sides: Sides  # (right, left) beginnings of the joints' names
+    apart: float = 0.0  # m, least distance across of a left and a right foot, whose legs else collide; 0: not observed
     command: tuple[float, float, float] = (1.0, 0.6, 1.0)  # largest vx, vy [m/s] and yaw rate [rad/s]
 
 
@@ -85,7 +86,7 @@ def humanoid() -> Robot:
     )
     home = (*stance, *stance, 0.0, 0.0, 0.073, 0.2, *hang, 0.2, -0.2, *hang[1:])
     joints = tuple(side + name for side, names in parts for name in names)
-    return Robot(joints, home, 0.755, legs, 0.65, 0.08, 1.4, (("right_", "left_"),))
+    return Robot(joints, home, 0.755, legs, 0.65, 0.08, 1.4, (("right_", "left_"),), apart=0.13)
 
 
 class Joystick(Task):
@@ -128,7 +129,8 @@ class Joystick(Task):
         private = *((f"true_{name}", size) for name, size in sensed), ("height", 1), ("action_change", n)
         private = *private, ("joints_from_reference", n)
         legs = len(cls.robot.legs)
-        cls.obs_parts = *seen, *private, ("feet_from_reference", legs), ("feet_slip", legs)
+        gap = (("feet_apart", 1),) * bool(cls.robot.apart)
+        cls.obs_parts = *seen, *private, *gap, ("feet_from_reference", legs), ("feet_slip", legs)
         cls.actor_dim, cls.obs_dim = (sum(size for _, size in parts) for parts in (seen, cls.obs_parts))
         cls.num_memory, cls.num_noise, cls.num_random = 19 + 4 * n, 20 + 2 * n, 25 + 2 * n
 
@@ -173,7 +175,8 @@ class Joystick(Task):
         sensed = body, joints, rates
         names = [leg.joints[0] for leg in self.robot.legs]
         legs = Reflection.of(((k, 1.0) for k in partners(names, self.robot.sides)), device, dtype)
-        obs = Reflection.cat((*sensed, action, command, *sensed, height, action, joints, legs, legs))
+        apart = (height,) * bool(self.robot.apart)  # the same in the image
+        obs = Reflection.cat((*sensed, action, command, *sensed, height, action, joints, *apart, legs, legs))
         return Mirror(qpos, qvel, action, obs)
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
@@ -230,7 +233,8 @@ class Joystick(Task):
         """For the actor, with noise: linear and angular velocity, gravity's direction, in the body's frame; joints from
         the keyframe's, 0.1 joint rates; the last action, the command, sine and cosine of the clock. For the critic also
         these without noise; height, the change of the action, how far joints and, in height, feet are from the
-        reference, and how fast those near the ground slip."""
+        reference, and how fast those near the ground slip; of a robot on two legs how far left of the second the first
+        foot is."""
         position, quat, joints = qpos.split((3, 4, self._n), dim=-1)
         velocity, angular, rates = qvel.split((3, 3, self._n), dim=-1)
         command, clock, last, before, *_ = self._recall(memory)
@@ -249,7 +253,8 @@ class Joystick(Task):
         along = speed.square().sum(-1) - (speed * gravity.unsqueeze(-2)).sum(-1).square()
         swing = self._moving(command) * (turn + 2.0 * math.pi * self._phases).sin().clamp(min=0.0).square()
         slip = (1.0 - swing) * torch.exp(-(high.clamp(min=0.0) / NEAR).square()) * score(along, SLIP)
-        feet = high - self._rest - self.robot.lift * swing, slip
+        gap = (place[..., :1, 1] - place[..., 1:2, 1],) * bool(self.robot.apart)
+        feet = *gap, high - self._rest - self.robot.lift * swing, slip
         return torch.cat((sensed + noise, last, command, turn.sin(), turn.cos(), *private, *feet), dim=-1)
 
     @staticmethod
@@ -276,11 +281,11 @@ class Joystick(Task):
 
     def reward(self, obs: Tensor, action: Tensor) -> Tensor:
         """Both velocities, then an upright, level, calm root at its height; the reference's joints and feet, no slip,
-        smooth actions."""
+        legs that do not cross, smooth actions."""
         n, legs = self._n, len(self.robot.legs)
         command, private = obs[..., 9 + 3 * n : 12 + 3 * n], obs[..., 14 + 3 * n :]
-        parts = private.split((3, 3, 3, n, n, 1, n, n, legs, legs), dim=-1)
-        velocity, angular, gravity, _, _, height, change, error, lift, slip = parts
+        parts = private.split((3, 3, 3, n, n, 1, n, n, bool(self.robot.apart), legs, legs), dim=-1)
+        velocity, angular, gravity, _, _, height, change, error, gap, lift, slip = parts
         speed = score((velocity[..., :2] - command[..., :2]).square().sum(-1), 0.03)
         yaw = score((angular[..., 2] - command[..., 2]).square(), 0.03)
         calm = 0.5 * score(velocity[..., 2].square(), 0.5) + 0.2 * score(angular[..., :2].square().sum(-1), 4.0)
@@ -288,6 +293,8 @@ class Joystick(Task):
         level = level + 0.2 * score((height[..., 0] - self.robot.height).square(), 0.01)
         gait = 1.2 * score(error.square(), 0.05).mean(-1) + self.smooth * score(change.square().mean(-1), 0.2)
         feet = 0.4 * score(lift.square(), 0.0004).mean(-1) + 0.15 * slip.mean(-1)
+        if self.robot.apart:
+            feet = feet + score((self.robot.apart - gap[..., 0]).clamp(min=0.0).square(), 0.003)
         return self.alive - 0.5 * speed - 0.25 * yaw - calm - level - gait - feet
 
     def metadata(self) -> dict[str, str]:
@@ -323,5 +330,5 @@ class G1(Joystick):
     """29 joints; action: targets of the servos."""
 
     name, asset, robot = "g1", "g1.xml", humanoid()
-    alive, smooth, randomise = 2.5, 1.0, Joystick.randomise[:-1]
+    alive, smooth, randomise = 2.5, 1.0, (*Joystick.randomise[:4], "push=0.5:1.5")
     touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise

@@ -214,6 +214,9 @@ def test_parts_of_the_observation_are_what_they_are_called(name: str) -> None:
     rest |= {part: sensed[part] + each for part, each in zip(sensed, noise.split(sizes[:5], dim=-1), strict=True)}
     feet = obs.pop("feet_from_reference"), obs.pop("feet_slip")  # see the tests of them
     assert feet[0].shape == feet[1].shape == (3, len(task.robot.legs))
+    if name == "g1":
+        left, right = task._feet.places(qpos[:, 7:]).unbind(1)
+        rest["feet_apart"] = (left - right)[:, 1:2]
     assert obs.keys() == rest.keys() and sum(sizes[:9]) == task.actor_dim
     for part, value in rest.items():
         torch.testing.assert_close(obs[part], value)
@@ -248,6 +251,18 @@ def test_reward_is_largest_on_the_reference(name: str) -> None:
     assert not task.terminated(observed())
     assert task.terminated(observed("qpos", 2, -0.5 * task.robot.height)) and task.terminated(observed("qpos", 4, 1.5))
     assert score(torch.tensor(0.0), 1.0) == 0 and score(torch.tensor(3.0), 1.0) == np.log(4.0).astype(np.float32)
+
+
+def test_legs_that_cross_cost() -> None:
+    """A G1's feet may be as near as `apart`, and no nearer."""
+    task = task_of("g1")
+    names, sizes = zip(*task.obs_parts, strict=True)
+    column = sum(sizes[: names.index("feet_apart")])
+    obs = torch.zeros(3, task.obs_dim, dtype=REAL)
+    obs[:, column] = torch.tensor([task.robot.apart, 0.5, 0.0])
+    enough, wide, crossed = task.reward(obs, obs[:, :29])
+    np.testing.assert_allclose(enough, wide, rtol=1e-12)
+    np.testing.assert_allclose(enough - crossed, np.log1p(task.robot.apart**2 / 0.003))
 
 
 def test_memory_goes_with_the_episode() -> None:
