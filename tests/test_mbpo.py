@@ -288,6 +288,7 @@ def test_a_run_resumes_bitwise_with_its_buffers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments, message",
     [
+        ("--seed-steps 64 --iterations 4", "--seed-steps 64 leave no update in --iterations 4"),
         ("--models 1 --elites 1", "--models must be from 2 to 1,000, not 1"),
         ("--elites 8", "--elites 8 are more than --models 7"),
         ("--num-envs 1", "--num-envs must be at least 2: one environment is held out"),

@@ -75,6 +75,7 @@ def test_a_run_resumes_bitwise_with_its_buffer(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments, message",
     [
+        ("--seed-steps 640 --iterations 20", "--seed-steps 640 leave no update in --iterations 20"),
         ("--actor-updates 2", "--actor-updates 2 are more than --updates-per-step 1"),
         ("--critics 2 --critic-subset 3", "--critic-subset 3 is larger than --critics 2"),
         ("--buffer-size 10", "--buffer-size 10 holds no iteration of 32 steps of 128"),
