@@ -34,7 +34,7 @@ CASES = {  # small trainings
     "bptt": "bptt --env hopper --num-envs 16",
     "pods": "pods --env cartpole --num-envs 16",
     "ppo_baseline": "ppo_baseline --env hopper --minibatch-size 512 --num-envs 16",
-    "sac_baseline": "sac_baseline --env hopper --num-envs 16",
+    "sac_baseline": "sac_baseline --env hopper --num-envs 16 --seed-steps 32",
     "mbpo": "mbpo --env hopper --num-envs 16 --seed-steps 16 --model-updates 4 --updates 4 --sample-enhance 1",
     "pfpn": "pfpn --env hopper --minibatch-size 512 --num-envs 16",
     "pfpn_sac": "pfpn_sac --env hopper --num-envs 16",
