@@ -390,6 +390,32 @@ def test_gradients_know_that_a_lower_ball_lands_earlier():
     assert (errors[0] < (0.3, 0.3, 4.0)).all() and (errors[1] > (2.0, 2.0, 9.0)).all(), errors
 
 
+def test_a_slope_turns_gradients_of_landings():
+    """Without gravity a ball meets it as it meets the plane, seen by an observer who is turned."""
+    scene, n, angle = parse(BALL.replace("<worldbody>", '<option gravity="0 0 0"/> <worldbody>')), 32, np.radians(20.0)
+    slope = scene.with_terrain([[0.0, 0.0], [1.0, np.tan(angle)]])
+    turn = torch.tensor([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+    start = torch.tensor([[0.0, 0, 0, 1, 0, 0.3, -1]]).double().repeat(n, 1)
+    start[:, 2] = torch.linspace(0.13, 0.2, n)
+    weights = torch.linspace(-1, 1, 6).double()
+
+    def gradient(scene, turn, touchdown):
+        sim = Simulator(scene, n, Integration("mujoco", 16, touchdown=touchdown), 1 / 60, 4, dtype=torch.float64)
+        leaf = start.clone().requires_grad_()
+        place, still, velocity = leaf.split((3, 1, 3), 1)
+        none = torch.zeros(n, 3).double()
+        qpos = torch.cat((place @ turn.T, still, none), 1)
+        qvel = torch.cat((velocity @ turn.T, none), 1)
+        for _ in range(4):
+            qpos, qvel = sim.step(qpos, qvel, none[:, :0])
+        ends = torch.cat((qpos[:, :3] @ turn, qvel[:, :3] @ turn), 1)
+        return torch.autograd.grad((ends * weights).sum(), leaf)[0][:, [0, 1, 2, 4, 5, 6]]
+
+    expected = gradient(scene, torch.eye(3).double(), True)
+    torch.testing.assert_close(gradient(slope, turn, True), expected, rtol=1e-6, atol=1e-6)
+    assert (gradient(slope, turn, False) - expected).norm(dim=1).quantile(0.5) > 0.1 * expected.norm(dim=1).median()
+
+
 # Tolerance
 
 
