@@ -55,7 +55,7 @@ class Args:
 
 @command
 def main(argv: Sequence[str] | None = None) -> None:
-    with in_one_line():
+    with in_one_line(argv):
         args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
     args.check()
     torch.set_num_threads(1)  # operations this small gain nothing from more

@@ -171,7 +171,7 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
     """The command line, checked before anything is measured; what follows "--" goes to the scripts that it runs."""
     words = [*(sys.argv[1:] if argv is None else argv), "--"]
     end = words.index("--")
-    with in_one_line():
+    with in_one_line(words[:end]):
         args = tyro.cli(kind, args=words[:end], description=description, config=(tyro.conf.FlagCreatePairsOff,))
     args.arguments = tuple(words[end + 1 : -1])
     check_ranges(args)

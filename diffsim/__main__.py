@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             return run_script(learner, flags)
     try:
         if argv:
-            with in_one_line():
+            with in_one_line(argv):
                 call = tyro.extras.subcommand_cli_from_dict(commands, args=argv, prog="diffsim", description=__doc__)
             call()
         else:

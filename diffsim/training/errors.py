@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
+from itertools import groupby
 from typing import NoReturn
 
 import torch
@@ -27,19 +30,36 @@ EXPECTED = (
     *(FloatingPointError, torch.OutOfMemoryError),
 )
 
+HELP = {"-h", "--help"}
+WIDE = "100000"  # columns of a terminal in which no word is split
+RULE = re.compile("[─-]+")  # between the parts of a box
+
 
 @contextmanager
-def in_one_line() -> Iterator[None]:
-    """Around a call of tyro: what it cannot parse is told like other errors, instead of in a box of several lines."""
+def in_one_line(words: Sequence[str] | None) -> Iterator[None]:
+    """Around a call of tyro: what it cannot parse is told like other errors, instead of in a box of several lines.
+
+    words: the command line that it parses; None: the script's.
+    """
+    columns, box = os.environ.get("COLUMNS"), io.StringIO()
+    if not HELP.intersection(sys.argv if words is None else words):
+        os.environ["COLUMNS"] = WIDE
     try:
-        with redirect_stderr(io.StringIO()) as box:
+        with redirect_stderr(box):
             yield
     except SystemExit as end:
         if not end.code:  # --help
             raise
         rows = re.sub(r"\x1b\[[\d;]*m", "", box.getvalue()).splitlines()[1:-1]  # without colours, title and border
-        parts = re.split("[─-]{5,}", " ".join(" ".join(row.strip("│|").split()) for row in rows))  # between rules
-        fail("; ".join(part.strip(" .") for part in parts if part and not part.startswith(" Argument helptext")))
+        parts = groupby((" ".join(row.strip("│").split()) for row in rows), RULE.fullmatch)
+        told = ("" if rule else " ".join(part).strip(" .") for rule, part in parts)
+        fail("; ".join(part for part in told if part and not part.startswith("Argument helptext")))
+    else:
+        sys.stderr.write(box.getvalue())  # warnings
+    finally:
+        os.environ.pop("COLUMNS", None)
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
 
 
 def fail(message: object) -> NoReturn:

@@ -275,7 +275,7 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
-    with in_one_line():
+    with in_one_line(argv):
         args = tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
     try:
         args.clip = read_clip(args.clip) if isinstance(args.clip, str) else args.clip

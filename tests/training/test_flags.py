@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 import sys
 from pathlib import Path
@@ -23,7 +24,7 @@ import ppo_baseline
 import sac_baseline
 import sapo
 import shac
-from diffsim.training import checkpoint, flags, parse, ranges
+from diffsim.training import checkpoint, errors, flags, parse, ranges
 from diffsim.training.evaluation import make_env
 
 
@@ -125,6 +126,21 @@ def test_what_tyro_cannot_parse_is_told_without_boxes_and_colours(tiny_run, tmp_
         monkeypatch.setattr(type(sys.stdout), "encoding", encoding)
         message = "script.py: Missing value for argument '--gamma'. Expected 1 values; For full helptext, run script.py"
         assert refusal(lambda: parse(shac.Args, ["--gamma"]), capsys).startswith(message)
+        for word in ("x" * 300, "a," * 90, "-----", "a-----b"):
+            assert f" {word}" in refusal(lambda word=word: parse(shac.Args, ["--seeds", word]), capsys)
+
+
+def test_tyros_help_has_the_terminals_width_and_its_warnings_are_told(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "70")
+    with pytest.raises(SystemExit, match="0"):
+        parse(shac.Args, ["--help"])
+    boxes = capsys.readouterr().out.partition("options ")[2]
+    assert max(map(len, boxes.splitlines())) == 70
+    for columns in ("70", None):
+        monkeypatch.delenv("COLUMNS") if columns is None else monkeypatch.setenv("COLUMNS", columns)
+        with errors.in_one_line([]):
+            print("beware", file=sys.stderr)
+        assert capsys.readouterr().err == "beware\n" and os.environ.get("COLUMNS") == columns
 
 
 @pytest.mark.parametrize(
