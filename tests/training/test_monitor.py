@@ -38,11 +38,14 @@ def test_a_replay_is_what_two_simulators_make_of_the_same_actions():
     assert found["sim/return_lost"] == pytest.approx((rewards[0] - rewards[1]) / abs(rewards[0]), rel=1e-4)
 
 
-def test_it_replays_on_the_ground_of_the_training():
+def test_it_replays_on_the_steepest_ground_of_the_training(monkeypatch):
     args = parse(shac.Args, [*FLAGS, "--rough", "20"])
-    env = diffsim.make("hopper", 4, seed=3, horizon=4, terrain=20.0)
-    for each in monitor.Monitor(args, env).envs:
-        np.testing.assert_array_equal(each.scene.terrain, env.scene.terrain)
+    env = diffsim.make("hopper", 20, seed=3, horizon=4, terrain=20.0)
+    monkeypatch.setattr(monitor, "STEPS", 0)
+    (watch := monitor.Monitor(args, env)).replay(Sines())
+    for each in watch.envs:
+        np.testing.assert_array_equal(each.scene.terrain, env.scene.terrain[-16:])
+        assert torch.equal(each.qpos, env.qpos[-16:])
 
 
 def test_it_changes_nothing_and_warns_once(tmp_path, monkeypatch, capsys):
