@@ -155,8 +155,9 @@ class Run:
         if state := self._state:
             own = state["ranks"][rank]
             episodes = (self._env, own["env"]) if self._env is not None else None
-            if state["args"].get("clip") != self.args.clip:
-                episodes = None  # which stand on another clip's frames: new ones begin
+            saved, slope = state["args"], getattr(self.args, "rough", 0.0)
+            if saved.get("clip") != self.args.clip or saved.get("rough", 0.0) != slope:
+                episodes = None  # which stand on another clip's frames or on other ground: new ones begin
             checkpoint.restore(learner, state, episodes)
             self._random_numbers().set_state(own["rng"])
             self.iteration, self.seconds = state["iteration"], state["seconds"]

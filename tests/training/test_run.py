@@ -266,6 +266,17 @@ def test_other_hyperparameters_hold_from_a_resume_on(tmp_path):
 # What it shows --------------------------------------------------------------------------------------------------------
 
 
+def test_a_run_goes_on_by_new_episodes_on_other_ground(tmp_path):
+    words = "--env hopper --num-envs 4 --horizon 4 --critic-iterations 1 --eval-episodes 1 --eval-every 0 --quiet"
+    flags = [*words.split(), *"--device cpu --rough 20 --iterations 2 --stop-after 1 --run-dir".split()]
+    shac.main([*flags, str(first := tmp_path / "first")])
+    for rough, length in (("20", 8), ("10", 4)):
+        shutil.copytree(first, path := tmp_path / rough)
+        shac.main(["--resume", str(path), "--rough", rough, "--stop-after", "2", "--quiet"])
+        (rank,) = checkpoint.load(path / "checkpoint.pt")["ranks"]
+        assert (rank["env"]["episode_step"] == length).all()
+
+
 def test_progress_and_messages(tmp_path, capsys):
     arguments = *TINY, "--iterations", 3, "--eval-every", 2
     run(bptt, tmp_path / "loud", *arguments)
