@@ -12,12 +12,12 @@ import torch
 from numpy.typing import ArrayLike
 
 from diffsim import startup
-from diffsim.env import DiffEnv
+from diffsim.env import DiffEnv, check_seed
 from diffsim.kernels.lanes import Division
 from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
-from diffsim.sim.integration import Integration
+from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
@@ -142,8 +142,9 @@ def make(
     if penalty and integration.constrained:
         raise ValueError("penalty sets constants of the penalty law, but the contact is mujoco")
     scene = scene.with_penalty(penalty or {})
-    if isinstance(terrain, int | float):
-        terrain = uneven(terrain, num_envs, seed or 0)
+    if is_real(terrain):
+        count = check_count("num_envs", num_envs)
+        terrain = uneven(float(terrain), count, 0 if seed is None else check_seed(seed))
     scene = scene if terrain is None else scene.with_terrain(terrain)
     episodes: Any = dict(stochastic_init=stochastic_init, early_termination=early_termination)
     episodes |= dict(max_episode_steps=max_episode_steps, adjoint_clip=adjoint_clip, render_mode=render_mode)

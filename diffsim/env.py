@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable
 from numbers import Integral
@@ -50,7 +51,7 @@ class DiffEnv(VectorEnv):
     limit.
 
     Args:
-        task: task on the simulator's device and dtype.
+        task: task on the simulator's device and dtype; several environments may share it.
         scene: its robot. On a terrain the task measures heights (of start, observation, reward and end) from the ground
             below the root. `qpos` stays in the world frame.
         num_envs, horizon: see Simulator.
@@ -93,6 +94,8 @@ class DiffEnv(VectorEnv):
         num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
         asked = Options(integration or task.integration("default"), **options).check()
         self.device, self.dtype = torch.device(asked.device), asked.dtype
+        task = copy.copy(task)  # of another ground than that of other environments
+        task.ground = None
         task.bind(scene)
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory)
         check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
@@ -110,7 +113,8 @@ class DiffEnv(VectorEnv):
         if not is_real(adjoint_clip) or not 0 <= adjoint_clip < math.inf:
             raise ValueError(f"adjoint_clip is {adjoint_clip!r}, must be a factor of at least 0")
         self.adjoint_clip = float(adjoint_clip)
-        self.task.ground = None if scene.terrain is None else Elevation(scene, self.device, self.dtype)
+        if scene.terrain is not None:
+            self.task.ground = Elevation(scene, self.device, self.dtype)
         real = np.float32 if self.dtype == torch.float32 else np.float64
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.obs_dim,), real)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (scene.nu,), real)

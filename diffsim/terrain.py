@@ -62,7 +62,7 @@ def uneven(degrees: float, count: int, seed: int = 0) -> Array:
     Within 0.5 m of x = 0 they are level. Then come segments of 0.4 m as of `rough`, for 30 m to both sides. The
     steepest slope grows evenly from profile to profile; the last one's is `degrees`.
     """
-    seeds = np.random.default_rng(abs(seed)).integers(2**31, size=(count, 2))
+    seeds = np.random.default_rng(seed % 2**64).integers(2**31, size=(count, 2))
     steepest = np.linspace(degrees / count, degrees, count).tolist()
     sides = (
         [rough(each, SEGMENT, most, LENGTH, LEVEL)[1:] for each in pair]

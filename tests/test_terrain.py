@@ -229,6 +229,28 @@ def test_a_number_of_degrees_makes_uneven_ground():
     env = diffsim.make("hopper", 3, terrain=12.0, seed=5)
     np.testing.assert_array_equal(env.scene.terrain, uneven(12.0, 3, 5))
     assert diffsim.make("hopper", 3, terrain=None, seed=5).scene.terrain is None
+    for count, degrees, seed, message in (
+        (0, 12.0, 5, "num_envs is 0, must be an integer of at least 1"),
+        (3, 12.0, 2.5, "seed is 2.5, must be one integer"),
+        (3, np.float32(95), 5, "degrees is 95.0, must lie between -90 and 90"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            diffsim.make("hopper", count, terrain=degrees, seed=seed)
+
+
+def test_environments_that_share_a_task_have_their_own_ground():
+    """Be there fewer of them, or none of it."""
+    first = diffsim.make("go2", 3, dtype=torch.float64, seed=1, terrain=step(0.3, -5.0))
+    hill = first.scene.with_terrain(uneven(20.0, 4))
+    flat = first.scene.with_terrain([[-9.0, 0.0], [9.0, 0.0]])
+    several = [diffsim.DiffEnv(first.task, scene, n, dtype=torch.float64) for scene, n in ((hill, 4), (flat, 1))]
+    for env, height in zip((first, *several), (0.3, 0.0, 0.0), strict=True):
+        qpos = first.qpos[:1].repeat(env.num_envs, 1)
+        seen = env.set_state(qpos, torch.zeros_like(first.qvel[:1]).repeat(env.num_envs, 1))
+        above = dict(zip(*zip(*env.task.obs_parts, strict=True), strict=True))
+        column = list(above).index("height")
+        column = sum(list(above.values())[:column])
+        torch.testing.assert_close(seen[:, column], qpos[:, 2] - height)
 
 
 # Input and pictures ---------------------------------------------------------------------------------------------------

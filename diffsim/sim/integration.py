@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 INTEGRATORS = ("semi_implicit", "implicit", "extrapolated", "mujoco")
 MOST_SUBSTEPS, MOST_PASSES = 1_000_000, 1000
@@ -65,7 +65,7 @@ class Integration(NamedTuple):
         return self._replace(substeps=substeps, passes=check_count("passes", self.passes, MOST_PASSES))
 
 
-def is_real(value: object) -> bool:
+def is_real(value: object) -> TypeGuard[float]:
     """Whether it is a number, be it NumPy's. True is none."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
