@@ -18,7 +18,7 @@ SUSPECT = 0.06  # m or rad, difference of the states at which a line warns
 
 
 class Monitor:
-    """Replays a window of the training's last environments, whose ground is the steepest, at FINER times the substeps."""
+    """Replays a window of the training's last environments, on the steepest ground, with FINER times the substeps."""
 
     def __init__(self, args: Flags, env: DiffEnv) -> None:
         self.env, self.warned, how = env, False, env.sim.integration
