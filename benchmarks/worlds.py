@@ -127,6 +127,8 @@ def on_terrain(spec: mujoco.MjSpec, profile: Array) -> mujoco.MjModel:
     """A file's model with a profile (K, 2) in the place of its planes: boxes whose upper faces are the segments, with
     all numbers of the first plane."""
     planes = [geom for geom in spec.worldbody.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    if not planes:
+        fail("--rough takes the place of planes, and the file has none")
     law = {name: getattr(planes[0], name) for name in GROUND_LAW}
     for (length, _, thickness), centre, rotation in slabs(profile):
         mujoco.mju_mat2Quat(quat := np.empty(4), rotation.ravel())

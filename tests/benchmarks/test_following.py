@@ -103,6 +103,8 @@ def test_rough_ground_is_made_of_boxes_and_judged_apart(tmp_path: Path, capsys: 
         start, found = np.array([x, 3.0, 20.0]), np.zeros(1, np.int32)
         fallen = mujoco.mj_ray(model, data, start, np.array([0.0, 0.0, -1.0]), None, 1, -1, found)
         assert 20.0 - fallen == pytest.approx(np.interp(x, *profile.T), abs=1e-9)
+    with pytest.raises(ValueError, match="--rough takes the place of planes, and the file has none"):
+        worlds.on_terrain(mujoco.MjSpec(), profile)
 
 
 def test_an_episode_that_is_too_short_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
