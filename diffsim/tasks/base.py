@@ -66,7 +66,7 @@ class Task:
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: float = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
-    ground: Elevation | None = None  # the terrain, if it is on one; heights that it sees are those over the root's
+    ground: Elevation | None = None  # set by an environment on terrain: heights are then those over it at the root's x
     start: tuple[float, ...] = ()  # by default the robot's keyframe "home", its first one, or qpos0; at rest
     spread: tuple[float, ...] | float = 0.0
 
@@ -156,6 +156,8 @@ class Task:
         for name in sorted(own - known):
             if meant := get_close_matches(name, known - own, 1, LIKENESS):
                 raise TaskError(f"task {self.name!r} has {name!r}: is {meant[0]!r} meant?")
+        if "ground" in own:
+            raise TaskError(f"task {self.name!r} has 'ground', which is the terrain: give it another name")
         for names in (("observe", "observe_with"), ("reward",)):
             if all(getattr(type(self), name) is getattr(Task, name) for name in names):
                 raise TaskError(f"task {self.name!r} has no method {names[0]!r}")

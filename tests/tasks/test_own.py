@@ -243,6 +243,7 @@ def test_what_is_missing_or_misspelt_is_named() -> None:
 
     assert refused(episode_lenght=5) == "task 'wrong' has 'episode_lenght': is 'episode_length' meant?"
     assert refused(terminate=lambda self, obs: obs) == "task 'wrong' has 'terminate': is 'terminated' meant?"
+    assert refused(ground=0.1) == "task 'wrong' has 'ground', which is the terrain: give it another name"
     assert refused(reward=Task.reward) == "task 'wrong' has no method 'reward'"
     assert refused(observe=Task.observe) == "task 'wrong' has no method 'observe'"
     flat = BALLS.format(key="")
