@@ -35,7 +35,7 @@ from diffsim.training import Count, Positive, Run, fail, graph, parse
 PartName = Literal["speed", "train"]
 Name = Literal["hopper", "half_cheetah", "ant", "humanoid", "go1", "go2", "g1", "g1_track"]
 # Contacts and rows of constraints for which mujoco_warp has room in a world; `lost` tells whether they are too few.
-# With more rows, or 4,096 robots other than these ants, mujoco_warp 4.0.0 reads outside of its memory.
+# With more rows, 4,096 of go2, g1 or humanoid, or g1_track mujoco_warp 4.0.0 reads outside of its memory.
 ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64)}
 ROOM |= {"humanoid": (64, 256), "go1": (16, 96), "go2": (16, 96), "g1": (24, 192), "g1_track": (24, 192)}
 PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
