@@ -216,7 +216,7 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         args = _cli(kind, argv, defaults)
         args.device = distributed.choose_device(args.device)
     check_ranges(args)
-    args.check()
+    (Flags.check if args.evaluate else kind.check)(args)  # no training that was allowed forbids an evaluation
     if path and args.run_dir is None:
         args.run_dir = path.parent
     return args

@@ -240,6 +240,13 @@ def test_what_a_checkpoint_decides(capsys):
     assert parse(shac.Args, ["--evaluate", str(path), *"--eval-episodes 9 --substeps 8 --quiet".split()]).substeps == 8
 
 
+def test_a_policy_can_be_evaluated_whose_training_would_be_refused_today(capsys):
+    path = save(dataclasses.replace(parse(shac.Args, "--env cartpole --device cpu".split()), critic_minibatches=9999))
+    assert parse(shac.Args, ["--evaluate", str(path)]).critic_minibatches == 9999
+    line = refusal(lambda: parse(shac.Args, ["--resume", str(path), "--iterations", "9999"]), capsys)
+    assert "--critic-minibatches 9999 are more than the" in line
+
+
 def test_networks_keep_their_sizes_and_other_flags_may_change(tiny_run, tmp_path, capsys):
     words = ["--resume", str(tiny_run / "checkpoint.pt"), "--run-dir", str(tmp_path / "run"), "--iterations", "3"]
     line = refusal(lambda: shac.main([*words, "--actor-hidden", "5"]), capsys)
