@@ -218,16 +218,18 @@ def test_control_steps_stay_with_mujoco(name, rng):
 # Terrain
 
 
-@pytest.mark.parametrize("name", ["sphere", "hopper", pytest.param("ant", marks=SLOW)])
+@pytest.mark.parametrize("name", ["sphere", "margin", "hopper", pytest.param("ant", marks=SLOW)])
 def test_an_incline_is_mujocos_tilted_plane(name, rng):
-    """At rest and sliding, up and down and across the slope."""
-    flat = parse(BALL) if name == "sphere" else task_scene(name)
+    """At rest and sliding, up and down and across the slope, and within a margin above it."""
+    ball = {"sphere": BALL, "margin": BALL.replace('size="0.1"', 'size="0.1" margin="0.03"')}
+    flat = parse(ball[name]) if name in ball else task_scene(name)
     scene = flat.with_terrain(incline(20.0, start=-50.0))
     qpos, qvel, ctrl = acting_states(flat, 64, rng)
     up, along = (2, 0) if scene.floating else (1, 0)
     qpos[:, along] = rng.uniform(-3, 3, 64)
     for _ in range(3):
         qpos[:, up] -= [reference.contacts(scene, *state)[0].min() + 0.01 for state in zip(qpos, qvel, strict=True)]
+    qpos[:, up] += rng.uniform(0, 0.05, 64) * (name == "margin")
     m = mujoco_model(scene)
     ground = np.flatnonzero(m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     turn = np.radians(-20.0) / 2
