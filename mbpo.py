@@ -121,6 +121,7 @@ class Args(ParallelFlags):
             f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step": self.buffer_size < rows,
             f"{jacobians} states that do not hold the past, on which {self.env} depends": self.sample_enhance and past,
             f"{jacobians} one robot: leave out --randomise": self.sample_enhance and self.randomise,
+            f"{jacobians} a robot on a plane: leave out --rough": self.sample_enhance and self.rough,
         }
         for message, found in wrong.items():
             if found:

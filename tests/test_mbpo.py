@@ -295,6 +295,7 @@ def test_a_run_resumes_bitwise_with_its_buffers(tmp_path: Path) -> None:
         ("--rollout-lengths 3 2", "--rollout-lengths 3 2: the first must not exceed the second"),
         ("--buffer-size 10", "--buffer-size 10 is less than the 64 transitions of a step"),
         ("--sample-enhance 1 --randomise mass=0.9:1.1", "--sample-enhance takes Jacobians of one robot"),
+        ("--sample-enhance 1 --rough 5", "--sample-enhance takes Jacobians of a robot on a plane: leave out --rough"),
     ],
 )
 def test_wrong_arguments_are_refused(arguments: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
