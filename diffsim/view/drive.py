@@ -104,7 +104,8 @@ class Pilot:
         if not isinstance(task, Locomotion):
             return env.observe(env.qpos, env.qvel, self._action)
         self._heading += TURN * float(move[2]) * env.control_dt
-        return task.observe(*turned(-self._heading, env.qpos, env.qvel), self._action)
+        qpos = env.qpos if task.ground is None else task.ground.lower(env.qpos)
+        return task.observe(*turned(-self._heading, qpos, env.qvel), self._action)
 
     def _forces(self, wish: Wish) -> Array:
         """(nbody, 6) of a pull, as Simulator.forces has them."""

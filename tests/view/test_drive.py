@@ -27,6 +27,7 @@ from diffsim import __main__ as command
 from diffsim import startup
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks import Ant
+from diffsim.terrain import step
 from diffsim.training import load_policy, make_policy_env
 from diffsim.view import drive
 from diffsim.view.drive import Handler, Pilot, Server, Stage, Wish
@@ -204,6 +205,13 @@ def test_a_clip_is_played_from_its_beginning_beside_its_ghost_and_again_after_it
     env.episode_step[:] = env.episode_length - 1
     pilot.step(Wish())
     assert env.memory[0, 0] == 0 and env.episode_step == 0
+
+
+def test_a_turned_robot_on_terrain_has_its_height_over_it() -> None:
+    env = diffsim.make("ant", 1, seed=1, terrain=step(0.3, -5.0), forces=True)
+    pilot = Pilot(env, lambda obs: torch.zeros(1, 8))
+    torch.testing.assert_close(pilot._see(np.zeros(3)), env.observe(env.qpos, env.qvel, torch.zeros(1, 8)))
+    assert pilot._see(np.array([0.0, 0.0, 1.0]))[0, 0] == pytest.approx(float(env.qpos[0, 2]) - 0.3)
 
 
 @pytest.mark.slow
