@@ -106,7 +106,7 @@ def test_pages_show_the_lines_of_the_cells() -> None:
 
 
 def test_a_curve_has_some_points_and_the_seconds_of_a_run_that_was_alone(tmp_path: Path) -> None:
-    for machine, learner, shared in (("h200", "shac", False), ("h200", "shac", True), ("cpu", "shac_h4", False)):
+    for machine, learner, shared in (("h200", "shac", False), ("h200", "shac", True), ("cpu", "shac_no_critic", False)):
         args, cell = paper.Args(runs=tmp_path, shared=shared), paper.Cell(machine, learner, "ant", 2)
         folder = cell.case(tmp_path).folder
         folder.mkdir(parents=True, exist_ok=True)
