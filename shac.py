@@ -195,10 +195,9 @@ class SHAC:
         rollout = collect(self.env, self.actor, noise)
         next_value = self.next_values(rollout)
         loss = actor_loss(rollout.reward, next_value, rollout.done, args.gamma)
-        seen = Rollout(*(tensor.detach() for tensor in rollout))
-        value = td_lambda(seen.reward, next_value.detach(), seen.done, args.gamma, args.td_lambda)
-        norm = self.actor_optimizer.step(self.weighted(loss, noise, seen, value) if args.inverse_variance else loss)
-        rollout = seen
+        rollout = Rollout(*(tensor.detach() for tensor in rollout))
+        value = td_lambda(rollout.reward, next_value.detach(), rollout.done, args.gamma, args.td_lambda)
+        norm = self.actor_optimizer.step(self.weighted(loss, noise, rollout, value) if args.inverse_variance else loss)
         self.value.copy_(value.view(-1, 1))
         self.obs.copy_(normalizer(rollout.obs).flatten(0, 1))
         normalizer.update(rollout.obs)
