@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -54,6 +55,16 @@ def test_webp_plays_at_true_speed_for_ever(tmp_path: Path) -> None:
         shown = [(frame.load(), frame.info["duration"])[1] for frame in ImageSequence.Iterator(film)]
         assert film.info["loop"] == 0 and film.size == (32, 16)
     assert len(shown) == 30 and sum(shown) == 1000
+
+
+def test_bars_are_of_the_numbers_in_the_pages() -> None:
+    shown = {(bar.task, bar.learner): bar.returns for bar in draw.measured_bars()["MuJoCo's contact"]}
+    text = (ROOT / "docs" / "transfer.md").read_text()
+    rows = re.findall(r"^\| (\w+), (\w+) \| (\d+), (\d+), (\d+) \|", text, re.MULTILINE)
+    assert {row[:2] for row in rows} == {("ant", "shac"), ("humanoid", "sapo")}
+    for task, learner, *seeds in rows:
+        low, middle, high = sorted(map(int, seeds))
+        assert [round(value) for value in shown[task, learner]] == [middle, low, high]
 
 
 @pytest.mark.slow
