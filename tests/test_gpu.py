@@ -105,7 +105,9 @@ def episode(
 @pytest.mark.gpu
 @pytest.mark.parametrize(
     "name, integration",
-    [(name, None) for name in SOFT] + [(name, Integration("implicit", 16, 0.5)) for name in ("ant", "humanoid_mtu")],
+    [(name, None) for name in SOFT]
+    + [(name, Integration("implicit", 16, 0.5)) for name in ("ant", "humanoid_mtu")]
+    + [("ant", Integration("mujoco", 4, passes=60, tolerance=1e-12))],
 )
 def test_gpu_agrees_with_cpu(name: str, integration: Integration | None) -> None:
     """Without factors, forces and terrain, and with them and the gradient in the first two."""
