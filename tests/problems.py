@@ -64,21 +64,33 @@ def assert_squashed_gaussian(actor: Any) -> None:
     torch.testing.assert_close(actor.deterministic()(obs), torch.tanh(actor.mean(features)))
 
 
-def assert_soft_updates(learner: Any, monkeypatch: pytest.MonkeyPatch, subset: int | None = None) -> None:
-    """Of the ant, at a temperature of 0.3: the soft Bellman backup, where a failure ends the value, the losses, and the
-    targets. With a subset of the critics (REDQ) the backup takes the least of so many, and the actor the mean of all.
+def assert_soft_updates(
+    learner: Any,
+    optimizers: tuple[Any, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    subset: int | None = None,
+    act: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
+) -> None:
+    """At a temperature of 0.3: the soft Bellman backup, where a failure ends the value, the losses, and the targets.
+
+    With a subset of the critics (REDQ) the backup takes the least of so many, and the actor the mean of all.
+
+    Args:
+        optimizers: of the actor and of the temperature.
+        act: actions and their log densities of observations, if the actor itself does not return these.
     """
     torch.manual_seed(0)
+    act, inputs, nu = act or learner.actor, learner.env.task.obs_dim, learner.env.scene.nu
     learner.temperature["log"].data.fill_(math.log(0.3))
-    obs, next_obs, failed = torch.randn(32, 37), torch.randn(32, 37), (torch.rand(32) < 0.3).float()
-    batch = Transition(obs, torch.rand(32, 8), torch.randn(32), next_obs, failed)
+    obs, next_obs, failed = torch.randn(32, inputs), torch.randn(32, inputs), (torch.rand(32) < 0.3).float()
+    batch = Transition(obs, torch.rand(32, nu), torch.randn(32), next_obs, failed)
     critics = len(learner.critics.layers[0].bias)
 
     def values(networks: Any, obs: Tensor, action: Tensor) -> Tensor:
         return torch.stack([networks[k](torch.cat((obs, action), 1)).squeeze(1) for k in range(critics)])
 
     state = torch.get_rng_state()
-    action, density = learner.actor(next_obs)
+    action, density = act(next_obs)
     chosen = torch.rand(critics).argsort()[:subset] if subset else slice(None)
     soft = values(learner.targets, next_obs, action)[chosen].amin(0) - 0.3 * density
     target = (batch.reward + 0.99 * (1 - failed) * soft).detach()
@@ -90,12 +102,12 @@ def assert_soft_updates(learner: Any, monkeypatch: pytest.MonkeyPatch, subset: i
         torch.testing.assert_close(slow, old + 0.005 * (fast - old))
 
     losses: list[Tensor] = []
-    for optimizer in (learner.actor_optimizer, learner.temperature_optimizer):
+    for optimizer in optimizers:
         monkeypatch.setattr(optimizer, "step", losses.append)
     state = torch.get_rng_state()
     learner.update_actor(obs)
     torch.set_rng_state(state)
-    action, density = learner.actor(obs)
+    action, density = act(obs)
     value = values(learner.critics, obs, action)
     torch.testing.assert_close(losses[0], (0.3 * density - (value.mean(0) if subset else value.amin(0))).mean())
-    torch.testing.assert_close(losses[1], 0.3 * (8 - density.mean().detach()))
+    torch.testing.assert_close(losses[1], 0.3 * (nu - density.mean().detach()))

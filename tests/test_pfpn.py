@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 import torch
-from learners import assert_resumes, read_progress, refusal, run
+from learners import assert_resumes, read_progress, run
+from problems import assert_soft_updates
 from torch import Tensor
 from torch.distributions import Categorical, MixtureSameFamily, Normal
 
@@ -18,7 +19,7 @@ import pfpn
 import pfpn_sac
 import ppo_baseline
 import sac_baseline
-from diffsim.training import ClippedAdam, Transition, load_policy, parse
+from diffsim.training import ClippedAdam, load_policy, parse
 
 each_script = pytest.mark.parametrize("script", [pfpn, pfpn_sac], ids=["ppo", "sac"])
 BATCH, M, N = 7, 3, 5  # states, actions, particles
@@ -378,23 +379,14 @@ def test_sac_bandit_has_its_soft_optimum() -> None:
     assert (density - reward(a, a).squeeze(-1).softmax(0)).abs().sum() / 2 < 0.12
 
 
-def test_sac_target_counts_the_entropy_of_what_follows() -> None:
-    """And neither it nor a value after a failure."""
-    torch.manual_seed(0)
+def test_sac_targets_and_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     learner = build(pfpn_sac.SAC, "--hidden 8 --critic-hidden 8", lambda _, action: action, 4)
-    learner.temperature["log"].data.fill_(-1)
-    obs, next_obs = torch.randn(2, 32, 1)
-    batch = Transition(obs, torch.rand(32, 1), torch.randn(32), next_obs, (torch.rand(32) < 0.3).float())
-    state = torch.get_rng_state()
-    mixture = learner.actor(next_obs)
-    u = mixture.sample()
-    values = torch.stack([learner.targets[k](torch.cat((next_obs, torch.tanh(u)), 1)).squeeze(1) for k in range(2)])
-    own = torch.stack([learner.critics[k](torch.cat((obs, batch.action), 1)).squeeze(1) for k in range(2)])
-    following = values.amin(0) - math.exp(-1) * mixture.log_prob(u)
-    target = batch.reward + 0.99 * (1 - batch.terminated) * following
-    torch.set_rng_state(state)
-    loss = learner.update_critics(batch, obs, next_obs)["losses/critic"]
-    torch.testing.assert_close(loss, (own - target).square().mean().detach())
+
+    def act(obs: Tensor) -> tuple[Tensor, Tensor]:
+        u = (mixture := learner.actor(obs)).sample()
+        return torch.tanh(u), mixture.log_prob(u)
+
+    assert_soft_updates(learner, (learner.optimizer, learner.temperature_optimizer), monkeypatch, act=act)
 
 
 def test_skipped_updates_are_those_of_all_optimizers() -> None:
@@ -474,21 +466,3 @@ def test_settings_are_those_of_the_baselines(script: Any, baseline: Any, env: st
     own |= {name: vars(script).get(constant) for name, constant in CONSTANTS.items() if name in other}
     shared = other.keys() & own.keys() - {"run_dir", "eval_every", "save_every", "initial_log_std"}  # of another policy
     assert len(shared) > 20 and {name: own[name] for name in shared} == {name: other[name] for name in shared}
-
-
-@pytest.mark.parametrize(
-    ("script", "arguments", "message"),
-    [
-        (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
-        (pfpn, "--lr-bounds 1e-2 1e-3", "must be two numbers, the first not above the second, not (0.01, 0.001)"),
-        (pfpn, "--initial-log-std nan", "--initial-log-std must be from -5 to 2, not nan"),
-        (pfpn, "--initial-log-std 2.5", "--initial-log-std must be from -5 to 2, not 2.5"),
-        (pfpn_sac, "--buffer-size 10", "--buffer-size 10 is smaller than a rollout of 4096 steps"),
-    ],
-)
-def test_wrong_arguments_are_refused(
-    script: ModuleType, arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    argv = ["--env", "ant", "--device", "cpu", "--run-dir", str(tmp_path / "run"), *arguments.split()]
-    assert message in refusal(lambda: script.main(argv), capsys)
-    assert not (tmp_path / "run").exists()
