@@ -229,12 +229,6 @@ def test_make_refuses(message, arguments):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_cuda_where_there_is_none():
-    with pytest.raises(ValueError, match="cuda.*cpu"):
-        diffsim.make("cartpole", device="cuda")
-
-
 @pytest.mark.parametrize(
     "action, message",
     [

@@ -299,30 +299,6 @@ def test_torchs_modes_and_defaults_do_not_matter(name, monkeypatch):
         env.step(action)[1].sum().backward()  # it can be trained from
 
 
-def test_state_dict_continues_exactly():
-    env = diffsim.make("hopper", num_envs=3, seed=1, horizon=40)
-    actions = random_actions(env, 120)
-    with torch.no_grad():
-        records(env, actions[:40])
-        env.detach()
-        saved = env.state_dict()
-        env.load_state_dict(saved)
-        env.detach()
-        expected = records(env, actions[40:80])
-        env.detach()
-        later = records(env, actions[80:])
-        other = diffsim.make("hopper", num_envs=3, seed=99, horizon=40)
-        other.load_state_dict(saved)
-        other.detach()
-        again = records(other, actions[40:80])
-        other.detach()
-        again_later = records(other, actions[80:])
-    assert expected["_final_obs"].any()
-    for one, two in ((expected, again), (later, again_later)):
-        for key, value in one.items():
-            assert_same(value, two[key])
-
-
 def test_a_state_of_another_kind_is_refused():
     """walker and half_cheetah have equally many numbers."""
     base = dict(name="half_cheetah", num_envs=3, dtype=torch.float32)
