@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import os
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -17,6 +18,7 @@ import torch
 from diffsim.training import command
 
 ROOT = Path(__file__).resolve().parents[1]
+PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
 # Windows of cartpole with a time-out on the way (240 steps), an evaluation before the end and one at it.
 _SMALL = (
     "--env cartpole --num-envs 3 --horizon 32 --iterations 10 --eval-every 4 --eval-episodes 3 --quiet --device cpu"

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
+import draw
 import numpy as np
 import pytest
+from learners import ROOT
 from PIL import Image, ImageSequence
 
-import diffsim
 from diffsim.tasks.joystick import Go2
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-import draw  # noqa: E402
+from diffsim.training.checkpoint import POLICIES
 
 
 def test_a_loop_ends_where_it_begins() -> None:
@@ -71,10 +68,9 @@ def test_bars_are_of_the_numbers_in_the_pages() -> None:
 def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one with a clock, both worlds above diagrams, and of one without, alone; a clip."""
     monkeypatch.setattr(draw, "FIGURES", tmp_path)
-    policies = Path(diffsim.__file__).parent / "policies"
-    draw.films((policies / "go2.pt",), size=(96, 64))
-    draw.films((policies / "ant.pt",), size=(96, 64), beside=False)
-    draw.films((policies / "g1_track.pt",), size=(96, 64))
+    draw.films((POLICIES / "go2.pt",), size=(96, 64))
+    draw.films((POLICIES / "ant.pt",), size=(96, 64), beside=False)
+    draw.films((POLICIES / "g1_track.pt",), size=(96, 64))
     with Image.open(tmp_path / "g1_track.webp") as dance:
         assert dance.size == (2 * 96, 64) and dance.n_frames == 25 * draw.DANCE[1]  # type: ignore[attr-defined]
     with Image.open(tmp_path / "go2.webp") as both, Image.open(tmp_path / "ant_here.webp") as one:

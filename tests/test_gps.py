@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from functools import cache
@@ -129,8 +128,7 @@ def search(trained: Path) -> gps.Search:
 
 @pytest.fixture(scope="module")
 def rows(trained: Path) -> list[dict[str, str]]:
-    with (trained / "progress.csv").open() as file:
-        return list(csv.DictReader(file))
+    return read_progress(trained)
 
 
 def test_reward_of_the_paper(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,8 +247,7 @@ def test_resume_continues_exactly(trained: Path, tmp_path: Path, checkpoint: dic
     resumed = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     for name in checkpoint.keys() - {"seconds", "args"}:
         assert_same(resumed[name], checkpoint[name])
-    with (tmp_path / "progress.csv").open() as file:
-        assert [int(row["iteration"]) for row in csv.DictReader(file)] == [0, 1, 2, 3, 4]
+    assert [int(row["iteration"]) for row in read_progress(tmp_path)] == [0, 1, 2, 3, 4]
 
 
 def test_rows_and_files_of_a_run(trained: Path, rows: list[dict[str, str]]) -> None:
@@ -364,36 +361,23 @@ def test_algorithm_1_learns_to_hop_as_its_guides_do(tmp_path: Path) -> None:
         ("--resume {trained}/checkpoint.pt --control-dt 0.02", "has --control-dt 0.016666666666666666, which cannot "),
         ("--regularizer-bounds 1 0.1", "--regularizer-bounds must be two numbers, the first not above"),
         ("--demonstration {file}.npz", "no such trajectory: {file}.npz"),
-        ("--demonstration {file}", "{file} is not an .npz with qpos, qvel and action"),
         (
             "--demonstration {hopper} --control-dt 0.02",
             "{hopper}: qpos has shape (521, 6) of float32, must be ",
         ),
         ("--demonstration {hopper}", "{hopper} has control steps of 0.02 s, not of 0.01667 s"),
         ("--horizon 999", "cartpole.npz: qpos has shape (261, 2) of float32, must be at least (1000, 2) for 999 steps"),
-        ("--demonstration {holes}", "{holes}: qvel holds numbers that are not finite"),
         ("--env ant", "--demonstration must be an example for ant; shipped are those of cartpole, hopper, "),
-        ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
-        ("--evaluate {file}", "{file} is not a complete checkpoint of gps.py"),
         ("--resume {trained}/checkpoint.pt --horizon 9 --iterations 9", "--horizon 30, which cannot change to 9"),
         ("--resume {trained}/checkpoint.pt --noise 0.3 --iterations 9", "--noise 0.1, which cannot change to 0.3"),
         ("--evaluate {trained}/checkpoint.pt --noise 0.3", "--noise 0.1, which cannot change to 0.3; --evaluate takes"),
         ("--resume {trained}/checkpoint.pt --demonstration {hopper}", "cannot change to {hopper}"),
-        (
-            "--resume {trained}/checkpoint.pt --hidden 9 --iterations 9",
-            "does not fit the flags, or the script as it is now: network.theta has shape (",
-        ),
-        ("--resume {trained}/checkpoint.pt", "is at iteration 4 already"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
     arguments: str, message: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    hopper, holes = gps.EXAMPLES / "hopper.npz", tmp_path / "holes.npz"
-    np.savez(holes, qpos=np.zeros((300, 2)), qvel=np.full((300, 2), np.nan), action=np.zeros((299, 1)))
-    arguments, message = (
-        text.replace("{hopper}", f"{hopper}").replace("{holes}", f"{holes}") for text in (arguments, message)
-    )
+    arguments, message = (text.replace("{hopper}", f"{gps.EXAMPLES / 'hopper.npz'}") for text in (arguments, message))
     env = "" if "--env" in arguments else "--env cartpole "
     assert_refuses(gps, env + arguments, message, trained, tmp_path, capsys)
 

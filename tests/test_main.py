@@ -7,13 +7,12 @@ import shutil
 import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 import warp as wp
-from learners import refusal
+from learners import PATH, ROOT, refusal
 
 import diffsim
 import shac
@@ -21,9 +20,6 @@ from diffsim import __main__ as command
 from diffsim import startup
 from diffsim.training import load_policy
 from diffsim.view import render
-
-ROOT = Path(__file__).resolve().parents[1]
-PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
 
 
 @pytest.fixture

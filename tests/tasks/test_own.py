@@ -8,15 +8,16 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from learners import ROOT
 from scenes import parse as scene_of
 from torch import Tensor
 
 import diffsim
 from diffsim.tasks import TASKS, Task, TaskError, find_task
-from diffsim.tasks.base import way_forward
+from diffsim.tasks.base import ASSETS, way_forward
 from diffsim.training.evaluation import fitting
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_robot.xml"
+EXAMPLE = ROOT / "examples" / "own_robot.xml"
 TASK = """
 from diffsim.tasks import Task
 
@@ -132,7 +133,7 @@ def test_where_the_file_of_a_robot_is_sought(tmp_path: Path, monkeypatch: pytest
         assert task.load_robot().path == str(folder / "own_robot.xml")
     for folder in (here, there):
         (folder / "hopper.xml").write_text(SLED)
-    hopper = Path(diffsim.__file__).parent / "assets" / "hopper.xml"
+    hopper = ASSETS / "hopper.xml"
     assert TASKS["hopper"].load_robot().path == str(hopper)
     stand = "from diffsim.tasks.hopper import Hopper\nclass Stand(Hopper): pass\n"
     (there / "stand.py").write_text(stand)

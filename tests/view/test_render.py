@@ -12,14 +12,13 @@ import scenes
 from learners import refusal
 from numpy.typing import NDArray
 
-import diffsim.tasks
 import view
 from diffsim import Scene, load_scene
+from diffsim.tasks.base import ASSETS
 from diffsim.view import render
 from diffsim.view.render import Renderer, film, save_video
 
 Array = NDArray[np.float64]
-ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
 HOPPER = load_scene(ASSETS / "hopper.xml")
 
 
