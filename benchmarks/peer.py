@@ -24,7 +24,7 @@ import warp as wp
 from cells import ScriptFlags
 from common import Part, measured, run
 from speed import timed, windows
-from tables import Cells, Row, read_csv
+from tables import Row, read_csv
 from torch import Tensor
 from worlds import FASTEST, MuJoCo, mujoco_model
 
@@ -165,13 +165,9 @@ SPEED = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward", "lost"  
 TRAIN = "task", "seed", "control steps", "training (s)", "control steps/s", "return", "lost"
 
 
-def shown(columns: tuple[str, ...], rows: list[Cells]) -> list[Row]:
-    return [{name: row.get(name, "") for name in columns} for row in rows]
-
-
 PARTS = {
-    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", partial(shown, SPEED)),
-    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", partial(shown, TRAIN)),
+    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", columns=SPEED),
+    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", columns=TRAIN),
 }
 
 
