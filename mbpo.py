@@ -111,9 +111,10 @@ class Args(ParallelFlags):
         first, last = self.rollout_lengths
         rows, past = self.num_envs * (1 + self.sample_enhance), find_task(self.env).num_memory
         jacobians = "--sample-enhance takes Jacobians of"
-        seeding = f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}"
+        most = self.iterations * self.steps - 1
+        seeding = f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}: at most {most}"
         wrong = {
-            seeding: self.seed_steps >= self.iterations * self.steps,
+            seeding: self.seed_steps > most,
             "start it without torchrun: processes do not share a replay buffer": distributed.size() > 1,
             "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
             f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,

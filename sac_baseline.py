@@ -110,8 +110,8 @@ class Args(ParallelFlags):
             fail("start it without torchrun: processes do not share a replay buffer")
         if self.critic_subset > self.critics:
             fail(f"--critic-subset {self.critic_subset} is larger than --critics {self.critics}")
-        if self.seed_steps >= self.iterations * self.steps:
-            fail(f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}")
+        if self.seed_steps > (most := self.iterations * self.steps - 1):
+            fail(f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}: at most {most}")
         if self.actor_updates > self.updates_per_step:
             fail(f"--actor-updates {self.actor_updates} are more than --updates-per-step {self.updates_per_step}")
         if self.buffer_size < self.steps * self.num_envs:

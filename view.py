@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def show(args: Args) -> None:
-    saved = load_policy(args.path / "checkpoint.pt" if args.path.is_dir() else args.path)
+    saved = load_policy(args.path)
     changes: dict[str, Any] = {"env": saved.task(args.env)} | ({"substeps": args.substeps} if args.substeps else {})
     task, name = find_task(changes["env"]).name, f"{saved.script}.py, iteration {saved.iteration}"
     env = make_policy_env(saved, args.episodes, **changes)

@@ -110,6 +110,8 @@ class Flags(RunFlags):
         """Raises a ValueError where arguments do not fit together."""
         if self.clip and not issubclass(find_task(self.env), Imitation):
             fail(f"--clip is for {', '.join(tracking())}: {self.env} tracks no motion")
+        if self.contact == "mujoco" != self.integrator:
+            fail(f"--integrator {self.integrator} is for --contact soft, and the contact is MuJoCo's")
 
     @classmethod
     def script(cls) -> str:

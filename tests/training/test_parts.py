@@ -41,6 +41,11 @@ def test_the_optimizer_is_bitwise_what_torchs_fused_adam_computes() -> None:
     assert optimizer.step_count == 5 and optimizer.skipped == 2
 
 
+def test_a_loss_without_a_gradient_is_named() -> None:
+    with pytest.raises(ValueError, match="the loss has no gradient: observe and reward must be torch operations"):
+        ClippedAdam(nn.Linear(2, 1), 0.5).step(torch.zeros(()))
+
+
 # Ensemble -------------------------------------------------------------------------------------------------------------
 
 BETAS = (0.7, 0.95)
