@@ -1,4 +1,4 @@
-"""SAC's equations, and a linear-quadratic problem without simulator, whose optimum is known."""
+"""Returns, SAC's equations, and a linear-quadratic problem without simulator, whose optimum is known."""
 
 from __future__ import annotations
 
@@ -7,13 +7,34 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
 from diffsim.training import Transition
+
+Array = NDArray[Any]
+
+
+def lambda_returns(reward: Array, following: Array, done: Array, gamma: float, lam: float) -> Array:
+    """(T, N): of each step the weighted sum of all its n-step returns until the episode or the window ends.
+
+    Args:
+        following: (T, N) values of the states after the steps.
+    """
+    horizon, expected = len(reward), np.zeros(reward.shape)
+    for t, i in np.ndindex(reward.shape):
+        n = next((k for k in range(1, horizon - t) if done[t + k - 1, i]), horizon - t)  # steps to the end
+        returns = [
+            sum(gamma**j * reward[t + j, i] for j in range(k)) + gamma**k * following[t + k - 1, i]
+            for k in range(1, n + 1)
+        ]
+        expected[t, i] = np.dot([*((1 - lam) * lam ** (k - 1) for k in range(1, n)), lam ** (n - 1)], returns)
+    return expected
 
 
 class Problem:
@@ -85,6 +106,8 @@ def assert_soft_updates(
     obs, next_obs, failed = torch.randn(32, inputs), torch.randn(32, inputs), (torch.rand(32) < 0.3).float()
     batch = Transition(obs, torch.rand(32, nu), torch.randn(32), next_obs, failed)
     critics = len(learner.critics.layers[0].bias)
+    for p in learner.targets.parameters():
+        p.data.add_(0.1 * torch.randn_like(p))  # far from the critics, which have made no step
 
     def values(networks: Any, obs: Tensor, action: Tensor) -> Tensor:
         return torch.stack([networks[k](torch.cat((obs, action), 1)).squeeze(1) for k in range(critics)])

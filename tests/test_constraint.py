@@ -541,9 +541,7 @@ def test_steps_that_do_not_converge_are_counted():
 @pytest.mark.parametrize(
     "scene, integration, why",
     [
-        (pendulum(), Integration("mujoco", 4, passes=0), "passes is 0, must be an integer of at least 1"),
         (pendulum(), Integration("mujoco", 4, tolerance=0), "tolerance is 0, must lie between 0 and 1"),
-        (pendulum(), Integration("mujoco", 4, theta=0.5), "only the implicit integrator has a theta"),
         (
             pendulum('frictionloss="1"'),
             Integration(),

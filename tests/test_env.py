@@ -103,20 +103,6 @@ def test_statistics_are_sums_since_they_were_taken():
     assert not any(value.any() for value in env.take_statistics().values())
 
 
-@pytest.mark.parametrize("steps", [240, 3])
-def test_time_limit_truncates(steps):
-    env = diffsim.make("cartpole", num_envs=2, seed=0, max_episode_steps=None if steps == 240 else steps)
-    with torch.no_grad():
-        for step in range(1, 2 * steps + 1):
-            _, _, terminated, truncated, info = env.step(torch.zeros(2, 1))
-            assert not terminated.any()
-            assert truncated.tolist() == info["_episode"].tolist() == [step % steps == 0] * 2
-            if truncated.any():
-                assert info["episode"]["l"].tolist() == [steps] * 2
-                np.testing.assert_allclose(info["episode"]["t"], steps / 60)
-    assert env.episode_step.tolist() == [0, 0]
-
-
 def test_early_termination_can_be_off():
     """A robot that lies goes on; one whose simulation blows up does not."""
     env = diffsim.make("hopper", num_envs=2, early_termination=False, seed=0)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from learners import assert_refuses, assert_same, read_progress, run
+from planning.systems import normal
 from torch import Tensor
 
 import diffsim
@@ -27,10 +28,6 @@ SMALL = (
     "--iterations 4 --lbfgs-iterations 5 --eval-every 2 --eval-episodes 3 --quiet"
 ).split()
 TINY = [*SMALL, *"--horizon 8 --pretraining 5 --iterations 2 --eval-episodes 1".split()]
-
-
-def normal(rng: np.random.Generator, *shape: int) -> Tensor:
-    return torch.tensor(rng.normal(size=shape))
 
 
 environment = cache(diffsim.make)

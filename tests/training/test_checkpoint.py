@@ -207,22 +207,6 @@ def assert_acts_alike(model: Any, network: nn.Module, obs: torch.Tensor, columns
         torch.testing.assert_close(torch.from_numpy(action), wanted[:rows], rtol=0, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_the_shipped_ant_as_onnx(tmp_path):
-    path = Path(str(command.POLICIES / "ant.pt"))
-    model, told = export(path, tmp_path / "policy.onnx")
-    saved = load_policy(path)
-    assert_acts_alike(model, saved.network, torch.randn(50, 37), 37)
-    assert told == {
-        "task": "ant",
-        "script": "sapo",
-        "iteration": str(saved.iteration),
-        "control_dt": str(1 / 60),
-        "actuators": ",".join(f"{part}_{leg}[-1:1]" for leg in range(1, 5) for part in ("hip", "ankle")),
-        "joint_names": ",".join(f"{part}_{leg}" for leg in range(1, 5) for part in ("hip", "ankle")),
-    }
-
-
 def test_a_policy_that_tracks_takes_the_clip_as_an_input(tmp_path: Path) -> None:
     """At the start of an episode, where nothing is off, and somewhat later."""
     torch.manual_seed(0)
