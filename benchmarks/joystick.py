@@ -168,7 +168,8 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def whole(rows: list[dict[str, str]]) -> list[Row]:
-    """The share of episodes without a fall: a line for each world, a column for each task, learner and machine."""
+    """The share of episodes without a fall: a column for each task, learner and machine, a line for worlds that agree
+    in all of them."""
     lines: dict[str, dict[str, str]] = {}
     for policy, group in policies(rows).items():
         kinds: dict[str, list[dict[str, str]]] = {}
@@ -177,9 +178,11 @@ def whole(rows: list[dict[str, str]]) -> list[Row]:
         for kind, own in kinds.items():
             lines.setdefault(kind, {})[policy] = with_worst(own, "whole", ".0%", min)
     order = "friction", "pushes", "20", "mass", "gains", "all"
-    kinds_in_order = sorted(lines, key=lambda kind: [not kind.startswith(name) for name in order])
+    agreeing: dict[tuple[str, ...], list[str]] = {}
+    for kind in sorted(lines, key=lambda kind: [not kind.startswith(name) for name in order]):
+        agreeing.setdefault(tuple(lines[kind].get(policy, "") for policy in policies(rows)), []).append(kind)
     return [
-        {"world": kind} | {policy: lines[kind].get(policy, "") for policy in policies(rows)} for kind in kinds_in_order
+        {"world": ", ".join(kinds)} | dict(zip(policies(rows), cells, strict=True)) for cells, kinds in agreeing.items()
     ]
 
 
