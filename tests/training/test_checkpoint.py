@@ -64,7 +64,7 @@ def test_a_crash_while_saving_leaves_the_old_one(tmp_path, monkeypatch):
 def test_anything_else_is_refused_in_one_line(tmp_path, capsys):
     path = tmp_path / "checkpoint.pt"
     assert refusal(lambda: load(path), capsys).endswith(f": no such checkpoint: {path}")
-    assert refusal(lambda: load(tmp_path), capsys).endswith(f": no such checkpoint: {tmp_path}")
+    assert refusal(lambda: load(tmp_path), capsys).endswith(f": no such checkpoint: {path}")  # of a folder
     save(path, "shac", Tiny(), STATE)
     assert refusal(lambda: load(path, "bptt"), capsys).endswith(f": {path} is a checkpoint of 'shac', not of bptt.py")
     whole = path.read_bytes()
