@@ -54,7 +54,7 @@ def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
     assert spec.features == {*everything.split()}
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
         source = compiled(kernel.module, arch=90)
-        for function in ("add_muscles", "place_balls", "sphere_on_terrain", "drag_wrench", "add_forces"):
+        for function in ("add_muscles", "place_balls", "nearest_of_each", "drag_wrench", "add_forces"):
             assert function in source, function
 
 
