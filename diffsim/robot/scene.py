@@ -204,6 +204,22 @@ class Scene:
         return link
 
     @property
+    def root(self) -> tuple[Array, Array, Array]:
+        """Where the carrier is: at place (3,) [m] if qpos is 0, its x grows by along (nq,) . qpos, and qpos + up (nq,)
+        is one metre higher."""
+        place, frame, along, up = np.zeros(3), np.eye(3), np.zeros(self.nq), np.zeros(self.nq)
+        if self.floating:
+            along[0] = up[2] = 1.0
+        for link in range(1, self.carrier + 1):  # slides, which turn nothing
+            place += frame @ (self.position[link] - self.joint_ref[link] * self.rotation[link] @ self.axis[link])
+            frame = frame @ self.rotation[link]
+            axis = frame @ self.axis[link]
+            along[link - 1] = axis[0]
+            if abs(axis[2]) > 1 - 1e-9:
+                up[link - 1] = np.sign(axis[2])
+        return place, along, up
+
+    @property
     def inert(self) -> int:
         """Number of links after the fixed base without mass, contact or muscle: the slides of a planar robot."""
         busy = (self.mass > 0) | self.inertia.any((1, 2))

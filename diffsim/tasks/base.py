@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import ClassVar, Literal, TypeAlias
 
 import mujoco
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -254,7 +255,7 @@ class Task:
         return memory
 
     def ghost(self, memory: Tensor) -> Tensor | None:
-        """qpos (..., nq) of what the robot is to track, which films and pages draw next to it, or None."""
+        """World qpos (..., nq) of what the robot is to track, which films and pages draw next to it, or None."""
         return None
 
     def program(self, policy: nn.Module, columns: int) -> tuple[nn.Module, dict[str, tuple[int, ...]], list[str]]:
@@ -310,9 +311,5 @@ def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:
 def way_forward(scene: Scene) -> int | None:
     """Column of qpos that is the root's x, of its free joint or its slide along x; None if neither ground nor fluid
     carries the robot, or if it has no such joint, as an arm."""
-    m = scene.mj_model
-    mujoco.mj_kinematics(m, data := mujoco.MjData(m))
-    along = (m.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (data.xaxis[:, 0] > 0.99)
-    along |= m.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-    found = m.jnt_qposadr[along & (m.body_weldid[m.body_parentid[m.jnt_bodyid]] == 0)]
+    found = np.flatnonzero(scene.root[1] > 0.99)
     return int(found[0]) if len(found) and scene.features & {"contact", "drag"} else None
