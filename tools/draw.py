@@ -33,10 +33,11 @@ from tyro.conf import Positional
 
 from diffsim import TASKS, Scene
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
+from diffsim.robot.contact import contact_bodies, trace
 from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.tasks.joystick import Joystick
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
-from diffsim.training.gait import TOUCHING, contact_bodies, trace
+from diffsim.training.gait import TOUCHING
 from diffsim.view.render import Frame, Renderer, whole_file
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))

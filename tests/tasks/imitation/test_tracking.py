@@ -17,6 +17,7 @@ from diffsim import Clip, read_clip
 from diffsim.tasks.imitation.task import STRAY
 from diffsim.tasks.imitation.tracking import AHEAD, BEFORE_END, REACH, STANDING, TURNED, G1Track
 from diffsim.tasks.locomotion import FREQUENCY_OF_PUSHES
+from diffsim.terrain import incline
 from diffsim.training import checkpoint
 
 REAL = torch.float64
@@ -287,6 +288,12 @@ def test_a_run_goes_on_with_a_shorter_clip_by_new_episodes(tmp_path: Path) -> No
     ppo_baseline.main(["--resume", str(tmp_path), "--clip", clip, "--stop-after", "2", "--quiet"])
     state = checkpoint.load(path)
     assert state["iteration"] == 2 and state["ranks"][0]["env"]["memory"][:, 0].max() <= 120
+
+
+def test_on_a_slope_the_ghost_stands_on_the_ground() -> None:
+    env = diffsim.make("g1_track", 2, clip="g1_jazz_walk", seed=0, terrain=incline(10.0, -2.0))
+    assert env.qpos[:, 2].min() > 1.0
+    torch.testing.assert_close(env.task.ghost(env.memory), env.qpos)
 
 
 def test_pushes_come_at_random_and_as_large_as_asked() -> None:
