@@ -212,7 +212,7 @@ def test_a_policy_that_tracks_takes_the_clip_as_an_input(tmp_path: Path) -> None
     torch.manual_seed(0)
     env = diffsim.make("g1_track", 3, seed=0, clip="g1_jazz_walk")
     args = parse(shac.Args, "--env g1_track --device cpu --actor-hidden 16 --clip g1_jazz_walk".split())
-    policy = shac.Actor(args, env.task.obs_dim, 29).deterministic()
+    policy = shac.Actor(args, env, None).deterministic()
     kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
     save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": kept, "iteration": 7})
     model, told = export(path, tmp_path / "policy.onnx")
@@ -261,9 +261,10 @@ def test_an_exported_policy_names_a_shipped_clip_and_may_have_16_bits(name: str,
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_onnx_takes_only_what_the_actor_sees(symmetric, tmp_path):
     torch.manual_seed(0)
+    env = diffsim.make("go1", 1)
     seen, whole = Go1.actor_dim, Go1.obs_dim
     args = parse(shac.Args, "--env go1 --device cpu --actor-hidden 16".split())
-    actor = shac.Actor(args, whole, 12, seen, Go1().mirror if symmetric else None)
+    actor = shac.Actor(args, env, env.task.mirror if symmetric else None)
     actor.normalizer.update(3.0 + 2.0 * torch.randn(100, whole) * torch.rand(whole))
     kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
     policy = actor.deterministic()[:-1]  # without tanh: actions leave [-1, 1]

@@ -107,7 +107,8 @@ def test_the_video_is_of_the_median_episode(
     assert scene is result.scene and dt == 1 / 60
     np.testing.assert_array_equal(qpos[:, 0], range(7))  # seven steps of the episode of return 3
     np.testing.assert_allclose(ctrl[:, 0], np.arange(7) / 10, rtol=1e-6)
-    assert len(some(result, control_dt=2.0).median_episode()[0]) == 5  # ten seconds
+    some(result, control_dt=2.0).save_video(tmp_path / "video.mp4")
+    assert len(filmed[1][1]) == 5  # ten seconds
 
 
 def test_evaluate_a_checkpoint_with_other_substeps(

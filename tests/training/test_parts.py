@@ -163,13 +163,6 @@ def test_a_full_buffer_keeps_its_size() -> None:
         assert torch.equal(copy.rows[:3], young.rows[:3]) and copy.count == 3
 
 
-def test_more_than_it_keeps_is_refused() -> None:
-    buffer = ReplayBuffer(3, 2, 1)
-    with pytest.raises(ValueError, match="4 transitions at once do not fit into a replay buffer of 3"):
-        buffer.add(transitions(0, 1, 2, 3))
-    assert buffer.count == 0
-
-
 # Running statistics ---------------------------------------------------------------------------------------------------
 
 MEAN, STD = (0, 5, -100, 1e-3), (1, 10, 0.1, 1e-3)
