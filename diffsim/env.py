@@ -88,7 +88,8 @@ class DiffEnv(VectorEnv):
         self.task, self.scene, self.control_dt = task.bind(scene), scene, task.control_dt
         how = integration or task.integration("default")
         self.sim = sim = Simulator(scene, num_envs, how, task.control_dt, horizon, **options)
-        self.num_envs, self.horizon, self.device, self.dtype = sim.num_envs, sim.horizon, sim.device, sim.dtype
+        self.num_envs, self.horizon = num_envs, horizon = sim.num_envs, sim.horizon
+        self.device, self.dtype = sim.device, sim.dtype
         numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory)
         check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
         self.episode_length = task.episode_length

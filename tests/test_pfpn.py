@@ -15,6 +15,7 @@ from problems import assert_soft_updates
 from torch import Tensor
 from torch.distributions import Categorical, MixtureSameFamily, Normal
 
+import diffsim
 import pfpn
 import pfpn_sac
 import ppo_baseline
@@ -421,7 +422,7 @@ def test_a_run_resumes_bitwise_with_its_particles(script: Any, tmp_path: Path) -
     whole = assert_resumes(script, tmp_path, flags, 3)
     last = {name: float(value or "nan") for name, value in read_progress(tmp_path / "whole")[-1].items()}
     assert last["particles_moved"] == whole["modules"]["resampling"]["moved"] > 0
-    actor = script.Actor(parse(script.Args, flags.split()), 5, 1)
+    actor = script.Actor(parse(script.Args, flags.split()), diffsim.make("cartpole", 1))
     actor.load_state_dict(whole["modules"]["actor"])
     obs = torch.randn(20, 5)
     mixture = actor(actor.normalizer(obs))
