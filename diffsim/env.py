@@ -19,7 +19,6 @@ from torch import Tensor
 from diffsim.robot.scene import Scene
 from diffsim.sim.adjoint import ClipAdjoint
 from diffsim.sim.integration import Integration, check_count, is_real
-from diffsim.sim.launcher import check_memory
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
@@ -90,8 +89,6 @@ class DiffEnv(VectorEnv):
         self.sim = sim = Simulator(scene, num_envs, how, task.control_dt, horizon, **options)
         self.num_envs, self.horizon = num_envs, horizon = sim.num_envs, sim.horizon
         self.device, self.dtype = sim.device, sim.dtype
-        numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory)
-        check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
         self.episode_length = task.episode_length
         if max_episode_steps is not None:
             self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
