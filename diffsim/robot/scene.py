@@ -125,7 +125,6 @@ class Scene:
     viscosity: float = 0.0  # kg/(m s)
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
-    approximations: tuple[str, ...] = ()  # what the file asks for and is simulated only roughly, a sentence each
 
     @property
     def nlink(self) -> int:

@@ -65,6 +65,9 @@ class SavedPolicy:
     iteration: int
     simulator: str = HOME
 
+    def __str__(self) -> str:
+        return f"{self.script}.py, iteration {self.iteration}"
+
     def task(self, given: str | None = None) -> str:
         """The name of its task, or the given file of an own one: what a checkpoint names is data, and no code to run.
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 
 from diffsim.sim.integration import PASSES, TOLERANCE
-from diffsim.tasks import FILE, TASKS, Contact, Imitation, Task, find_task
+from diffsim.tasks import FILE, TASKS, Accuracy, Contact, Imitation, Task, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, in_one_line
@@ -73,7 +73,7 @@ class Flags:
     quiet: bool = False
     """no progress bar, and no messages until the end"""
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
-    accuracy: Literal["fast", "default", "accurate"] = "default"
+    accuracy: Accuracy = "default"
     """preset of integrator, substeps and theta (docs/numerics.md); default: the papers' settings"""
     integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
     """time integration (per task, --accuracy and --contact); mujoco includes MuJoCo's own contact and limits"""
