@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def show(args: Args) -> None:
     saved = load_policy(args.path)
-    changes = {"substeps": args.substeps} if args.substeps else {}
+    changes: dict[str, Any] = {"substeps": args.substeps} if args.substeps else {}
     env = make_policy_env(saved, args.episodes, env=args.env, **changes)
     evaluation = evaluate(env, saved.network, args.seed)
     print(f"{env.task.name}, {saved}, {args.episodes} episodes: {evaluation}")
