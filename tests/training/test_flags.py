@@ -89,7 +89,7 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant, humanoid"),
         ("--env walker --accuracy fast", "task 'walker' has no preset 'fast' on soft contact; choose from default"),
         ("--env cartpole --rough 10", "cartpole touches no ground, so it has no terrain"),
-        ("--env ant --clip humanoid_run", "--clip is for humanoid_imitation, g1_track: ant tracks no motion"),
+        ("--env ant --clip humanoid_run", "task 'ant' tracks no clip; humanoid_imitation, g1_track do"),
         ("--env humanoid_imitation --clip nowhere", "--clip: no such clip: nowhere"),
         ("--env walker --rough 50", "--rough must be from 0 to 45, not 50.0"),
         ("--substeps 5 --integrator extrapolated", "substeps is 5, must be even"),

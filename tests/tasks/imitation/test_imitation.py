@@ -18,7 +18,6 @@ import shac
 from diffsim import Clip, read_clip
 from diffsim.tasks.imitation.task import STRAY, HumanoidImitation
 from diffsim.training import export_policy, load_policy, make_policy_env, parse
-from diffsim.training.evaluation import make_env
 
 REAL = torch.float64
 NQ, NV, NU = 28, 27, 21
