@@ -186,6 +186,15 @@ def test_guides_reproduce_the_plan(rows: list[dict[str, str]]) -> None:
     assert abs(mean - plan) < 0.01 * abs(plan) and 0 < std < 0.01 * abs(plan)
 
 
+def test_a_diverged_step_earns_a_floor_below_all_of_the_guides(search: gps.Search) -> None:
+    """As far below their worst step as that one is below the best."""
+    worst, top = search.sample_guides().reward.aminmax()
+    assert search.floor == pytest.approx((2 * worst - top).item()) and worst < top
+    x, finite = search.guides[0].x[None], torch.arange(30)[None] < 20
+    reward = search.measure(x, search.guides[0].u[None], finite).reward
+    assert ((reward == search.floor) == ~finite).all()
+
+
 def test_line_7_ends_above_both_of_its_starts(search: gps.Search) -> None:
     S, theta = search.S.samples.pick(search.choose(16, 4)), search.network.theta
     value, top = search.objective(log_mixture(S), S.reward / search.scale), S.returns.argmax()

@@ -166,6 +166,15 @@ def test_the_implicit_gradient_has_no_bias() -> None:
     assert min(cosines[pfpn_sac.implicit]) > 0.995 and cosines[pfpn_sac.straight_through][0] < 0.8
 
 
+def test_the_implicit_gradient_is_bounded_where_few_actions_are_drawn() -> None:
+    """Between two narrow particles F is the left one's weight, and the density that of the floor."""
+    logits, loc = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True), torch.tensor([[-1.0, 1.0]]).double()
+    mixture = pfpn_sac.Mixture(logits, loc, torch.full_like(loc, -4.0))
+    mixture.sample = lambda: torch.zeros(1, dtype=torch.float64)  # type: ignore[method-assign]
+    (slope,) = torch.autograd.grad(pfpn_sac.implicit(mixture).sum(), logits)
+    torch.testing.assert_close(slope, torch.tensor([[-0.25, 0.25]]).double() / pfpn_sac.DENSITY)
+
+
 # Resampling -----------------------------------------------------------------------------------------------------------
 
 
