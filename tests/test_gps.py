@@ -162,14 +162,23 @@ def test_policy_does_not_look_at_the_action_before(rng: np.random.Generator) -> 
 def test_schedule_of_the_regulariser(
     bounds: tuple[float, float], start: float, search: gps.Search, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Lines 10 to 16: a better policy is kept, and w_r falls; otherwise w_r grows, and the best is sampled again."""
+    """Lines 10 to 16: a better policy is kept, and w_r falls; otherwise w_r grows, and the best is sampled again.
+
+    What is better is confirmed with all samples of the best one.
+    """
     search.args.regularizer_bounds, search.w_r, best = bounds, start, search.network.theta
     monkeypatch.setattr(search, "optimise", lambda S: (search.network.theta + 1e-3, {}))
-    seen = []
+    seen, compared = [], list[bool]()
+
+    def estimate(theta: Tensor, active: Tensor) -> tuple[bool, dict[str, float]]:
+        own = (search.S.samples.source == search.best).nonzero().flatten()
+        compared.append(bool(torch.isin(own, active).all()))
+        return better, {}
+
+    monkeypatch.setattr(search, "estimate", estimate)
     for better in (True, True, True, False, False, False, False, False, False, True):
-        monkeypatch.setattr(search, "estimate", lambda theta, active, better=better: (better, {}))
         metrics, drawn = search.iterate(1), search.control_steps
-        assert metrics["gps/accepted"] == better
+        assert metrics["gps/accepted"] == better and (compared[-1] or not better)
         assert metrics["gps/regularizer"] == pytest.approx(seen[-1] if seen else start)
         best = best + 1e-3 if better else best
         torch.testing.assert_close(search.network.theta, best)
@@ -343,6 +352,7 @@ def test_the_noise_of_guides_is_at_most_the_policys() -> None:
     """exp(reward) and the tracking of states make it smaller."""
     search = make_search("hopper", "--horizon 20")
     search.prepare(lambda message: None)
+    assert search.scale == pytest.approx(search.S.samples.reward.std().item())
     for covariance in search.guides[0].L @ search.guides[0].L.mT:
         assert (torch.linalg.eigvalsh(search.network.sigma.square().diag() - covariance) > 0).all()
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import get_type_hints
 
+import numpy as np
 import pytest
 import torch
 from learners import SCRIPTS, assert_refuses, refusal
@@ -25,6 +26,7 @@ import ppo_baseline
 import sac_baseline
 import sapo
 import shac
+from diffsim.terrain import uneven
 from diffsim.training import checkpoint, errors, flags, parse, ranges
 from diffsim.training.evaluation import make_env
 
@@ -268,6 +270,11 @@ def test_accuracy_is_stored_and_can_be_replaced():
         assert numbers(*words) == (accurate.integrator, accurate.substeps, accurate.theta)
     assert numbers("--accuracy", "accurate", "--substeps", "2") == (accurate.integrator, 2, accurate.theta)
     assert numbers("--substeps", "16", "--integrator", "semi_implicit") == ("semi_implicit", 16, 0.0)
+
+
+def test_rough_ground_is_as_steep_as_the_flag():
+    args = parse(shac.Args, "--env hopper --device cpu --rough 12".split())
+    np.testing.assert_array_equal(make_env(args, 3, seed=5).scene.terrain, uneven(12.0, 3, 5))
 
 
 def test_what_a_checkpoint_decides(capsys):
