@@ -47,6 +47,13 @@ def test_robots_are_their_files(name: str) -> None:
         hip = data.xanchor[pitch.id]
         assert abs(hip[2] - foot[2] - robot.length) < 0.1
         assert np.linalg.norm(hip[:2] - leg.place) < 0.06
+    for joint, point in zip(task._feet.joint.view(len(robot.legs), -1)[:, -1].tolist(), task._feet.point, strict=True):
+        body = model.jnt_bodyid[1 + joint]
+        spheres = [g for g in feet if model.geom_bodyid[g] == body]  # the point is in the middle under them
+        under = data.geom_xpos[spheres].mean(0) - (0, 0, model.geom_size[spheres[0], 0])
+        np.testing.assert_allclose(
+            data.xpos[body] + data.xmat[body].reshape(3, 3) @ point[:, 0].numpy(), under, atol=1e-12
+        )
     low, high = model.actuator_ctrlrange.T
     joints = model.actuator_trnid[:, 0]
     home = np.array(robot.home)[joints - 1]
