@@ -74,13 +74,11 @@ class Args(ParallelFlags):
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only.
+    """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only."""
 
-    The policy sees the first `seen` numbers of an observation (None: all).
-    """
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         orthogonal, elu = args.deterministic_policy, partial(nn.ELU, inplace=True)
         network = mlp(seen or obs_dim, args.hidden, action_dim, elu, norm=True, orthogonal=orthogonal)
@@ -120,8 +118,7 @@ class BPTT:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
+        self.actor = Actor(args, env).to(env.device)
         self.policy = self.actor.deterministic()
         # However large a gradient is, it is clipped and followed: the comparison shows exploding gradients.
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, args.betas, skip_norm=math.inf)

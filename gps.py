@@ -472,7 +472,7 @@ def train(args: Args, learner: type[Search] = Search) -> None:
             run.log_evaluation(search.evaluate())
 
 
-main = script(Args, train, lambda args: evaluate_checkpoint(args, Search, Search.evaluate))
+main = script(Args, train, lambda args: evaluate_checkpoint(args, Search))
 
 if __name__ == "__main__":
     main()

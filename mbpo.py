@@ -111,9 +111,10 @@ class Args(ParallelFlags):
         first, last = self.rollout_lengths
         rows, past = self.num_envs * (1 + self.sample_enhance), find_task(self.env).num_memory
         jacobians = "--sample-enhance takes Jacobians of"
-        seeding = f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}"
+        most = self.iterations * self.steps - 1
+        seeding = f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}: at most {most}"
         wrong = {
-            seeding: self.seed_steps >= self.iterations * self.steps,
+            seeding: self.seed_steps > most,
             "start it without torchrun: processes do not share a replay buffer": distributed.size() > 1,
             "--num-envs must be at least 2: one environment is held out": self.num_envs < 2,
             f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
@@ -132,13 +133,11 @@ class Args(ParallelFlags):
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state.
+    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
 
-    The policy sees the first `seen` numbers of an observation (None: all).
-    """
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
@@ -209,7 +208,7 @@ class MBPO:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         self.held_out = -(-args.num_envs // HELD_OUT)
-        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
+        self.actor = Actor(args, env).to(env.device)
         critics = [mlp(obs_dim + action_dim, args.hidden, 1, nn.ReLU) for _ in range(2)]
         self.critics = Ensemble(critics).to(env.device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)

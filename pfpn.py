@@ -223,13 +223,11 @@ def almost_constant(inputs: int, output: Tensor) -> nn.Linear:
 
 
 class Actor(nn.Module):
-    """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations.
+    """pi(a|s) and V(s), in units of its normalizer, on shared features of normalized observations."""
 
-    Both see the first `seen` numbers of an observation (None: all).
-    """
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ELU))
         self.head = Head(args, args.hidden[-1], action_dim)
@@ -344,7 +342,7 @@ class PPO:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        self.actor = Actor(args, env.task.obs_dim, env.scene.nu, env.task.actor_dim).to(env.device)
+        self.actor = Actor(args, env).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
         self.return_normalizer = ObsNormalizer().to(env.device)

@@ -187,13 +187,11 @@ def spread(actions: int, n: int) -> tuple[Tensor, Tensor]:
 
 
 class Actor(nn.Module):
-    """pi(a|s), of normalized observations.
+    """pi(a|s), of normalized observations."""
 
-    The policy sees the first `seen` numbers of an observation (None: all).
-    """
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.head = Head(args, args.hidden[-1], action_dim)
@@ -307,7 +305,7 @@ class SAC:
         estimator = straight_through if args.estimator == "straight-through" else implicit
         self.sample = Mixture.sample if args.policy == "gaussian" else estimator
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
+        self.actor = Actor(args, env).to(env.device)
         self.policy = self.actor.deterministic()
         self.resampling = Resampling(args, self.actor.head).to(env.device)
         critics = [mlp(obs_dim + action_dim, args.critic_hidden, 1, nn.ReLU) for _ in range(2)]

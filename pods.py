@@ -101,13 +101,11 @@ class Args(Flags):
 
 
 class Actor(nn.Module):
-    """The deterministic policy a = tanh(u(s)).
+    """The deterministic policy a = tanh(u(s))."""
 
-    The policy sees the first `seen` numbers of an observation (None: all).
-    """
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.mean = seeing(seen, mlp(seen or obs_dim, args.hidden, action_dim, nn.ELU, norm=True))
 
@@ -216,7 +214,7 @@ class PODS:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        self.actor = Actor(args, env.task.obs_dim, env.scene.nu, env.task.actor_dim).to(env.device)
+        self.actor = Actor(args, env).to(env.device)
         self.policy = self.actor.deterministic()
         self.optimizer = ClippedAdam(self.actor, args.max_grad_norm, lr=args.lr)
         self.control_steps = 0  # of the iteration

@@ -99,13 +99,12 @@ class Args(SymmetricFlags):
 class ActorCritic(nn.Module):
     """The mean of the Gaussian pi(a|s), whose standard deviation does not depend on s, and V(s), on common features.
 
-    The policy sees the first `seen` numbers of an observation (None: all). A mirror makes it symmetric.
+    A mirror makes the policy symmetric.
     """
 
-    def __init__(
-        self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
-    ) -> None:
+    def __init__(self, args: Args, env: DiffEnv, mirror: Mirror | None) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim, mirror)
         elu = partial(nn.ELU, inplace=True)
         self.features = seeing(seen, mlp(seen or obs_dim, args.hidden, None, elu), mirror)
@@ -162,7 +161,7 @@ class PPO:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
         mirror = env.task.mirror if args.symmetric else None
-        self.actor_critic = ActorCritic(args, obs_dim, action_dim, env.task.actor_dim, mirror).to(env.device)
+        self.actor_critic = ActorCritic(args, env, mirror).to(env.device)
         self.policy = self.actor_critic.deterministic()
         self.return_normalizer = ObsNormalizer().to(env.device)
         self.optimizer = ClippedAdam(self.actor_critic, args.max_grad_norm, lr=args.lr)

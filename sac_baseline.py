@@ -110,8 +110,8 @@ class Args(ParallelFlags):
             fail("start it without torchrun: processes do not share a replay buffer")
         if self.critic_subset > self.critics:
             fail(f"--critic-subset {self.critic_subset} is larger than --critics {self.critics}")
-        if self.seed_steps >= self.iterations * self.steps:
-            fail(f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}")
+        if self.seed_steps > (most := self.iterations * self.steps - 1):
+            fail(f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}: at most {most}")
         if self.actor_updates > self.updates_per_step:
             fail(f"--actor-updates {self.actor_updates} are more than --updates-per-step {self.updates_per_step}")
         if self.buffer_size < self.steps * self.num_envs:
@@ -122,13 +122,11 @@ class Args(ParallelFlags):
 
 
 class Actor(nn.Module):
-    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state.
+    """pi(a|s): tanh of a Gaussian whose mean and standard deviation depend on the state."""
 
-    The policy sees the first `seen` numbers of an observation (None: all).
-    """
-
-    def __init__(self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None) -> None:
+    def __init__(self, args: Args, env: DiffEnv) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim)
         self.body = seeing(seen, mlp(seen or obs_dim, args.hidden, None, nn.ReLU))
         self.mean, self.log_std = (nn.Linear(args.hidden[-1], action_dim) for _ in range(2))
@@ -160,7 +158,7 @@ class SAC:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
         obs_dim, action_dim = env.task.obs_dim, env.scene.nu
-        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim).to(env.device)
+        self.actor = Actor(args, env).to(env.device)
         inputs = obs_dim + action_dim
         critics = [mlp(inputs, args.hidden, 1, nn.ReLU, args.layer_norm) for _ in range(args.critics)]
         self.critics = Ensemble(critics).to(env.device)

@@ -125,6 +125,10 @@ class Args(WindowFlags):
             values |= INTEGRATION[self.env]._asdict()
         return super().task_defaults() | values | BALANCING.get(self.env, {})
 
+    @property
+    def samples(self) -> int:
+        return super().samples // self.population
+
     def check(self) -> None:
         super().check()
         if (self.num_envs // distributed.size()) % self.population:
@@ -137,13 +141,12 @@ class Args(WindowFlags):
 class Actor(nn.Module):
     """pi(a|s) of K members, tanh of a Gaussian. Observations are normalized by the statistics of all members.
 
-    The policy sees the first `seen` numbers of an observation (None: all). A mirror makes it symmetric.
+    A mirror makes the policy symmetric.
     """
 
-    def __init__(
-        self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
-    ) -> None:
+    def __init__(self, args: Args, env: DiffEnv, mirror: Mirror | None) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         K, width = args.population, args.actor_hidden[-1]
         self.normalizer = ObsNormalizer(obs_dim, mirror)
         bodies = [mlp(seen or obs_dim, args.actor_hidden, None, ACTIVATIONS[args.activation], True) for _ in range(K)]
@@ -199,7 +202,7 @@ class SAPO:
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env, K, obs_dim = args, env, args.population, env.task.obs_dim
         mirror = env.task.mirror if args.symmetric else None
-        self.actor = Actor(args, obs_dim, env.scene.nu, env.task.actor_dim, mirror).to(env.device)
+        self.actor = Actor(args, env, mirror).to(env.device)
         options = args.critic_hidden, 1, ACTIVATIONS[args.activation]
         networks = [mlp(obs_dim, *options, norm=True, orthogonal=True) for _ in range(args.critics * K)]
         critics = [folded(seeing(None, network, mirror), mirror and mirror.value) for network in networks]

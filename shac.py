@@ -114,13 +114,12 @@ class Args(WindowFlags):
 class Actor(nn.Module):
     """pi(a|s): tanh of a Gaussian whose standard deviation does not depend on the state, or of its mean only.
 
-    The policy sees the first `seen` numbers of an observation (None: all). A mirror makes it symmetric.
+    A mirror makes the policy symmetric.
     """
 
-    def __init__(
-        self, args: Args, obs_dim: int, action_dim: int, seen: int | None = None, mirror: Mirror | None = None
-    ) -> None:
+    def __init__(self, args: Args, env: DiffEnv, mirror: Mirror | None) -> None:
         super().__init__()
+        obs_dim, action_dim, seen = env.task.obs_dim, env.scene.nu, env.task.actor_dim
         self.normalizer = ObsNormalizer(obs_dim, mirror)
         orthogonal = args.deterministic_policy
         network = mlp(seen or obs_dim, args.actor_hidden, action_dim, ELU, norm=True, orthogonal=orthogonal)
@@ -169,9 +168,9 @@ class SHAC:
 
     def __init__(self, args: Args, env: DiffEnv) -> None:
         self.args, self.env = args, env
-        obs_dim, action_dim = env.task.obs_dim, env.scene.nu
+        obs_dim = env.task.obs_dim
         mirror = env.task.mirror if args.symmetric else None
-        self.actor = Actor(args, obs_dim, action_dim, env.task.actor_dim, mirror).to(env.device)
+        self.actor = Actor(args, env, mirror).to(env.device)
         self.policy = self.actor.deterministic()
         critic = seeing(None, mlp(obs_dim, args.critic_hidden, 1, ELU, norm=True, orthogonal=True), mirror)
         self.critic = folded(critic, mirror and mirror.value).to(env.device)

@@ -16,7 +16,6 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from diffsim.tasks import find_task
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.errors import in_one_line
 from diffsim.training.evaluation import SEED, VIDEO_SECONDS, gait_lines
@@ -66,12 +65,11 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def show(args: Args) -> None:
-    saved = load_policy(args.path / "checkpoint.pt" if args.path.is_dir() else args.path)
-    changes: dict[str, Any] = {"env": saved.task(args.env)} | ({"substeps": args.substeps} if args.substeps else {})
-    task, name = find_task(changes["env"]).name, f"{saved.script}.py, iteration {saved.iteration}"
-    env = make_policy_env(saved, args.episodes, **changes)
+    saved = load_policy(args.path)
+    changes: dict[str, Any] = {"substeps": args.substeps} if args.substeps else {}
+    env = make_policy_env(saved, args.episodes, env=args.env, **changes)
     evaluation = evaluate(env, saved.network, args.seed)
-    print(f"{task}, {name}, {args.episodes} episodes: {evaluation}")
+    print(f"{env.task.name}, {saved}, {args.episodes} episodes: {evaluation}")
     if feet := evaluation.gait():
         print(gait_lines(feet))
     print(f"video: {evaluation.save_video(args.video, args.seconds, size=args.size)}")

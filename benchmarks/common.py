@@ -19,7 +19,7 @@ from tables import ROOT, Row
 from diffsim import DiffEnv
 from diffsim.sim.options import check_device
 from diffsim.tasks import TaskError, find_task
-from diffsim.training import SavedPolicy, command, fail, load_policy, make_policy_env
+from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy, make_policy_env
 from diffsim.training.distributed import choose_device
 from diffsim.training.errors import in_one_line
 from diffsim.training.ranges import check_ranges
@@ -40,7 +40,6 @@ class CommonFlags:
     env: Tasks = TASKS  # tasks
     device: str = "cpu"  # torch device of the measurements, cpu or cuda (auto: the GPU if there is one)
     output: Path | None = None  # directory of csv files (default: runs/benchmarks/cpu or, by the GPU, e.g. .../h100)
-    figures: Path | None = None  # directory of the pictures (default: that of the csv files)
     update_results: bool = False  # write to results/ and docs/figures/ of this repository, and fill the tables of docs/
     draw_only: bool = False  # measure nothing, read csv files
     machine: str = ""  # whose results these are, a folder of results/ (default: that of --device)
@@ -76,8 +75,8 @@ class CommonFlags:
         self.replace(name, [row], key)
 
     def picture(self, name: str) -> Path:
-        default = DOCS / "figures" / self.directory.name.replace("cpu", "")
-        return (self.figures or (default if self.update_results else self.directory)) / f"{name}.png"
+        pages = DOCS / "figures" / self.directory.name.replace("cpu", "")
+        return (pages if self.update_results else self.directory) / f"{name}.png"
 
     def publish(self, name: str, text: str, page: str, everywhere: bool = False) -> None:
         """Print a table; with --update-results fill the part of a page that has its name.
@@ -113,6 +112,16 @@ class CheckpointFlags(CommonFlags):
         if not (self.checkpoints or self.draw_only):
             fail("of what? give a checkpoint or the directory of a run")
         return () if self.draw_only else self.checkpoints
+
+
+@dataclass
+class ServoFlags(CheckpointFlags):
+    """What benchmarks of robots with servos take: worlds in MuJoCo."""
+
+    file: Path | None = None  # MJCF of the robot with a ground, in place of the task's
+    friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
+    push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
+    race: bool = False  # checkpoints are those along the way of runs: seconds of training until they are good enough
 
 
 ABOUT = ("checkpoint", "task", "learner", "contact", "seed", "iteration")  # columns that say which policy a row is of
@@ -203,6 +212,7 @@ class Part(NamedTuple):
     table: str = ""  # its name in a page
     page: str = ""
     shown: Callable[[list[dict[str, str]]], Sequence[Row]] = list  # what the page shows of the rows
+    columns: tuple[str, ...] | None = None  # and of these; all if None
 
 
 def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
@@ -212,7 +222,7 @@ def measured(args: CommonFlags, part: Part) -> list[dict[str, str]]:
             args.keep(part.csv, row, part.key)
     order: dict[str, int] = {name: place for place, name in enumerate(LEARNT)}
     rows = sorted(args.read(part.csv), key=lambda row: order.get(row.get("task", "").partition(" ")[0], len(order)))
-    args.publish(part.table, tables.markdown(part.shown(rows)), part.page)
+    args.publish(part.table, tables.markdown(part.shown(rows), part.columns), part.page)
     return rows
 
 

@@ -39,14 +39,13 @@ KEY = ("env", "variant", "seed", "kind", "terrain", "controller")
 CONTROLLERS = ("policy", "ddp", "tbdp")
 FALL, FAR = 0.45, 0.9  # m; of the guides' way
 COUNT = 10  # trajectories over each terrain, from the same start with the policy's noise
+ITERATIONS = (0, 15)  # of iLQR, after which an example's growth is measured
 LEFT = ("task", "iLQR iterations", "controller")  # key of gps_stability.csv
 
 
 @dataclass
 class Args(CheckpointFlags):
     growth: tuple[str, ...] = ()  # tasks whose example's growth is measured
-    iterations: tuple[int, ...] = (0, 15)  # of iLQR
-    pretraining: int = 1500  # L-BFGS iterations
 
     @property
     def measured(self) -> tuple[Path, ...]:
@@ -144,9 +143,9 @@ def growth(loop: Tensor, dt: float) -> float:
     return total / (len(loop) * dt)
 
 
-def leaving(env: str, iterations: int, pretraining: int) -> Iterator[Row]:
+def leaving(env: str, iterations: int) -> Iterator[Row]:
     """How fast a guide and the policy fitted to it leave the example, and the policy's error."""
-    words = f"--env {env} --device cpu --ilqr-iterations {iterations} --pretraining {pretraining} --threads 1"
+    words = f"--env {env} --device cpu --ilqr-iterations {iterations} --pretraining 1500 --threads 1"
     flags = parse(gps.Args, words.split())
     search = gps.Search(flags, make_env(flags, 1))
     search.prepare(print)
@@ -177,8 +176,8 @@ def main(args: Args) -> None:
     for path in args.measured:
         for row in measure(path):
             args.keep("gps_controllers", row, KEY)
-    for env, iterations in () if args.draw_only else product(args.growth, args.iterations):
-        for row in leaving(env, iterations, args.pretraining):
+    for env, iterations in () if args.draw_only else product(args.growth, ITERATIONS):
+        for row in leaving(env, iterations):
             args.keep("gps_stability", row, LEFT)
     args.publish("gps terrain", markdown(table(args.read("gps_controllers"))), "gps.md", everywhere=True)
     args.publish("gps stability", markdown(rates(args.read("gps_stability"))), "gps.md", everywhere=True)

@@ -240,7 +240,7 @@ CASES: dict[str, type[Search]] = dict(zip(get_args(Case), CLASSES, strict=True))
 main = script(
     VariantArgs,
     lambda args: gps.train(args, CASES[args.case]),
-    lambda args: evaluate_checkpoint(args, CASES[args.case], Search.evaluate),
+    lambda args: evaluate_checkpoint(args, CASES[args.case]),
 )
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from worlds import Array, OtherFile, State, in_double, pushes, rollout
 
 from diffsim.tasks.joystick import Joystick
 from diffsim.terrain import Elevation, uneven
-from diffsim.training import NonNegative, Positive, fail, gait
+from diffsim.training import Positive, fail, gait
 from diffsim.training.checkpoint import HOME
 from diffsim.training.flags import Slope
 from diffsim.training.ranges import Range
@@ -47,16 +47,12 @@ Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # th
 
 
 @dataclass
-class Args(common.CheckpointFlags):
-    file: Path | None = None  # MJCF of the robot with a ground, in place of the task's
-    friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
+class Args(common.ServoFlags):
     mass: tuple[Positive, ...] = (1.0,)  # of all bodies' mass and inertia
     gains: tuple[Positive, ...] = (1.0,)  # of the servos' stiffness and damping
     latency: Annotated[float, Range("from 0 to 40", lambda ms: 0 <= ms <= 40)] = 0.0  # ms by which actions come late
-    push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
     seconds: Long = 20.0  # of an episode
     rough: tuple[Slope, ...] = ()  # degrees, steepest slopes of rough ground, 0: the file's plane
-    race: bool = False  # checkpoints are those along the way of runs: seconds of training to an error
 
 
 def follow(case: Case, world: OtherFile, args: Args, profile: Array | None = None) -> tuple[Array, Array, Array, Array]:
@@ -88,21 +84,21 @@ def errors(velocities: Array, second: int) -> Array:
 
 
 def training(case: Case) -> dict[str, object]:
-    """Where the policy was trained, for how long, and its last evaluation's return, of what its run says."""
+    """Which policy it is, where and how long it was trained, and its last evaluation's return, of what its run says."""
+    about = case.about
+    if case.saved.simulator != HOME:
+        about["learner"] = f"{about['learner']} in {case.saved.simulator}"
     rows = tables.read_csv(case.path.parent / "progress.csv")
     rows = [row for row in rows if int(row["iteration"]) <= case.saved.iteration]
     device = str(case.saved.args.get("device", "")).partition(":")[0]
-    found: dict[str, object] = {"device": device, "return": ["", *numbers(rows, "eval_return")][-1]}
-    return found | {"training s": float(rows[-1]["seconds"]) if rows else ""}
+    about |= {"device": device, "return": ["", *numbers(rows, "eval_return")][-1]}
+    return about | {"training s": float(rows[-1]["seconds"]) if rows else ""}
 
 
 def measure(args: Args, path: Path) -> Iterator[Row]:
     """A row for each friction, mass and gains."""
     case = load_case(path, 1, "cpu")
-    about, task = case.about, case.env.task
-    if case.saved.simulator != HOME:
-        about["learner"] = f"{about['learner']} in {case.saved.simulator}"
-    if not isinstance(task, Joystick):
+    if not isinstance(task := case.env.task, Joystick):
         fail(f"{path} was trained on {task.name}, which follows no command")
     for slope, friction, mass, gains in product(args.rough or (0.0,), args.friction, args.mass, args.gains):
         profile = uneven(slope, 1, PROFILE)[0] if slope else None
@@ -114,7 +110,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         row |= {"mass": mass, "gains": gains, "latency": args.latency}
         row |= {"rough": slope} if args.rough else walk(case, qpos, action)
         row |= {"error": error.mean(), "worst error": error.max(), "yaw error": yaw.mean()}
-        yield about | training(case) | row | {"whole": 1 - fallen.mean(), "seconds": args.seconds}
+        yield training(case) | row | {"whole": 1 - fallen.mean(), "seconds": args.seconds}
 
 
 def walk(case: Case, qpos: Array, action: Array) -> dict[str, object]:
@@ -172,7 +168,8 @@ def table(rows: list[dict[str, str]]) -> list[Row]:
 
 
 def whole(rows: list[dict[str, str]]) -> list[Row]:
-    """The share of episodes without a fall: a line for each world, a column for each task, learner and machine."""
+    """The share of episodes without a fall: a column for each task, learner and machine, a line for worlds that agree
+    in all of them."""
     lines: dict[str, dict[str, str]] = {}
     for policy, group in policies(rows).items():
         kinds: dict[str, list[dict[str, str]]] = {}
@@ -181,9 +178,11 @@ def whole(rows: list[dict[str, str]]) -> list[Row]:
         for kind, own in kinds.items():
             lines.setdefault(kind, {})[policy] = with_worst(own, "whole", ".0%", min)
     order = "friction", "pushes", "20", "mass", "gains", "all"
-    kinds_in_order = sorted(lines, key=lambda kind: [not kind.startswith(name) for name in order])
+    agreeing: dict[tuple[str, ...], list[str]] = {}
+    for kind in sorted(lines, key=lambda kind: [not kind.startswith(name) for name in order]):
+        agreeing.setdefault(tuple(lines[kind].get(policy, "") for policy in policies(rows)), []).append(kind)
     return [
-        {"world": kind} | {policy: lines[kind].get(policy, "") for policy in policies(rows)} for kind in kinds_in_order
+        {"world": ", ".join(kinds)} | dict(zip(policies(rows), cells, strict=True)) for cells, kinds in agreeing.items()
     ]
 
 

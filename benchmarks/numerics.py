@@ -90,7 +90,7 @@ def presets(rows: list[Cells]) -> list[Row]:
         (row for row in labelled(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
     )
     lines = [row | {"setting": row["setting"].replace(USUAL, "").removesuffix(" substeps")} for row in lines]
-    return [{name: row[name] for name in SHOWN} for own in grouped(lines, "task").values() for row in own]
+    return [row for own in grouped(lines, "task").values() for row in own]
 
 
 def measure_extremes(args: Args, robot: str) -> Iterator[Row]:
@@ -128,10 +128,6 @@ def measure_promise(args: Args, robot: str) -> Iterator[Row]:
     yield row | {"speed": default.cost / best.cost, "default's error": default.error}
 
 
-def promised(rows: list[Cells]) -> list[Row]:
-    return [{name: row[name] for name in PROMISED} for row in rows]
-
-
 def draw(args: Args, rows: list[Cells]) -> None:
     panels = list[Panel]()
     for (task,), own in grouped((row for row in labelled(rows) if "float64" not in row["kind"]), "task").items():
@@ -146,9 +142,9 @@ def draw(args: Args, rows: list[Cells]) -> None:
 
 PAGE = "numerics.md"
 PARTS: dict[PartName, Part] = {
-    "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, presets),
+    "presets": Part("numerics_presets", measure_presets, ("task", "setting"), "presets", PAGE, presets, SHOWN),
     "extremes": Part("numerics_extremes", measure_extremes, ("task", "sweep"), "extremes", PAGE, bounds),
-    "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", PAGE, promised),
+    "promise": Part("numerics_promise", measure_promise, ("robot",), "promise", PAGE, columns=PROMISED),
 }
 
 

@@ -31,7 +31,7 @@ import fingerprints
 import numpy as np
 import tables
 from cells import GROUPS, LEARNERS, RETURNS, Cell, Curve, Group, Runner, ScriptFlags, curve, evaluation, read_cells
-from common import LEARNT, TASKS, Line, Panel, Tasks, check_names, plot, run
+from common import LEARNT, Line, Panel, Tasks, check_names, plot, run
 from tables import ROOT, Cells, Row, grouped, markdown, middle, numbers, read_csv
 
 import diffsim
@@ -332,10 +332,6 @@ def main(args: Args) -> None:
         args.publish(name, shown, GROUPS[name].page if "|" in shown else "", everywhere=True)
         if GROUPS[name].picture:
             pictured(args, name)
-    rows = [row for row in args.read("pace") if cells.same_numbers(row["revision"], row["learner"], row["task"])]
-    rows.sort(key=lambda row: TASKS.index(row["task"]))
-    if rows:
-        args.publish("pace", markdown(rows, ("task", "learner", "iteration (s)")), "performance.md", everywhere=True)
 
 
 if __name__ == "__main__":

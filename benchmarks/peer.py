@@ -16,15 +16,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata, util
-from typing import Literal
+from typing import Annotated, Literal
 
 import mujoco
 import torch
+import tyro
 import warp as wp
 from cells import ScriptFlags
 from common import Part, measured, run
 from speed import timed, windows
-from tables import Cells, Row, read_csv
+from tables import Row, read_csv
 from torch import Tensor
 from worlds import FASTEST, MuJoCo, mujoco_model
 
@@ -39,12 +40,13 @@ Name = Literal["hopper", "half_cheetah", "ant", "humanoid", "go1", "go2", "g1", 
 ROOM: dict[Name, tuple[int, int]] = {"hopper": (8, 32), "half_cheetah": (12, 64), "ant": (16, 64)}
 ROOM |= {"humanoid": (64, 256), "go1": (16, 96), "go2": (16, 96), "g1": (24, 192), "g1_track": (24, 192)}
 PPO = "--num-envs 4096 --minibatch-size 32768 --entropy-coef 0.002 --eval-every 0 --save-every 0 --iterations 1000000"
+EVERY: tuple[Name, ...] = ("ant", "humanoid", "go2", "g1")
 HORIZON = 32  # control steps of a timed window
 
 
 @dataclass
 class Args(ScriptFlags):
-    env: tuple[Name, ...] = ("ant", "humanoid", "go2", "g1")  # type: ignore[assignment]  # tasks
+    env: Annotated[tuple[Name, ...], tyro.conf.arg(help="tasks")] = EVERY  # type: ignore[assignment]
     parts: tuple[PartName, ...] = ("speed",)  # what to measure
     num_envs: tuple[Count, ...] = (64, 1024, 4096)  # batch sizes of the speed
     repeats: Count = 10  # windows of 32 control steps; the fastest counts
@@ -165,13 +167,9 @@ SPEED = *KEY, "mj_step", "mujoco_warp", "here", "forward and backward", "lost"  
 TRAIN = "task", "seed", "control steps", "training (s)", "control steps/s", "return", "lost"
 
 
-def shown(columns: tuple[str, ...], rows: list[Cells]) -> list[Row]:
-    return [{name: row.get(name, "") for name in columns} for row in rows]
-
-
 PARTS = {
-    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", partial(shown, SPEED)),
-    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", partial(shown, TRAIN)),
+    "speed": Part("peer_speed", measure_speed, KEY, "peer_speed", "performance.md", columns=SPEED),
+    "train": Part("peer_train", train, ("task", "seed"), "peer_train", "performance.md", columns=TRAIN),
 }
 
 

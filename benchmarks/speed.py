@@ -41,7 +41,7 @@ HORIZONS = (1, 4, 8, 16, 32, 64, 128)  # its horizons, at 64 environments
 
 @dataclass
 class Args(CommonFlags):
-    env: Annotated[tuple[TaskName | Robot, ...], tyro.conf.arg(aliases=["--env-id"])] = TASKS  # type: ignore[assignment]
+    env: Annotated[tuple[TaskName | Robot, ...], tyro.conf.arg(aliases=["--env-id"], help="tasks")] = TASKS  # type: ignore[assignment]
     parts: tuple[PartName, ...] = ("physics",)  # tables to measure
     num_envs: tuple[Count, ...] = (64, 256)  # batch sizes of the physics table
     states: Count = 9  # states of random motion in which a control step is timed; the median over them counts

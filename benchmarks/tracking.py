@@ -32,8 +32,7 @@ from worlds import Array, OtherFile, State, pushes, rollout
 
 from diffsim import read_clip
 from diffsim.tasks.imitation.tracking import Tracking
-from diffsim.training import Count, NonNegative, Positive, SavedPolicy, fail
-from diffsim.training.checkpoint import HOME
+from diffsim.training import Count, SavedPolicy, fail
 
 OFF = 0.05  # rad, of the joints at the start
 ENOUGH = 0.95  # share of episodes that succeed, to which learners race
@@ -41,13 +40,9 @@ PAGE = "tracking.md"
 
 
 @dataclass
-class Args(common.CheckpointFlags):
-    file: Path | None = None  # MJCF of the robot with a ground, in place of the task's
+class Args(common.ServoFlags):
     clip: Path | None = None  # motions in place of those of the training: a file or a folder
     episodes: Count = 16  # of each motion
-    friction: tuple[Positive, ...] = (0.7, 1.0, 1.3)  # factors of the friction in MuJoCo
-    push: NonNegative = 0.0  # m/s, a change of the root's velocity in a random direction every 4 s
-    race: bool = False  # checkpoints are those along the way of runs: seconds of training to enough success
 
 
 def track(saved: SavedPolicy, task: Tracking, world: OtherFile, args: Args) -> tuple[Array, Array]:
@@ -84,9 +79,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     task = type(own)(dtype=torch.float64, clip=clip)
     task.bind(case.env.scene)
     task.low, task.high = own.low.double(), own.high.double()  # other clips do not move the servos' range
-    count, about = len(task.motions[0]), case.about
-    if case.saved.simulator != HOME:
-        about["learner"] = f"{about['learner']} in {case.saved.simulator}"
+    count = len(task.motions[0])
     for friction in args.friction:
         world = OtherFile(case.env, count * args.episodes, args.file, friction)
         success, (root, turn, joints) = track(case.saved, task, world, args)
@@ -101,7 +94,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
         if args.race:
             given = case.saved.args
             row["control steps"] = case.saved.iteration * given["num_envs"] * given["horizon"]
-        yield about | training(case) | row
+        yield training(case) | row
 
 
 def least(rows: list[dict[str, str]]) -> str:

@@ -21,7 +21,7 @@ from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
-from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, TaskError, find_task, tracking
+from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, TaskError, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.terrain import uneven
 
@@ -131,7 +131,8 @@ def make(
     elif issubclass(kind, Imitation):
         task = kind(device, dtype, clip if isinstance(clip, Clip) else read_clip(clip))
     else:
-        raise ValueError(f"task {kind.name!r} tracks no clip; {', '.join(tracking())} do")
+        others = ", ".join(name for name, task in TASKS.items() if issubclass(task, Imitation))
+        raise ValueError(f"task {kind.name!r} tracks no clip; {others} do")
     if control_dt is not None and control_dt != task.control_dt:
         if task.num_memory:  # its times count in control steps
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")

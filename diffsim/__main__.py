@@ -81,8 +81,7 @@ def demo(task: Positional[str] = "ant", output: Path = Path("demo.mp4")) -> None
         env = make_policy_env(saved, DEMO_EPISODES)
         env.episode_length = min(env.episode_length, round(DEMO_SECONDS / env.control_dt))
         evaluation = evaluate(env, saved.network)
-    which = f"{saved.script}.py, iteration {saved.iteration}"
-    print(f"{task}, {which}, the first {DEMO_SECONDS:g} s of {DEMO_EPISODES} episodes: {evaluation}")
+    print(f"{task}, {saved}, the first {DEMO_SECONDS:g} s of {DEMO_EPISODES} episodes: {evaluation}")
     print(f"video: {evaluation.save_video(output)}")
 
 
@@ -116,9 +115,8 @@ def drive(
     if own is None and (trained := saved.task()) != task.name:
         fail(f"{checkpoint} is a checkpoint of {trained}, not of {robot}")
     torch.set_num_threads(1)
-    caption = f"{saved.script}.py, iteration {saved.iteration}"
     with startup.quick_kernels():
-        serve(make_policy_env(saved, 1, forces=True, env=own), saved.network, caption, host, port)
+        serve(make_policy_env(saved, 1, forces=True, env=own), saved.network, str(saved), host, port)
 
 
 def train(learner: Positional[Learner]) -> None:
@@ -167,7 +165,7 @@ def export(checkpoint: Positional[Path], output: Positional[Path], env: str | No
         else:
             fail(f"cannot write {output}: its name must end in .pt or .onnx")
     size = output.stat().st_size / 1e3
-    print(f"{output}: {saved.args['env']}, {saved.script}.py, iteration {saved.iteration}, {size:.0f} kB")
+    print(f"{output}: {saved.args['env']}, {saved}, {size:.0f} kB")
 
 
 def run_script(name: str, flags: Sequence[str]) -> None:

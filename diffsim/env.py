@@ -19,9 +19,7 @@ from torch import Tensor
 from diffsim.robot.scene import Scene
 from diffsim.sim.adjoint import ClipAdjoint
 from diffsim.sim.integration import Integration, check_count, is_real
-from diffsim.sim.launcher import check_memory
 from diffsim.sim.modes import in_plain_mode
-from diffsim.sim.options import Options
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
 from diffsim.terrain import Elevation
@@ -54,15 +52,8 @@ class DiffEnv(VectorEnv):
         task: task on the simulator's device and dtype; several environments may share it.
         scene: its robot. On a terrain the task measures heights (of start, observation, reward and end) from the ground
             below the root. `qpos` stays in the world frame.
-        num_envs, horizon: see Simulator.
         integration: default the task's "default".
-        seed: of the random start states.
-        stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
-        early_termination: end episodes where the task reports a fall.
-        max_episode_steps: control steps after which an episode is truncated; default the task's episode_length.
-        adjoint_clip: after each step, gradients with respect to an environment's state are scaled down to at most this
-            many times the batch's median, see sim/adjoint.py; 0: not at all.
-        render_mode: with "rgb_array" `render` returns a frame of each environment.
+        num_envs to render_mode: see diffsim.make.
         **options: device, dtype, threads, factors, forces, block, division: see sim.Options.
 
     Attributes:
@@ -91,19 +82,16 @@ class DiffEnv(VectorEnv):
         render_mode: Literal["rgb_array"] | None = None,
         **options: Any,
     ) -> None:
-        num_envs, horizon = check_count("num_envs", num_envs), check_count("horizon", horizon)
-        asked = Options(integration or task.integration("default"), **options).check()
-        self.device, self.dtype = torch.device(asked.device), asked.dtype
         task = copy.copy(task)  # of another ground than that of other environments
         task.ground = None
-        task.bind(scene)
-        numbers = horizon * (task.num_random + scene.nq + scene.nv + task.obs_dim + task.num_memory)
-        check_memory("start states of a window", num_envs, numbers * self.dtype.itemsize, self.device)
-        self.task, self.scene, self.num_envs, self.horizon = task, scene, num_envs, horizon
-        self.control_dt, self.episode_length = task.control_dt, task.episode_length
+        self.task, self.scene, self.control_dt = task.bind(scene), scene, task.control_dt
+        how = integration or task.integration("default")
+        self.sim = sim = Simulator(scene, num_envs, how, task.control_dt, horizon, **options)
+        self.num_envs, self.horizon = num_envs, horizon = sim.num_envs, sim.horizon
+        self.device, self.dtype = sim.device, sim.dtype
+        self.episode_length = task.episode_length
         if max_episode_steps is not None:
             self.episode_length = check_count("max_episode_steps", max_episode_steps, most=2**62)
-        self.sim = Simulator(scene, num_envs, control_dt=task.control_dt, horizon=horizon, **asked._asdict())
         self.metadata = self.metadata | {"render_fps": round(1 / task.control_dt)}
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}, must be 'rgb_array'; `diffsim drive` shows a robot live")

@@ -59,8 +59,9 @@ def rough(seed: int, segment: float = 1.0, degrees: float = 10.0, length: float 
 def uneven(degrees: float, count: int, seed: int = 0) -> Array:
     """(count, K, 2) profiles of ground that is rough before and behind the robot; a seed has the same ones always.
 
-    Within 0.5 m of x = 0 they are level. Then come segments of 0.4 m as of `rough`, for 30 m to both sides. The
-    steepest slope grows evenly from profile to profile; the last one's is `degrees`.
+    Within 0.5 m of x = 0 they are level. Then come segments of 0.4 m as of `rough`, for 30 m to both sides: robots that
+    follow commands stay there in an episode, those that run do not. The steepest slope grows evenly from profile to
+    profile; the last one's is `degrees`.
     """
     seeds = np.random.default_rng(seed % 2**64).integers(2**31, size=(count, 2))
     steepest = np.linspace(degrees / count, degrees, count).tolist()
@@ -89,8 +90,8 @@ class Elevation:
 
         if scene.terrain is None:
             raise ValueError(f"{scene.name} has no terrain")
-        place, along, up = root(scene)
-        self._x0, self._along, self._up = place, tensor(along), tensor(up)
+        place, along, up = scene.root
+        self._x0, self._along, self._up = float(place[0]), tensor(along), tensor(up)
         x, z = scene.terrain[..., 0], scene.terrain[..., 1]
         run = np.diff(x)
         slope = np.divide(np.diff(z), run, out=np.zeros_like(run), where=run > 0)  # of a wall nobody asks
@@ -131,18 +132,3 @@ class Elevation:
     def lower(self, qpos: Tensor) -> Tensor:
         """qpos (..., nq) over the plane of one in the world."""
         return qpos - self.height(qpos).unsqueeze(-1) * self._up
-
-
-def root(scene: Scene) -> tuple[float, Array, Array]:
-    """x0, along (nq,) and up (nq,): the root's x is x0 + along . qpos, and qpos + up is one metre higher."""
-    along, up, place, frame = np.zeros(scene.nq), np.zeros(scene.nq), np.zeros(3), np.eye(3)
-    if scene.floating:
-        along[0] = up[2] = 1.0
-    for link in range(1, scene.carrier + 1):  # slides, which turn nothing
-        place += frame @ (scene.position[link] - scene.joint_ref[link] * scene.rotation[link] @ scene.axis[link])
-        frame = frame @ scene.rotation[link]
-        axis = frame @ scene.axis[link]
-        along[link - 1] = axis[0]
-        if abs(axis[2]) > 1 - 1e-9:
-            up[link - 1] = np.sign(axis[2])
-    return float(place[0]), along, up

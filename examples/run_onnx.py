@@ -52,9 +52,12 @@ if __name__ == "__main__":
     parser.add_argument("--model", help="MJCF of the robot on a ground; by default that of this repository")
     parser.add_argument("--command", nargs=3, type=float, default=[0.5, 0, 0], help="vx, vy [m/s] and yaw rate [rad/s]")
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--video", help="an .mp4 instead of the window; minutes without a GPU; needs imageio-ffmpeg")
+    parser.add_argument("--video", help="an .mp4 instead of the window, which needs a display; needs imageio-ffmpeg")
     args = parser.parse_args()
-    policy = InferenceSession(args.policy)
+    try:
+        policy = InferenceSession(args.policy)
+    except Exception as error:  # onnxruntime has a class for each status
+        parser.error(f"{args.policy} cannot be read: {error}")
     told = policy.get_modelmeta().custom_metadata_map
     if "command_range" not in told:
         parser.error(f"{args.policy}: a policy of {told.get('task')}, which follows no commands")

@@ -7,6 +7,7 @@ place of `record`. The fit simulates 0.1 s from random rows and compares the vel
 segments has factors of its own, so one backward pass for each velocity gives the exact Jacobian of all segments.
 """
 
+import sys
 from pathlib import Path
 
 import mujoco.rollout
@@ -61,13 +62,16 @@ def identify(sim: diffsim.Simulator, recording: tuple[Tensor, ...], iterations: 
 
 
 def main(plot: Path | None = None) -> None:
+    if plot:  # before the work
+        import matplotlib.pyplot as plt
+
+        figure, axes = plt.subplots(figsize=(5, 2.8), layout="constrained")
+        if plot.suffix[1:] not in (allowed := figure.canvas.get_supported_filetypes()):
+            sys.exit(f"--plot: {plot} must end in one of .{', .'.join(allowed)}")
     torch.manual_seed(0)
     sim = diffsim.make("hopper", 256, horizon=STEPS, contact="mujoco", factors=True).sim
     estimates = identify(sim, record(diffsim.make("hopper", 20)))
     if plot:
-        import matplotlib.pyplot as plt
-
-        figure, axes = plt.subplots(figsize=(5, 2.8), layout="constrained")
         axes.plot(estimates, "o-")
         axes.hlines([*TRUTH.values()], 0, len(estimates) - 1, ["C0", "C1"], "dashed")
         axes.set(xlabel="iteration", ylabel="factor of the file's constant")

@@ -1,4 +1,4 @@
-"""SAC's equations, and a linear-quadratic problem without simulator, whose optimum is known."""
+"""Returns, SAC's equations, and a linear-quadratic problem without simulator, whose optimum is known."""
 
 from __future__ import annotations
 
@@ -7,13 +7,34 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
 from diffsim.training import Transition
+
+Array = NDArray[Any]
+
+
+def lambda_returns(reward: Array, following: Array, done: Array, gamma: float, lam: float) -> Array:
+    """(T, N): of each step the weighted sum of all its n-step returns until the episode or the window ends.
+
+    Args:
+        following: (T, N) values of the states after the steps.
+    """
+    horizon, expected = len(reward), np.zeros(reward.shape)
+    for t, i in np.ndindex(reward.shape):
+        n = next((k for k in range(1, horizon - t) if done[t + k - 1, i]), horizon - t)  # steps to the end
+        returns = [
+            sum(gamma**j * reward[t + j, i] for j in range(k)) + gamma**k * following[t + k - 1, i]
+            for k in range(1, n + 1)
+        ]
+        expected[t, i] = np.dot([*((1 - lam) * lam ** (k - 1) for k in range(1, n)), lam ** (n - 1)], returns)
+    return expected
 
 
 class Problem:
@@ -64,21 +85,35 @@ def assert_squashed_gaussian(actor: Any) -> None:
     torch.testing.assert_close(actor.deterministic()(obs), torch.tanh(actor.mean(features)))
 
 
-def assert_soft_updates(learner: Any, monkeypatch: pytest.MonkeyPatch, subset: int | None = None) -> None:
-    """Of the ant, at a temperature of 0.3: the soft Bellman backup, where a failure ends the value, the losses, and the
-    targets. With a subset of the critics (REDQ) the backup takes the least of so many, and the actor the mean of all.
+def assert_soft_updates(
+    learner: Any,
+    optimizers: tuple[Any, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    subset: int | None = None,
+    act: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
+) -> None:
+    """At a temperature of 0.3: the soft Bellman backup, where a failure ends the value, the losses, and the targets.
+
+    With a subset of the critics (REDQ) the backup takes the least of so many, and the actor the mean of all.
+
+    Args:
+        optimizers: of the actor and of the temperature.
+        act: actions and their log densities of observations, if the actor itself does not return these.
     """
     torch.manual_seed(0)
+    act, inputs, nu = act or learner.actor, learner.env.task.obs_dim, learner.env.scene.nu
     learner.temperature["log"].data.fill_(math.log(0.3))
-    obs, next_obs, failed = torch.randn(32, 37), torch.randn(32, 37), (torch.rand(32) < 0.3).float()
-    batch = Transition(obs, torch.rand(32, 8), torch.randn(32), next_obs, failed)
+    obs, next_obs, failed = torch.randn(32, inputs), torch.randn(32, inputs), (torch.rand(32) < 0.3).float()
+    batch = Transition(obs, torch.rand(32, nu), torch.randn(32), next_obs, failed)
     critics = len(learner.critics.layers[0].bias)
+    for p in learner.targets.parameters():
+        p.data.add_(0.1 * torch.randn_like(p))  # far from the critics, which have made no step
 
     def values(networks: Any, obs: Tensor, action: Tensor) -> Tensor:
         return torch.stack([networks[k](torch.cat((obs, action), 1)).squeeze(1) for k in range(critics)])
 
     state = torch.get_rng_state()
-    action, density = learner.actor(next_obs)
+    action, density = act(next_obs)
     chosen = torch.rand(critics).argsort()[:subset] if subset else slice(None)
     soft = values(learner.targets, next_obs, action)[chosen].amin(0) - 0.3 * density
     target = (batch.reward + 0.99 * (1 - failed) * soft).detach()
@@ -90,12 +125,12 @@ def assert_soft_updates(learner: Any, monkeypatch: pytest.MonkeyPatch, subset: i
         torch.testing.assert_close(slow, old + 0.005 * (fast - old))
 
     losses: list[Tensor] = []
-    for optimizer in (learner.actor_optimizer, learner.temperature_optimizer):
+    for optimizer in optimizers:
         monkeypatch.setattr(optimizer, "step", losses.append)
     state = torch.get_rng_state()
     learner.update_actor(obs)
     torch.set_rng_state(state)
-    action, density = learner.actor(obs)
+    action, density = act(obs)
     value = values(learner.critics, obs, action)
     torch.testing.assert_close(losses[0], (0.3 * density - (value.mean(0) if subset else value.amin(0))).mean())
-    torch.testing.assert_close(losses[1], 0.3 * (8 - density.mean().detach()))
+    torch.testing.assert_close(losses[1], 0.3 * (nu - density.mean().detach()))

@@ -16,12 +16,12 @@ import reference
 import torch
 from numpy.typing import NDArray
 
-import diffsim
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
+from diffsim.tasks.base import ASSETS
 
 Array = NDArray[np.float64]
 
@@ -285,7 +285,7 @@ def parse(mjcf: str) -> Scene:
 
 @cache
 def task_scene(name: str) -> Scene:
-    return load_scene(Path(diffsim.__file__).parent / "assets" / TASKS[name].asset)
+    return load_scene(ASSETS / TASKS[name].asset)
 
 
 @cache

@@ -32,11 +32,6 @@ def test_scales_are_those_of_the_twin(rows: int, factor: float, rng: np.random.G
     assert (rows < 64) or 0.1 < (scales < 1).float().mean() < 0.6
 
 
-@pytest.mark.parametrize("value", [0.0, torch.nan, torch.inf])
-def test_rows_without_a_length_stay_as_they_are(value: float) -> None:
-    assert (row_scales(torch.full((4, 3), value), 2.0) == 1).all()
-
-
 def test_rows_alike_stay_and_a_huge_one_no_longer_dominates() -> None:
     qpos, qvel = torch.zeros(9, 4, requires_grad=True), torch.zeros(9, 3, requires_grad=True)
     weight = torch.ones(9, 1)

@@ -129,21 +129,6 @@ def test_threads_take_whole_blocks(threads, hoppers):
         torch.testing.assert_close(x, y, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("bad", [3, BLOCK, 2 * BLOCK])  # the last one is alone in its block, which is filled up with it
-@pytest.mark.parametrize("where, value", [(0, np.nan), (1, 1e30), (2, np.inf)])
-def test_neighbours_do_not_see_a_contained_environment(bad, where, value, hoppers):
-    states, expected = hoppers
-    states = tuple(x.copy() for x in states)
-    states[where][bad, -1] = value
-    found, sim = step(task_scene("hopper"), states, torch.float32, SEMI)
-    assert sim.nonfinite.nonzero().flatten().tolist() == [bad] and sim.nonfinite_gradients.sum() == 0
-    others = np.arange(2 * BLOCK + 1) != bad
-    for x, y in zip(found, expected, strict=True):
-        torch.testing.assert_close(x[others], y[others], rtol=0, atol=0)
-    np.testing.assert_array_equal(found[0][bad], states[0][bad].astype(np.float32))
-    assert all((gradient[bad] == 0).all() for gradient in found[2:])
-
-
 def test_a_gradient_that_is_not_finite_is_counted_once(hoppers):
     """And contained: it is zero, and the others are as beside a finite one."""
     states, expected = hoppers

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import sys
+import re
 from pathlib import Path
 
+import draw
 import numpy as np
 import pytest
+from learners import ROOT
 from PIL import Image, ImageSequence
 
-import diffsim
 from diffsim.tasks.joystick import Go2
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-import draw  # noqa: E402
+from diffsim.training.checkpoint import POLICIES
 
 
 def test_a_loop_ends_where_it_begins() -> None:
@@ -56,14 +54,23 @@ def test_webp_plays_at_true_speed_for_ever(tmp_path: Path) -> None:
     assert len(shown) == 30 and sum(shown) == 1000
 
 
+def test_bars_are_of_the_numbers_in_the_pages() -> None:
+    shown = {(bar.task, bar.learner): bar.returns for bar in draw.measured_bars()["MuJoCo's contact"]}
+    text = (ROOT / "docs" / "transfer.md").read_text()
+    rows = re.findall(r"^\| (\w+), (\w+) \| (\d+), (\d+), (\d+) \|", text, re.MULTILINE)
+    assert {row[:2] for row in rows} == {("ant", "shac"), ("humanoid", "sapo")}
+    for task, learner, *seeds in rows:
+        low, middle, high = sorted(map(int, seeds))
+        assert [round(value) for value in shown[task, learner]] == [middle, low, high]
+
+
 @pytest.mark.slow
 def test_films(opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one with a clock, both worlds above diagrams, and of one without, alone; a clip."""
     monkeypatch.setattr(draw, "FIGURES", tmp_path)
-    policies = Path(diffsim.__file__).parent / "policies"
-    draw.films((policies / "go2.pt",), size=(96, 64))
-    draw.films((policies / "ant.pt",), size=(96, 64), beside=False)
-    draw.films((policies / "g1_track.pt",), size=(96, 64))
+    draw.films((POLICIES / "go2.pt",), size=(96, 64))
+    draw.films((POLICIES / "ant.pt",), size=(96, 64), beside=False)
+    draw.films((POLICIES / "g1_track.pt",), size=(96, 64))
     with Image.open(tmp_path / "g1_track.webp") as dance:
         assert dance.size == (2 * 96, 64) and dance.n_frames == 25 * draw.DANCE[1]  # type: ignore[attr-defined]
     with Image.open(tmp_path / "go2.webp") as both, Image.open(tmp_path / "ant_here.webp") as one:

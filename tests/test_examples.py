@@ -21,13 +21,14 @@ import numpy as np
 import pytest
 import torch
 import worlds
+from learners import PATH, ROOT
 from scenes import with_motors
 
 import diffsim
 from diffsim.__main__ import POLICIES, main
 from diffsim.training import load_policy
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = ROOT / "examples"
 
 
 def load(name: str) -> ModuleType:
@@ -148,7 +149,7 @@ def test_first_steps(shown: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Non
     def system(command: str) -> None:
         commands.append(command)
         Path("runs/ant").mkdir(parents=True, exist_ok=True)
-        shutil.copy(EXAMPLES.parent / "diffsim" / "policies" / "ant.pt", "runs/ant/checkpoint.pt")
+        shutil.copy(POLICIES / "ant.pt", "runs/ant/checkpoint.pt")
         Path("ant.mp4").write_bytes(b"video")
 
     assert len(CODES) >= 4 and not any(cell["outputs"] or cell["execution_count"] for cell in CODES)
@@ -169,11 +170,10 @@ def test_first_steps(shown: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.usefixtures("opengl")
 def test_first_steps_train_and_film(shown: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "")
-    path = os.pathsep.join([str(EXAMPLES.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
 
     def system(command: str) -> None:
         words = [sys.executable, *command.split()[1:]]
-        subprocess.run(words, env=os.environ | {"PYTHONPATH": path, "CUDA_VISIBLE_DEVICES": ""}, check=True)
+        subprocess.run(words, env=os.environ | PATH | {"CUDA_VISIBLE_DEVICES": ""}, check=True)
 
     names = execute(CODES, system, iterations=2)
     assert load_policy(Path("runs/ant/checkpoint.pt")).iteration == 2

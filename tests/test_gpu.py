@@ -54,7 +54,7 @@ def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
     assert spec.features == {*everything.split()}
     for kernel in (forward_kernel(spec), backward_kernel(spec)):
         source = compiled(kernel.module, arch=90)
-        for function in ("add_muscles", "place_balls", "sphere_on_terrain", "drag_wrench", "add_forces"):
+        for function in ("add_muscles", "place_balls", "nearest_of_each", "drag_wrench", "add_forces"):
             assert function in source, function
 
 
@@ -105,7 +105,9 @@ def episode(
 @pytest.mark.gpu
 @pytest.mark.parametrize(
     "name, integration",
-    [(name, None) for name in SOFT] + [(name, Integration("implicit", 16, 0.5)) for name in ("ant", "humanoid_mtu")],
+    [(name, None) for name in SOFT]
+    + [(name, Integration("implicit", 16, 0.5)) for name in ("ant", "humanoid_mtu")]
+    + [("ant", Integration("mujoco", 4, passes=60, tolerance=1e-12))],
 )
 def test_gpu_agrees_with_cpu(name: str, integration: Integration | None) -> None:
     """Without factors, forces and terrain, and with them and the gradient in the first two."""

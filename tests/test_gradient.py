@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from scenes import (
     BOUNDED_SERVOS,
     COMPENSATED,
     DISTINCT_CASES,
-    HINGE,
     INTEGRATORS,
     SHOULDER,
     acting_states,
@@ -22,12 +20,10 @@ from scenes import (
     parse,
     pass_limits,
     raise_ground,
-    random_tree,
     run,
     small_scene,
     task_scene,
     tree_scene,
-    without_ground,
 )
 
 from diffsim.robot.scene import FACTORS
@@ -156,21 +152,6 @@ def test_quaternion_of_any_length(rng):
     check_gradients(scene, (longer, qvel, ctrl), rng)
 
 
-@pytest.mark.parametrize("integrator", ["semi_implicit", "implicit"])
-def test_limit_lets_go_of_a_joint_that_returns_fast(integrator):
-    """Its damper would pull harder than its spring pushes."""
-    scene, h = parse(HINGE), 1 / 60
-    inertia = scene.inertia[1][2, 2] + scene.armature[1]
-    for side in (-1, 1):
-        q, v, u = 0.53 * side, -8.0 * side, 0.7
-        leaves = [torch.tensor([[x]], dtype=torch.float64, requires_grad=True) for x in (q, v, u)]
-        _, after = Simulator(scene, 1, Integration(integrator, 1), dtype=torch.float64).step(*leaves)
-        np.testing.assert_allclose(after.item(), v + h * 3 * u / inertia, rtol=1e-12)
-        slopes = [g.item() for g in torch.autograd.grad(after, leaves)]
-        spring = -scene.stiffness[1] * h / inertia  # of 1e-300
-        np.testing.assert_allclose(slopes, [spring, 1, 3 * h / inertia], rtol=1e-12)
-
-
 def test_gradient_at_rest_is_the_viscous_one(rng):
     """|v| v has slope 0 at 0, so a body at rest feels viscosity only, and no division by zero."""
     fish = small_scene("fluid")
@@ -184,18 +165,3 @@ def test_gradient_at_rest_is_the_viscous_one(rng):
     torch.testing.assert_close(slopes[300.0, 2.0], slopes[0.0, 2.0], rtol=1e-12, atol=0)
     torch.testing.assert_close(slopes[300.0, 0.0], slopes[1e-300, 0.0], rtol=1e-12, atol=0)
     assert not torch.allclose(slopes[0.0, 2.0], slopes[300.0, 0.0], rtol=0.1)
-
-
-def test_a_free_joint_is_three_slides_and_a_ball(rng):
-    """State and gradient; the same numbers in qpos and qvel."""
-    slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
-    root, tree = r"<body [^>]*><freejoint/>", random_tree("floating", 0)  # whose own place only a free joint ignores
-    free, jointed = (
-        without_ground(parse(re.sub(root, f"<body>{joint}", tree)))
-        for joint in ("<freejoint/>", f'{slides} <joint type="ball"/>')
-    )
-    assert free.floating and not jointed.floating and jointed.nball == 1
-    states, how, w = free_states(free, 4, rng), {"integration": ONE}, weights(free, rng)
-    for found in (lambda scene: run(scene, *states, **how), lambda scene: gradients(scene, states, w, **how)):
-        for value, expected in zip(found(jointed), found(free), strict=True):
-            np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9 * abs(expected).max())

@@ -7,13 +7,12 @@ import shutil
 import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 import warp as wp
-from learners import refusal
+from learners import PATH, ROOT, refusal
 
 import diffsim
 import shac
@@ -21,9 +20,6 @@ from diffsim import __main__ as command
 from diffsim import startup
 from diffsim.training import load_policy
 from diffsim.view import render
-
-ROOT = Path(__file__).resolve().parents[1]
-PATH = {"PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])}
 
 
 @pytest.fixture
@@ -110,10 +106,12 @@ def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
     assert small.stat().st_size < 0.5 * trained.stat().st_size
     before, after, obs = load_policy(trained), load_policy(small), torch.randn(3, 5)
     assert torch.equal(before.network(obs), after.network(obs))
+    assert torch.equal(load_policy(trained.parent).network(obs), after.network(obs))  # by the folder of its run
     assert (before.args, before.script, before.iteration) == (after.args, after.script, after.iteration)
     torch.save(torch.load(trained, weights_only=True) | {"simulator": "another"}, tmp_path / "other.pt")
     command.main(["export", str(tmp_path / "other.pt"), str(small)])
     assert (after.simulator, load_policy(small).simulator) == ("diffsim", "another")
+    assert "trained on cartpole, not on ant" in refusal(lambda: before.task("ant"), capsys)
     assert "holds only a policy" in refusal(lambda: shac.main(["--resume", str(small)]), capsys)
 
 

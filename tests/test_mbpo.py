@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import assert_resumes, read_progress, refusal
+from learners import assert_resumes, read_progress
 from problems import Problem, assert_soft_updates, assert_squashed_gaussian, assert_system_controlled
 from test_scripts import Waits
 from torch import Tensor
@@ -243,7 +243,8 @@ def test_density_is_that_of_the_squashed_gaussian() -> None:
 
 
 def test_targets_and_losses(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_soft_updates(build(), monkeypatch)
+    learner = build()
+    assert_soft_updates(learner, (learner.actor_optimizer, learner.temperature_optimizer), monkeypatch)
 
 
 def test_a_linear_quadratic_system_is_controlled() -> None:
@@ -283,20 +284,3 @@ def test_a_run_resumes_bitwise_with_its_buffers(tmp_path: Path) -> None:
     assert sizes == [300, 30, 400]
     first, *_, last = read_progress(tmp_path / "part")
     assert first["losses_critic"] == "" and float(last["models_holdout_mse"]) > 0 and last["models_train_nll"]
-
-
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ("--seed-steps 64 --iterations 4", "--seed-steps 64 leave no update in --iterations 4"),
-        ("--models 1 --elites 1", "--models must be from 2 to 1,000, not 1"),
-        ("--elites 8", "--elites 8 are more than --models 7"),
-        ("--num-envs 1", "--num-envs must be at least 2: one environment is held out"),
-        ("--rollout-lengths 3 2", "--rollout-lengths 3 2: the first must not exceed the second"),
-        ("--buffer-size 10", "--buffer-size 10 is less than the 64 transitions of a step"),
-        ("--sample-enhance 1 --randomise mass=0.9:1.1", "--sample-enhance takes Jacobians of one robot"),
-        ("--sample-enhance 1 --rough 5", "--sample-enhance takes Jacobians of a robot on a plane: leave out --rough"),
-    ],
-)
-def test_wrong_arguments_are_refused(arguments: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert message in refusal(lambda: mbpo.main(["--env", "ant", *arguments.split()]), capsys)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learners import assert_resumes, read_progress, refusal, run
+from learners import assert_resumes, read_progress, run
 from planning.systems import Linear, normal
 from torch import Tensor
 
@@ -230,16 +229,3 @@ def test_tasks_without_early_termination(tmp_path: Path, capsys: pytest.CaptureF
     for name in ("checkpoint.pt", "policy.pt"):
         pods.main(["--evaluate", str(tmp_path / name), "--no-finer", "--eval-episodes", "2"])
         assert "length 1000.0" in capsys.readouterr().out
-
-
-REFUSED: list[tuple[str, str]] = [
-    ("--env ant", "ant ends episodes early, and all sequences have one length: give --no-early-termination"),
-    ("--env hopper --order 2", "hopper ends episodes early"),
-    ("--env cartpole --horizon 100", "--horizon 100 does not divide the 240 control steps of an episode"),
-]
-
-
-@pytest.mark.parametrize("arguments, message", REFUSED)
-def test_wrong_arguments_are_refused(arguments: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    call: Callable[[], object] = lambda: pods.main(arguments.split())  # noqa: E731
-    assert message in refusal(call, capsys)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from learners import read_progress, run
+from problems import lambda_returns
 from torch.distributions import Normal, kl_divergence
 
 import diffsim
@@ -30,17 +31,7 @@ def test_gae_is_the_weighted_sum_of_all_its_n_step_advantages(
     following[terminated] = 0.0  # V(s_{t+1}): of the last state where time ran out, nothing where the episode failed
     for t, i in zip(*np.nonzero(~done[:-1]), strict=True):
         following[t, i] = value[t + 1, i]
-
-    expected = np.zeros(size)
-    for i in range(size[1]):
-        for t in range(horizon):
-            n = next((k for k in range(1, horizon - t) if done[t + k - 1, i]), horizon - t)  # steps to the end
-            advantages = []
-            for k in range(1, n + 1):
-                rewards = sum(gamma**j * reward[t + j, i] for j in range(k))
-                advantages.append(rewards + gamma**k * following[t + k - 1, i] - value[t, i])
-            weights = [(1 - lam) * lam ** (k - 1) for k in range(1, n)] + [lam ** (n - 1)]
-            expected[t, i] = np.dot(weights, advantages)
+    expected = lambda_returns(reward, following, done, gamma, lam) - value
     tensors = (torch.tensor(x) for x in (reward, value, following, done))
     np.testing.assert_allclose(ppo.gae(*tensors, gamma, lam), expected, rtol=1e-12, atol=1e-12)
 

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from learners import ROOT
 
 import diffsim
 from diffsim.tasks import TASKS
+from diffsim.tasks.base import ASSETS
 
-ROOT = Path(__file__).resolve().parents[1]
 SNIPPETS = [
     pytest.param(code, id=f"{page.stem}-{k}")
     for page in (ROOT / "README.md", ROOT / "docs" / "gymnasium.md", ROOT / "docs" / "physics.md")
@@ -24,8 +25,8 @@ SNIPPETS = [
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """With a robot.xml of the reader's, and no new task afterwards."""
-    shutil.copy(ROOT / "diffsim" / "assets" / "hopper.xml", tmp_path / "robot.xml")
-    shutil.copy(ROOT / "diffsim" / "assets" / "stage.xml", tmp_path)
+    shutil.copy(ASSETS / "hopper.xml", tmp_path / "robot.xml")
+    shutil.copy(ASSETS / "stage.xml", tmp_path)
     monkeypatch.chdir(tmp_path)
     known = dict(TASKS)
     yield

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from learners import SMALL, assert_derivatives, refusal, run
+from learners import SMALL, assert_derivatives, run
 from torch import Tensor, nn
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
@@ -201,12 +201,6 @@ def test_members_of_equal_weights_and_samples_learn_as_one() -> None:
         for c in range(2):
             for p, q in zip(two.critics[2 * c + k].parameters(), one.critics[c].parameters(), strict=True):
                 torch.testing.assert_close(p, q, rtol=1e-4, atol=1e-5)
-
-
-def test_members_must_share_the_environments_evenly(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--env", "cartpole", "--num-envs", "10", "--population", "4"]
-    message = "--num-envs 10 cannot be split evenly among --population 4"
-    assert message in refusal(lambda: parse(sapo.Args, arguments), capsys)
 
 
 @pytest.mark.parametrize(

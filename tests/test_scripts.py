@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 import signal
 import traceback
 from collections.abc import Callable
@@ -200,19 +199,3 @@ def test_same_seed_same_weights_on_a_gpu(script, tmp_path, eager):
 
 
 # A saved policy -------------------------------------------------------------------------------------------------------
-
-
-def test_evaluate(script, trained, tmp_path, capsys):
-    """What the run ended with, beside the checkpoint, which stays as it is."""
-    path = tmp_path / "checkpoint.pt"
-    before = shutil.copy(trained / "checkpoint.pt", path).read_bytes()
-    script.main(["--evaluate", str(path), "--device", "cpu", "--no-finer"])
-    final = float(read_progress(trained)[-1]["eval_return"])
-    out = capsys.readouterr().out
-    assert out.startswith(f"cartpole, 3 episodes: return median {final:.1f}, mean ") and "gait" not in out
-    evaluation = json.loads((tmp_path / "evaluation.json").read_text())
-    assert evaluation == json.loads((trained / "evaluation.json").read_text())
-    settings = dict(script=script.__name__, iteration=10, env="cartpole", substeps=4, eval_episodes=3)
-    assert evaluation["settings"].items() >= settings.items()
-    assert evaluation["lengths"] == [240] * 3 and evaluation["speed"] is None
-    assert path.read_bytes() == before

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from learners import SMALL, assert_derivatives, assert_same, run
+from problems import lambda_returns
 from torch import Tensor
 
 import diffsim
@@ -41,16 +42,7 @@ def test_td_lambda_is_equation_7(rng: np.random.Generator, lam: float, horizon: 
     rollout = random_rollout(rng, horizon)
     reward, done = rollout.reward.detach().numpy(), rollout.done.numpy()
     value = rng.normal(size=reward.shape)
-    expected = np.zeros_like(reward)
-    for i in range(reward.shape[1]):
-        for t in range(horizon):
-            n = next((k for k in range(1, horizon - t) if done[t + k - 1, i]), horizon - t)  # steps to the end
-            returns = [
-                sum(GAMMA**step * reward[t + step, i] for step in range(k)) + GAMMA**k * value[t + k - 1, i]
-                for k in range(1, n + 1)
-            ]
-            expected[t, i] = (1 - lam) * sum(lam ** (k - 1) * returns[k - 1] for k in range(1, n))
-            expected[t, i] += lam ** (n - 1) * returns[n - 1]
+    expected = lambda_returns(reward, value, done, GAMMA, lam)
     result = shac.td_lambda(rollout.reward.detach(), torch.tensor(value), rollout.done, GAMMA, lam)
     np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12)
 

@@ -7,7 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from learners import PATH
+
 # Four threads that make the same environment and step it for the first time. Optimisation would take ten seconds.
 THREADS = """
 import threading, torch, warp
@@ -40,7 +41,7 @@ mujoco.mj_step(model, data)
 
 def run(program: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Where MUJOCO_GL names an OpenGL that may not be there: nothing is drawn."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "MUJOCO_GL": "osmesa"} | environment
+    environment = os.environ | PATH | {"MUJOCO_GL": "osmesa"} | environment
     folder = folder / "here"
     folder.mkdir(exist_ok=True)
     command = [sys.executable, "-c", program]

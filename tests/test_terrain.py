@@ -10,7 +10,6 @@ import pytest
 import reference
 import torch
 from scenes import BALL, PENDULUM, acting_states, parse, run, task_scene, unit
-from test_accuracy import source
 from test_gradient import check_gradients
 
 import diffsim
@@ -99,24 +98,6 @@ def test_gradients_of_the_hopper_are_those_of_differences(rng):
     check_gradients(scene, states, rng, integration=Integration(substeps=8))
 
 
-def test_gradients_across_a_ridge_and_a_valley_are_those_of_differences(ball, rng):
-    """Of balls that roll over a vertex within the step."""
-    states = pressed(ball, np.array([-0.05, 0.97, 1.97, 3.22]), rng)
-    states[1][:] = np.array([4.0, 0.5, 0.0, 0.0, 30.0, 0.0])
-    before, after = states[0][:, 0], run(ball, *states, integration=IMPLICIT)[0][:, 0]
-    vertices = np.array([0.0, 1.0, 2.0, 3.25])
-    assert ((before < vertices) & (vertices < after)).all()
-    check_gradients(ball, states, rng, integration=IMPLICIT)
-
-
-def test_a_level_terrain_is_the_plane(rng):
-    flat, vertices = parse(BALL), np.stack([np.linspace(-9, 9, 40), np.zeros(40)], 1)
-    states = pressed(flat.with_terrain(PLANE), np.linspace(-3, 3, 16), rng)
-    plane, level = (run(scene, *states, 4, integration=IMPLICIT) for scene in (flat, flat.with_terrain(vertices)))
-    for value, expected in zip(level, plane, strict=True):
-        np.testing.assert_allclose(value, expected, rtol=1e-11, atol=1e-11)
-
-
 def test_spikes_high_steps_and_narrow_notches_stay_finite(rng):
     """Nothing fits into the notches; gradients are finite, too."""
     x = np.repeat(np.arange(0.0, 4.0, 0.04), 2)
@@ -154,13 +135,6 @@ def test_the_twin_and_the_drawn_boxes_are_where_mujoco_has_them(rng):
         found = min(mujoco.mj_geomDistance(model, data, k, model.ngeom - 1, 5.0, None) for k in range(model.ngeom - 1))
         expected = reference.clearance(HILLS, np.array([x, z]), 0.1)[0]
         assert expected <= 0 or abs(found - expected) < 1e-6
-
-
-def test_kernels_of_a_plane_do_not_know_terrain():
-    scene = task_scene("hopper")
-    plain, hilly = source(scene), source(scene.with_terrain(HILLS))
-    for name in ("(var_m).terrain", "(var_m).carrier_along", "sphere_on_terrain"):
-        assert name in hilly and name not in plain
 
 
 # Tasks ----------------------------------------------------------------------------------------------------------------
@@ -215,14 +189,15 @@ def test_heights_at_several_places(rng):
 
 
 def test_feet_of_a_joystick_task_are_seen_over_the_ground_below_them():
-    """A Go2 whose hind feet stand 10 cm higher than its front feet."""
-    name, n = "go2", 2
+    """A Go2 whose hind feet stand 10 cm higher than its front feet, or the other way round."""
     flat, there = (
-        diffsim.make(name, n, dtype=torch.float64, seed=1, terrain=ground) for ground in (None, step(-0.1, 0.05))
+        diffsim.make("go2", 2, dtype=torch.float64, seed=1, terrain=ground) for ground in (None, step(-0.1, 0.05))
     )
-    seen = [env.set_state(flat.qpos, flat.qvel)[:, -8:-4] for env in (flat, there)]
-    assert (flat.qpos[:, 0] == 0).all()
-    torch.testing.assert_close(seen[1] - seen[0], torch.tensor([0.1, 0.1, 0.0, 0.0]).double().expand(n, 4))
+    for turn, front, hind in (((1.0, 0, 0, 0), 0.1, 0.0), ((0, 0, 0, 1.0), 0.0, 0.1)):
+        qpos = flat.qpos.clone()
+        qpos[:, 3:7] = torch.tensor(turn)
+        seen = [env.set_state(qpos, flat.qvel)[:, -8:-4] for env in (flat, there)]
+        torch.testing.assert_close(seen[1] - seen[0], torch.tensor([front, front, hind, hind]).double().expand(2, 4))
 
 
 def test_a_number_of_degrees_makes_uneven_ground():
@@ -305,7 +280,8 @@ def test_generated_profiles():
     assert (z[abs(x) <= LEVEL] == 0).all()
     np.testing.assert_allclose([-x.min(), x.max()], LENGTH + LEVEL + 1)
     angles = np.degrees(np.arctan(np.diff(z) / np.diff(x)))
-    assert 18 < abs(angles).max() < 20 and abs(angles.mean()) < 3
+    np.testing.assert_allclose(abs(angles).max(1), [5, 10, 15, 20], rtol=0.08)  # profile by profile
+    assert (abs(angles).max(1) < [5, 10, 15, 20]).all() and abs(angles.mean()) < 3
     assert len(np.unique(z[:, -1])) == len(np.unique(z[:, 0])) == 4
     assert np.array_equal(profiles, uneven(20.0, 4, -3)) and not np.array_equal(profiles, uneven(20.0, 4, 4))
     for make, message in (

@@ -33,10 +33,11 @@ from tyro.conf import Positional
 
 from diffsim import TASKS, Scene
 from diffsim.__main__ import DEMO_EPISODES, POLICIES
+from diffsim.robot.contact import contact_bodies, trace
 from diffsim.tasks.imitation.tracking import Tracking
 from diffsim.tasks.joystick import Joystick
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
-from diffsim.training.gait import TOUCHING, contact_bodies, trace
+from diffsim.training.gait import TOUCHING
 from diffsim.view.render import Frame, Renderer, whole_file
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -284,7 +285,7 @@ class Bar(NamedTuple):
     learner: str
     task: str
     returns: list[float]
-    training: float
+    training: float = 0.0
     total: float = 0.0
 
 
@@ -306,6 +307,10 @@ def measured_bars() -> dict[str, list[Bar]]:
         seeds = [float(x) for x in row["each seed"].split()]
         values = [float(row["return"]), min(seeds), max(seeds)]
         exact.append(Bar(row["learner"].removesuffix("_mujoco"), row["task"], values, float(row["training (s)"])))
+    for (cell,), rows in grouped(read_csv(folder / "contact.csv"), "cell").items():
+        task, learner = cell.split(", ")
+        ends = [float(row["return"]) for row in rows]
+        exact.append(Bar(learner, task, [median(ends), min(ends), max(ends)]))
     for (task,), rows in grouped(read_csv(folder / "peer_train.csv"), "task").items():
         ends, times = ([float(row[key]) for row in rows] for key in ("return", "training (s)"))
         values = [median(ends), min(ends), max(ends)]
@@ -321,18 +326,20 @@ def bars() -> None:
     panels, colours = figure.subplots(2, 2), dict[str, str]()
     for (first, second), (contact, found) in zip(panels, measured_bars().items(), strict=True):
         learners, tasks = (list(dict.fromkeys(getattr(bar, key) for bar in found)) for key in ("learner", "task"))
+        learners.sort(key=[*colours, *learners].index)  # in each panel in the same order
         tasks.sort(key=list(TASKS).index)
         for k, learner in enumerate(learners):
             colour = colours.setdefault(learner, f"C{len(colours)}")
             own = [bar for bar in found if bar.learner == learner]
-            at = np.array([tasks.index(bar.task) for bar in own]) + 0.2 * (k - 1.5)
+            at = np.array([tasks.index(bar.task) + 0.2 * (k - (len(learners) - 1) / 2) for bar in own])
             middle, low, high = np.array([bar.returns for bar in own]).T
             first.bar(at, middle, 0.18, yerr=(middle - low, high - middle), capsize=2, color=colour, label=learner)
             second.bar(at, [max(bar.total, bar.training) for bar in own], 0.18, color=colour, alpha=0.4)
             second.bar(at, [bar.training for bar in own], 0.18, color=colour, label=learner)
-        for panel, text in ((first, "return, median and range"), (second, "training; light: total (s)")):
+        labels = "return, median and range", "measured seconds\nof training; light: total"
+        for panel, text in zip((first, second), labels, strict=True):
             panel.set_ylabel(text, fontsize=9)
-            panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8.5)
+            panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8, va="top")
             panel.tick_params(axis="y", labelsize=9)
             panel.spines[["top", "right"]].set_visible(False)
         first.set_title(contact, fontsize=10, loc="left")

@@ -49,6 +49,7 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
     Numbers, force_at, point_velocity, pick = t.scene.vec11, sp.force_at, sp.point_velocity, block.pick
     Model, Link, Load, Lane, NV, kin = t.Model, t.Link, t.Load, t.Lane, spec.nv, kinematics(spec)
     Place, Frame, ground, TERRAIN = t.Place, t.Frame, terrain_contact(spec), "terrain" in spec.features
+    in_frame, in_world = ground.in_frame, ground.in_world
     LIMIT, LOSS, VARIED = "limit" in spec.features, "frictionloss" in spec.features, spec.varied
 
     @wp.func
@@ -118,32 +119,9 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
         """Centre of contact sphere c, its distance from the ground, 1 where that is within its margin, else 0; the
         frame of the contact, and the ground's curvature in it."""
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
-        if wp.static(TERRAIN):
-            x = carrier[0] + centre[0]
-            z = carrier[1] + centre[2]
-            reach = T(m.contact_radius[c] + m.contact_numbers[c][10])
-            hit = ground.nearest_of_each(m, here.e, x, z, m.contact_radius[c], reach)
-            distance = hit[0]
-            E = ground.frame_of(hit)
-            curvature = hit[3]
-        else:
-            distance = carrier + centre[2] - T(m.contact_radius[c])
-            E = T(1.0)
-            curvature = T(0.0)
+        reach = T(m.contact_radius[c] + m.contact_numbers[c][10])
+        distance, E, curvature = ground.distance(m, here, c, centre, carrier, reach)
         return centre, distance, pick(distance, T(m.contact_numbers[c][10]), T(1.0), T(0.0)), E, curvature
-
-    @wp.func
-    def in_frame(E: Frame, v: vec3):
-        """A world vector in the frame of a contact, in which the law acts."""
-        if wp.static(TERRAIN):
-            return wp.transpose(E) * v
-        return v
-
-    @wp.func
-    def in_world(E: Frame, v: vec3):
-        if wp.static(TERRAIN):
-            return E * v
-        return v
 
     @wp.func
     def constants(m: Model, here: Lane, c: int):

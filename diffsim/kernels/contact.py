@@ -32,19 +32,25 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
     T, vec3, vec4, Model, Lane, Link = t.T, t.vec3, t.vec4, t.Model, t.Lane, t.Link
     Node, Adjoint, Array = t.Node, t.Adjoint, t.Ts
     Place, force_at, point_velocity, pick = t.Place, sp.force_at, sp.point_velocity, block.pick
-    sphere_on_terrain, TERRAIN = terrain_contact(spec).sphere_on_terrain, "terrain" in spec.features
-    IMPLICIT, VARIED = spec.implicit, spec.varied
+    ground, TERRAIN = terrain_contact(spec), "terrain" in spec.features
+    IMPLICIT, VARIED, in_frame, in_world = spec.implicit, spec.varied, ground.in_frame, ground.in_world
 
     @wp.func
-    def sphere_state(m: Model, here: Lane, k: int, link: Link, height: T):
-        """Lowest point p, its velocity, and the depth (predicted theta h ahead if implicit) of contact sphere k."""
-        p = sp.on_link(link.R, link.x, m.contact_position[k])
-        depth = height + p[2] - T(m.contact_radius[k])
-        p = p - vec3(T(0.0), T(0.0), T(m.contact_radius[k]))
-        v = point_velocity(link.V, p)
+    def sphere_state(m: Model, here: Lane, c: int, link: Link, place: Place):
+        """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
+        theta h ahead if implicit), E, and the ground's curvature in it."""
+        centre = sp.on_link(link.R, link.x, m.contact_position[c])
+        r = T(m.contact_radius[c])
+        reach = r
+        if wp.static(IMPLICIT and TERRAIN):
+            fastest = wp.length(point_velocity(link.V, centre)) + r * wp.length(wp.spatial_top(link.V))
+            reach = r + here.theta * here.h * fastest
+        depth, E, curvature = ground.distance(m, here, c, centre, place, reach)
+        p = centre - in_world(E, vec3(T(0.0), T(0.0), r))
+        v = in_frame(E, point_velocity(link.V, p))
         if wp.static(IMPLICIT):
             depth = depth + here.theta * here.h * v[2]
-        return p, v, depth
+        return p, v, depth, E, curvature
 
     @wp.func
     def touches(here: Lane, d: T, v: vec3):
@@ -106,17 +112,12 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
     def add_contacts(m: Model, here: Lane, k: int, link: Link, place: Place, load: t.Load):
         """The load of link k with its contacts."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            if wp.static(TERRAIN):
-                p, v, depth, E, _ = sphere_on_terrain(m, here, c, link, place)
-            else:
-                p, v, depth = sphere_state(m, here, c, link, place)
+            p, v, depth, E, _ = sphere_state(m, here, c, link, place)
             on = touches(here, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
                 fc = contact_force(here, depth, v)
-                f = vec3(fc[0], fc[1], fc[2])
-                if wp.static(TERRAIN):
-                    f = E * f
+                f = in_world(E, vec3(fc[0], fc[1], fc[2]))
                 if wp.static(IMPLICIT):
                     B = on * contact_resistance(here, depth, fc[3])
                     if wp.static(TERRAIN):
@@ -138,25 +139,18 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
     ):
         """The adjoints of link k with its contacts' part of phi added."""
         for c in range(m.contact_begin[k], m.contact_begin[k + 1]):
-            if wp.static(TERRAIN):
-                p, v, depth, E, curvature = sphere_on_terrain(m, here, c, link, place)
-            else:
-                p, v, depth = sphere_state(m, here, c, link, place)
+            p, v, depth, E, curvature = sphere_state(m, here, c, link, place)
             on = touches(here, depth, v)
             if block.any_of(on):
                 depth = on * depth  # no force on the others, as it grows with the depth
                 fc = contact_force(here, depth, v)
                 f = vec3(fc[0], fc[1], fc[2])
-                g_f = -on * point_velocity(node.W, p)
-                if wp.static(TERRAIN):
-                    g_f = wp.transpose(E) * g_f
+                g_f = in_frame(E, -on * point_velocity(node.W, p))
                 a = vec3()
                 hi = T(0.0)
                 if wp.static(IMPLICIT):
                     hi = here.h
-                    a = point_velocity(node.A, p) + vec3(m.gravity)
-                    if wp.static(TERRAIN):
-                        a = wp.transpose(E) * a
+                    a = in_frame(E, point_velocity(node.A, p) + vec3(m.gravity))
                     B = on * contact_resistance(here, depth, fc[3])
                     f = f - wp.cw_mul(B, a)
                 g = contact_adjoint(here, depth, v, a, g_f, hi)
@@ -169,19 +163,17 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 g_v = vec3(g[0], g[1], g[2])
                 if wp.static(TERRAIN):
                     g_turn = wp.cross(g_v, v)[1] - wp.cross(g_f, f)[1]  # adjoint of the angle of E
-                    f = E * f
-                    g_v = E * g_v
+                f = in_world(E, f)
+                g_v = in_world(E, g_v)
                 wrench = force_at(p, f)
                 G = force_at(p, g_v)
-                g_p = vec3(T(0.0), T(0.0), g[3])
-                if wp.static(TERRAIN):
-                    g_p = E * g_p
+                g_p = in_world(E, vec3(T(0.0), T(0.0), g[3]))
                 g_p = g_p + wp.cross(g_v, wp.spatial_top(link.V)) - wp.cross(f, wp.spatial_top(node.W))
                 if wp.static(IMPLICIT):
                     g_a = -wp.cw_mul(B, g_f)
                     if wp.static(TERRAIN):
                         g_turn = g_turn + wp.cross(g_a, a)[1]
-                        g_a = E * g_a
+                    g_a = in_world(E, g_a)
                     GA = force_at(p, g_a)
                     g_p = g_p + wp.cross(g_a, wp.spatial_top(node.A))
                     adj.a = adj.a + GA
@@ -190,14 +182,11 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
                 adj.w = adj.w - wrench
                 adj.v = adj.v + G
                 # The lowest point follows the sphere's centre, not the body's material.
+                radius = T(m.contact_radius[c])
                 if wp.static(TERRAIN):
-                    radius = T(m.contact_radius[c])
                     tangent = E * vec3(T(1.0), T(0.0), T(0.0))
-                    centre = p + radius * E * vec3(T(0.0), T(0.0), T(1.0))
                     g_p = g_p + curvature * (g_turn - radius * wp.dot(tangent, g_p)) * tangent
-                else:
-                    centre = p + vec3(T(0.0), T(0.0), T(m.contact_radius[c]))
-                adj.p = adj.p + force_at(centre, g_p)
+                adj.p = adj.p + force_at(p + in_world(E, vec3(T(0.0), T(0.0), radius)), g_p)
                 adj.p = adj.p + wp.spatial_cross_dual(link.V, G) - wp.spatial_cross_dual(node.W, wrench)
         return adj
 

@@ -59,15 +59,6 @@ class _Numbers:
         )
 
     @cached_property
-    def place(self) -> np.ndarray:
-        """The carrier's at q = 0: along the slides that end there nothing turns, so the offsets add up as they are."""
-        frame, place = np.eye(3), np.zeros(3)
-        for i in range(1, self.scene.carrier + 1):
-            place += frame @ self.position[i]
-            frame = frame @ self.scene.rotation[i]
-        return place
-
-    @cached_property
     def motor_slot(self) -> np.ndarray:
         return self.slot[:, self.scene.motor_link]
 
@@ -192,9 +183,9 @@ FIELDS: dict[str, Field] = {
     # read in scenes with a terrain only: a row of each profile, or one for all environments, whose vertices are
     # (x, z, unit vector along the segment that begins there)
     "terrain": ("vec4ss", lambda n: n.terrain),
-    "carrier_along": ("real", lambda n: n.place[0]),  # x at q = 0
+    "carrier_along": ("real", lambda n: n.scene.root[0][0]),  # x at q = 0
     # over the ground at q = 0 (fixed base), or minus the ground's height (floating)
-    "carrier_height": ("real", lambda n: n.place[2] - n.scene.ground_height),
+    "carrier_height": ("real", lambda n: n.scene.root[0][2] - n.scene.ground_height),
     "base_damping": ("real", lambda n: n.scene.base_damping[0]),
     **_scenes("vec3", "gravity"),
     **_scenes("real", "k_n k_d k_t mu"),

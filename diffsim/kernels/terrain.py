@@ -1,4 +1,4 @@
-"""Contact of a sphere with a piecewise-linear ground z(x), and where it is: what of contact.py's plane is not the same.
+"""Where a sphere touches the ground: a plane, or a piecewise-linear z(x).
 
 A sphere of radius r touches where its centre is nearer to the ground than r. Signed distance d, normal n and curvature
 k of the centre's distance field are those of the nearest feature:
@@ -22,17 +22,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from diffsim.kernels.model import functions, types
-from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.wide import blocks
 
 
 @cache
 def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
-    t, sp, block, BLOCK = types(spec), spatial(spec), blocks(spec), spec.block
-    T, U, vec2, vec3, vec4, mat3, Model = t.T, t.U, t.vec2, t.vec3, t.vec4, t.mat3, t.Model
-    uvec4 = t.scene.vec4
-    point_velocity, IMPLICIT = sp.point_velocity, spec.implicit
+    t, block, BLOCK, TERRAIN = types(spec), blocks(spec), spec.block, "terrain" in spec.features
+    T, U, vec3, vec4, mat3, Model, uvec4 = t.T, t.U, t.vec3, t.vec4, t.mat3, t.Model, t.scene.vec4
 
     @wp.func
     def length_of(m: Model, row: int, i: int):
@@ -145,22 +142,25 @@ def terrain_contact(spec: KernelSpec) -> SimpleNamespace:
         return mat3(hit[2], T(0.0), hit[1], T(0.0), T(1.0), T(0.0), -hit[1], T(0.0), hit[2])
 
     @wp.func
-    def sphere_on_terrain(m: Model, here: t.Lane, c: int, link: t.Link, place: vec2):
-        """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
-        theta h ahead if implicit), E and the curvature k."""
-        centre = sp.on_link(link.R, link.x, m.contact_position[c])
-        r = T(m.contact_radius[c])
-        reach = r
-        if wp.static(IMPLICIT):
-            fastest = wp.length(point_velocity(link.V, centre)) + r * wp.length(wp.spatial_top(link.V))
-            reach = r + here.theta * here.h * fastest
-        hit = nearest_of_each(m, here.e, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
-        E = frame_of(hit)
-        p = centre - r * vec3(hit[1], T(0.0), hit[2])
-        v = wp.transpose(E) * point_velocity(link.V, p)
-        depth = hit[0]
-        if wp.static(IMPLICIT):
-            depth = depth + here.theta * here.h * v[2]
-        return p, v, depth, E, hit[3]
+    def distance(m: Model, here: t.Lane, c: int, centre: vec3, place: t.Place, reach: T):
+        """(d, E, k) of contact sphere c, see nearest(); over a plane E is the world's and k is 0."""
+        if wp.static(TERRAIN):
+            hit = nearest_of_each(m, here.e, place[0] + centre[0], place[1] + centre[2], m.contact_radius[c], reach)
+            return hit[0], frame_of(hit), hit[3]
+        else:
+            return place + centre[2] - T(m.contact_radius[c]), T(1.0), T(0.0)
+
+    @wp.func
+    def in_frame(E: t.Frame, v: vec3):
+        """A world vector in the frame of a contact, in which the law acts."""
+        if wp.static(TERRAIN):
+            return wp.transpose(E) * v
+        return v
+
+    @wp.func
+    def in_world(E: t.Frame, v: vec3):
+        if wp.static(TERRAIN):
+            return E * v
+        return v
 
     return functions(locals())

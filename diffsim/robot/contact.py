@@ -1,4 +1,4 @@
-"""Which geoms touch, by which numbers of the file, and at which points."""
+"""Which geoms touch, by which numbers of the file, at which points, and how these move over the ground."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffsim.robot.elements import disabled_flags
-from diffsim.robot.scene import Array
+from diffsim.robot.scene import Array, Index, Scene
 
 HULL_POINTS = 16  # of a mesh, at most
 _CORNERS = np.array([[x, y, z] for y in (-1, 1) for x in (-1, 1) for z in (-1, 1)], float)
@@ -147,3 +147,24 @@ def _spread(points: Array) -> Array:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return points[chosen]
+
+
+def contact_bodies(scene: Scene) -> Index:
+    """(ncontact,) MuJoCo's number of the body of each contact sphere."""
+    return scene.mj_model.dof_bodyid[scene.contact_link + (5 if scene.floating else -1)]  # a link's last dof
+
+
+def trace(scene: Scene, qpos: Array) -> tuple[Array, Array]:
+    """Depth (F, nc) below and slide (F - 1, nc) along the ground of contact spheres' lowest points, m; qpos (F, nq)."""
+    model, data, bodies = scene.mj_model, mujoco.MjData(scene.mj_model), contact_bodies(scene)
+    # A link's frame has the axes of its body and sits at the anchor of its joint.
+    centre = model.jnt_pos[model.body_jntadr[bodies] + model.body_jntnum[bodies] - 1] + scene.contact_position
+    place, turn = np.empty((len(qpos), len(bodies), 3)), np.empty((len(qpos), len(bodies), 3, 3))
+    for k, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        place[k], turn[k] = data.xpos[bodies], data.xmat[bodies].reshape(-1, 3, 3)
+    lowest = centre - scene.contact_radius[:, None] * turn[:, :, 2]  # in the body's frame
+    point = place + np.einsum("fcij,fcj->fci", turn, lowest)
+    moved = place[1:] + np.einsum("fcij,fcj->fci", turn[1:], lowest[:-1]) - point[:-1]
+    return scene.ground_height - point[..., 2], np.linalg.norm(moved[..., :2], axis=-1)

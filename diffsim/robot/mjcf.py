@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 from diffsim.robot.contact import contact_points, ground_pairs
 from diffsim.robot.elements import at_rest, control_range, disabled_flags, floating, motors, numeric, servos
 from diffsim.robot.refuse import beyond, obstacles
-from diffsim.robot.report import approximations
 from diffsim.robot.scene import Array, Scene, SceneError, Spheres
 
 
@@ -40,7 +38,7 @@ def load_scene(path: str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec) ->
     _refuse(file, obstacles(model))
     scene = _Reader(model, file).scene()
     _refuse(file, beyond(scene))
-    return dataclasses.replace(scene, approximations=approximations(scene))
+    return scene
 
 
 def _refuse(file: Path, found: list[str]) -> None:

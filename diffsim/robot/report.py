@@ -25,7 +25,7 @@ def report(scene: Scene) -> str:
     """A page of text about a scene."""
     sections = [
         (f"{scene.name}: can be simulated", list(_parts(scene))),
-        ("approximated", [f"- {sentence}" for sentence in scene.approximations]),
+        ("approximated", [f"- {sentence}" for sentence in approximations(scene)]),
     ]
     return "\n\n".join("\n  ".join([title, *lines]) for title, lines in sections if lines)
 

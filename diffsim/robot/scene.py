@@ -125,7 +125,6 @@ class Scene:
     viscosity: float = 0.0  # kg/(m s)
     terrain: Array | None = None  # (1 or num_envs, K, 2) vertices of the ground in the plane's place, see with_terrain
     constraints: Constraints | None = None  # MuJoCo's, in place of springs and dampers, see robot/constraint.py
-    approximations: tuple[str, ...] = ()  # what the file asks for and is simulated only roughly, a sentence each
 
     @property
     def nlink(self) -> int:
@@ -202,6 +201,22 @@ class Scene:
                 break
             link += 1
         return link
+
+    @property
+    def root(self) -> tuple[Array, Array, Array]:
+        """Where the carrier is: at place (3,) [m] if qpos is 0, its x grows by along (nq,) . qpos, and qpos + up (nq,)
+        is one metre higher."""
+        place, frame, along, up = np.zeros(3), np.eye(3), np.zeros(self.nq), np.zeros(self.nq)
+        if self.floating:
+            along[0] = up[2] = 1.0
+        for link in range(1, self.carrier + 1):  # slides, which turn nothing
+            place += frame @ (self.position[link] - self.joint_ref[link] * self.rotation[link] @ self.axis[link])
+            frame = frame @ self.rotation[link]
+            axis = frame @ self.axis[link]
+            along[link - 1] = axis[0]
+            if abs(axis[2]) > 1 - 1e-9:
+                up[link - 1] = np.sign(axis[2])
+        return place, along, up
 
     @property
     def inert(self) -> int:

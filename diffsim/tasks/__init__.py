@@ -32,22 +32,3 @@ def find_task(name: str | type[Task]) -> type[Task]:
     if name not in TASKS and not FILE.fullmatch(str(name)):
         raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
     return TASKS.get(name) or task_of_file(name)
-
-
-def tracking() -> list[str]:
-    """The names of those in TASKS that track clips."""
-    return [name for name, task in TASKS.items() if issubclass(task, Imitation)]
-
-
-__all__ = [
-    "FILE",
-    "TASKS",
-    "Accuracy",
-    "Contact",
-    "HumanoidImitation",
-    "Imitation",
-    "Task",
-    "TaskError",
-    "find_task",
-    "tracking",
-]

@@ -11,18 +11,20 @@ import os
 import sys
 from collections.abc import Mapping
 from difflib import get_close_matches
+from numbers import Integral
 from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar, Literal, TypeAlias
 
 import mujoco
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
-from diffsim.sim.integration import TOLERANCE, Integration
+from diffsim.sim.integration import TOLERANCE, Integration, is_real
 from diffsim.tasks.mirror import Mirror
 from diffsim.terrain import Elevation
 
@@ -106,6 +108,7 @@ class Task:
         self._check_names()
         n, m = scene.nq + scene.nv, scene.mj_model
         self.forward_column = getattr(self, "forward_column", way_forward(scene))
+        self._check_attributes(scene.nq)
         self.num_random = getattr(self, "num_random", n)
         if type(self).reset is Task.reset:
             self._nq, self._quaternions = scene.nq, scene.quaternion_adr.tolist()
@@ -132,7 +135,9 @@ class Task:
         for k in scene.quaternion_adr:
             if not qpos[:, k : k + 4].any(1).all():
                 raise TaskError(f"task {self.name!r}: the quaternion qpos[{k}:{k + 4}] of the start is zero")
-        if self.terminated(obs).any():
+        over = self._tensor("terminated", self.terminated(obs))
+        self._check("what terminated returns for two observations", (over.dtype, tuple(over.shape)), (torch.bool, (2,)))
+        if over.any():
             bound = "" if self.min_height is None else f", and min_height is {self.min_height}"
             raise TaskError(f"task {self.name!r}: an episode ends where it starts; obs[0] is {obs[0, 0]:.4g}{bound}")
         return self
@@ -161,6 +166,18 @@ class Task:
         for names in (("observe", "observe_with"), ("reward",)):
             if all(getattr(type(self), name) is getattr(Task, name) for name in names):
                 raise TaskError(f"task {self.name!r} has no method {names[0]!r}")
+
+    def _check_attributes(self, nq: int) -> None:
+        """That those can be used which would otherwise fail when a run has begun."""
+        length, column = self.episode_length, self.forward_column
+        for name, fits, allowed in (
+            ("name", Path(self.name).name == self.name != "", "the name of a folder, without a slash"),
+            ("episode_length", isinstance(length, Integral) and length >= 1, "an integer of at least 1"),
+            ("min_height", self.min_height is None or is_real(self.min_height), "a number of meters, or None"),
+            ("forward_column", column in (None, *range(nq)), f"a column of qpos, 0 to {nq - 1}, or None"),
+        ):
+            if not fits:
+                raise TaskError(f"task {self.name!r}: {name} is {getattr(self, name)!r}, must be {allowed}")
 
     @classmethod
     def presets(cls, contact: str | None = None) -> dict[str, Integration]:
@@ -238,7 +255,7 @@ class Task:
         return memory
 
     def ghost(self, memory: Tensor) -> Tensor | None:
-        """qpos (..., nq) of what the robot is to track, which films and pages draw next to it, or None."""
+        """World qpos (..., nq) of what the robot is to track, which films and pages draw next to it, or None."""
         return None
 
     def program(self, policy: nn.Module, columns: int) -> tuple[nn.Module, dict[str, tuple[int, ...]], list[str]]:
@@ -294,9 +311,5 @@ def height_reward(delta: Tensor, upper: float, slope: float) -> Tensor:
 def way_forward(scene: Scene) -> int | None:
     """Column of qpos that is the root's x, of its free joint or its slide along x; None if neither ground nor fluid
     carries the robot, or if it has no such joint, as an arm."""
-    m = scene.mj_model
-    mujoco.mj_kinematics(m, data := mujoco.MjData(m))
-    along = (m.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (data.xaxis[:, 0] > 0.99)
-    along |= m.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-    found = m.jnt_qposadr[along & (m.body_weldid[m.body_parentid[m.jnt_bodyid]] == 0)]
+    found = np.flatnonzero(scene.root[1] > 0.99)
     return int(found[0]) if len(found) and scene.features & {"contact", "drag"} else None

@@ -180,10 +180,8 @@ class Joystick(Task):
         return Mirror(qpos, qvel, action, obs)
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
-        """The keyframe, with joints and rates drawn around it."""
-        start = torch.addcmul(self._start, rand[..., : len(self.start)] - 0.5, self._spread)
-        qpos, qvel = start.split((7 + self._n, 6 + self._n), dim=-1)
-        return qpos, qvel
+        """The keyframe, with joints and rates drawn around it; `begin` takes the other numbers."""
+        return super().reset(rand[..., : len(self.start)])
 
     def begin(self, rand: Tensor) -> Tensor:
         """A command, a phase and a latency; no action yet."""

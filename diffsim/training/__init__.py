@@ -10,21 +10,10 @@ from diffsim.training.checkpoint import Learner, SavedPolicy, export_onnx, expor
 from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.errors import UsageError, fail
 from diffsim.training.evaluation import Evaluation, evaluate, evaluate_checkpoint, make_policy_env
-from diffsim.training.flags import Flags, ParallelFlags, parse
-from diffsim.training.layers import Likeliest, ObsNormalizer, moments
+from diffsim.training.flags import parse
+from diffsim.training.layers import Likeliest, ObsNormalizer
 from diffsim.training.main import command, script
 from diffsim.training.optimizer import ClippedAdam
-from diffsim.training.ranges import (
-    Count,
-    Decay,
-    Finite,
-    Fraction,
-    Natural,
-    NonNegative,
-    Positive,
-    Repeats,
-    SomeWidths,
-    Widths,
-)
+from diffsim.training.ranges import Count, Natural, NonNegative, Positive
 from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run

@@ -65,13 +65,19 @@ class SavedPolicy:
     iteration: int
     simulator: str = HOME
 
+    def __str__(self) -> str:
+        return f"{self.script}.py, iteration {self.iteration}"
+
     def task(self, given: str | None = None) -> str:
         """The name of its task, or the given file of an own one: what a checkpoint names is data, and no code to run.
 
-        Raises ValueError if the policy was trained on a file's task, and none is given.
+        Raises ValueError if the policy was trained on a file's task and none is given, or the other way round.
         """
-        if given is None and FILE.fullmatch(trained := self.args["env"]):
+        own = FILE.fullmatch(trained := self.args["env"])
+        if own and given is None:
             fail(f"a policy of your own task: give its file, whose code runs, by --env {trained} (drive: as robot)")
+        if not own and given not in (None, trained):
+            fail(f"a policy that was trained on {trained}, not on {given}")
         return given or self.args["env"]
 
 
@@ -120,8 +126,11 @@ def find_nonfinite(learner: Learner) -> str | None:
 
 
 def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, Any]:
-    """The checkpoint at path, whole, of this format and of the script if one is named; else raises ValueError."""
-    if not (path := Path(path)).is_file():
+    """The checkpoint at path, or of the run whose folder that is, whole, of this format and of the script if one is
+    named; else raises ValueError."""
+    if (path := Path(path)).is_dir():
+        path /= "checkpoint.pt"
+    if not path.is_file():
         fail(f"no such checkpoint: {path}")
     try:
         with zipfile.ZipFile(path) as archive:

@@ -57,9 +57,7 @@ class EpisodeStatistics:
             self.windows.popleft()
 
     def means(self) -> tuple[float, float]:
-        """NaN before the first episode's end."""
-        if not self.windows:
-            return math.nan, math.nan
+        """Once an episode has ended."""
         count, total_return, total_length = (sum(column) for column in zip(*self.windows, strict=True))
         return total_return / count, total_length / count
 

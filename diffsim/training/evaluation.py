@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,12 +23,10 @@ from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
 from diffsim.training import checkpoint, gait, graph
-from diffsim.training.checkpoint import Learner, SavedPolicy
+from diffsim.training.checkpoint import SavedPolicy
 from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
-
-L = TypeVar("L", bound=Learner)
 
 VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
@@ -88,16 +86,6 @@ class Evaluation:
         """The episode of median return."""
         return int(self.returns.argsort()[(len(self.returns) - 1) // 2])
 
-    def median_episode(self, seconds: float = VIDEO_SECONDS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """qpos (T, nq) and action (T, nu) of the first seconds of the episode of median return."""
-        qpos, action = self.episode(self.median)
-        steps = max(1, round(min(len(qpos), seconds / self.control_dt)))
-        return qpos[:steps], action[:steps]
-
-    def median_ghost(self) -> NDArray[np.float32] | None:
-        """(T, nq) what the episode of median return was to track, if anything."""
-        return None if self.ghost is None else self.ghost[:, self.median].numpy(force=True)
-
     def episode(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """qpos (T, nq) and action (T, nu) of all steps of an episode."""
         steps = int(self.lengths[number])
@@ -117,10 +105,12 @@ class Evaluation:
         """
         from diffsim.view import render  # a run without a video draws nothing
 
-        (qpos, action), scene = self.median_episode(seconds), self.scene
+        steps, scene = max(1, round(seconds / self.control_dt)), self.scene
+        qpos, action = (rows[:steps] for rows in self.episode(self.median))
+        ghost = None if self.ghost is None else self.ghost[:, self.median].numpy(force=True)
         if scene.terrain is not None:
             scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])
-        return render.film(path, scene, qpos, self.control_dt, action, ghost=self.median_ghost(), **options)
+        return render.film(path, scene, qpos, self.control_dt, action, ghost=ghost, **options)
 
 
 def gait_lines(parts: gait.Gait) -> str:
@@ -145,8 +135,6 @@ class Player:
 
     def __init__(self, env: DiffEnv, policy: Callable[[Tensor], Tensor], graphs: bool = False) -> None:
         self.env, self.captured = env, graphs and env.device.type == "cuda"
-        if self.captured and env.horizon != 1:
-            raise ValueError(f"a graph of one control step needs environments of horizon 1, not {env.horizon}")
         self.policy = copy.deepcopy(policy) if self.captured else policy  # a graph knows the addresses of its weights
         self.obs = torch.zeros(env.num_envs, env.task.obs_dim, dtype=env.dtype, device=env.device)
         self.returns, self.lengths = torch.zeros_like(self.obs[:, 0]), torch.zeros_like(env.episode_step)
@@ -235,11 +223,7 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
     return env
 
 
-def evaluate_checkpoint(
-    args: Args,
-    learner: Callable[[Args, DiffEnv], L] | None = None,
-    method: Callable[[L], Evaluation] | None = None,
-) -> None:
+def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | None = None) -> None:
     """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video.
 
     Unless --no-finer is given, the policy must also keep its return at FINER times the substeps, explicitly integrated:
@@ -247,7 +231,7 @@ def evaluate_checkpoint(
 
     Args:
         args: the script's arguments.
-        learner, method: how a restored learner is evaluated, if not by `evaluate` of its policy.
+        learner: of a method `evaluate`, which then takes the place of `evaluate` of its policy.
     """
     assert args.evaluate and args.run_dir
     check_writable(args.run_dir)
@@ -256,11 +240,10 @@ def evaluate_checkpoint(
 
     def measure(flags: Args) -> Evaluation:
         env = make_env(flags, flags.eval_episodes)
-        if learner and method:
-            restored = learner(flags, env)
-            checkpoint.restore(restored, state)
-            return method(restored)
-        return evaluate(env, fitting(checkpoint.load_policy(path).network, env))
+        if learner is None:
+            return evaluate(env, fitting(checkpoint.load_policy(path).network, env))
+        checkpoint.restore(restored := learner(flags, env), state)
+        return restored.evaluate()
 
     evaluation, found = measure(args), dict[str, Any]()
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 
 from diffsim.sim.integration import PASSES, TOLERANCE
-from diffsim.tasks import FILE, TASKS, Contact, Imitation, Task, find_task, tracking
+from diffsim.tasks import FILE, TASKS, Accuracy, Contact, Imitation, Task, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, in_one_line
@@ -41,8 +41,10 @@ Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**
 
 
 @dataclass
-class RunFlags:
-    """Where and how long it runs, what it writes."""
+class Flags:
+    """What every script takes: the run, the task, and how it is simulated. Each extends it by its hyperparameters."""
+
+    fixed: ClassVar[tuple[str, ...]] = ()  # flags of a script that --resume keeps
 
     seed: Seed = 1
     """seed of all random numbers"""
@@ -70,16 +72,8 @@ class RunFlags:
     """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
     """no progress bar, and no messages until the end"""
-
-
-@dataclass
-class Flags(RunFlags):
-    """What every script takes: the task and how it is simulated as well. Each extends it by its hyperparameters."""
-
-    fixed: ClassVar[tuple[str, ...]] = ()  # flags of a script that --resume keeps
-
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
-    accuracy: Literal["fast", "default", "accurate"] = "default"
+    accuracy: Accuracy = "default"
     """preset of integrator, substeps and theta (docs/numerics.md); default: the papers' settings"""
     integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
     """time integration (per task, --accuracy and --contact); mujoco includes MuJoCo's own contact and limits"""
@@ -108,8 +102,8 @@ class Flags(RunFlags):
 
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
-        if self.clip and not issubclass(find_task(self.env), Imitation):
-            fail(f"--clip is for {', '.join(tracking())}: {self.env} tracks no motion")
+        if self.contact == "mujoco" != self.integrator:
+            fail(f"--integrator {self.integrator} is for --contact soft, and the contact is MuJoCo's")
 
     @classmethod
     def script(cls) -> str:
@@ -175,11 +169,15 @@ class WindowFlags(SymmetricFlags):
     critic_minibatches: Repeats = 4
     """minibatches of a pass over a rollout's samples, contiguous in time"""
 
+    @property
+    def samples(self) -> int:
+        """Of a rollout, for each critic."""
+        return self.num_envs * self.horizon // distributed.size()
+
     def check(self) -> None:
         super().check()
-        samples = self.num_envs * self.horizon // (distributed.size() * getattr(self, "population", 1))
-        if self.critic_minibatches > samples:
-            fail(f"--critic-minibatches {self.critic_minibatches} are more than the {samples} samples of a rollout")
+        if self.critic_minibatches > (most := self.samples):
+            fail(f"--critic-minibatches {self.critic_minibatches} are more than the {most} samples of a rollout")
 
 
 Args = TypeVar("Args", bound=Flags)
@@ -207,14 +205,13 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         except (AttributeError, KeyError, TypeError) as error:
             fail(f"{path} is damaged: {error}")
     else:
-        task, args.device = find_task(args.env), distributed.choose_device(args.device)
+        task = find_task(args.env)
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
             args.contact = task.contact
         defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
         if issubclass(task, Imitation):
             defaults.clip = read_clip(task.default_clip)
         args = _cli(kind, argv, defaults)
-        args.device = distributed.choose_device(args.device)
     check_ranges(args)
     (Flags.check if args.evaluate else kind.check)(args)  # no training that was allowed forbids an evaluation
     if path and args.run_dir is None:
@@ -256,7 +253,6 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
         # A preset replaces the saved numbers.
         defaults = dataclasses.replace(defaults, **_presets(dataclasses.replace(defaults, **chosen)))
     args = _cli(kind, argv, defaults)
-    args.device = distributed.choose_device(args.device)
     fixed: Iterable[str] = FIXED + kind.fixed if args.resume else [name for name in hints if name not in EVALUATED]
     may = f"; --evaluate takes {', '.join(map(flag, sorted(EVALUATED & hints.keys())))}" if args.evaluate else ""
     for name in fixed:
@@ -281,6 +277,7 @@ def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
         args.clip = read_clip(args.clip) if isinstance(args.clip, str) else args.clip
     except ValueError as error:
         fail(f"--clip: {error}")
+    args.device = distributed.choose_device(args.device)
     for name in ("resume", "evaluate"):
         if (path := getattr(args, name)) and path.is_dir():
             setattr(args, name, path / "checkpoint.pt")

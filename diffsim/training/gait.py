@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from diffsim.robot.scene import Array, Index, Scene
+from diffsim.robot.contact import contact_bodies, trace
+from diffsim.robot.scene import Array, Scene
 
 EPISODES = 8  # at most as many are measured
 SETTLING = 1.0  # s at the start of an episode that are left out
@@ -18,27 +19,6 @@ END = 0.99  # of half its range, beyond which an action is saturated
 FOOT = "duty", "steps/s", "clearance (m)", "slip (m/s)", "depth (m)"  # docs/running.md says what each is
 ROBOT = "left-right", "diagonal", "action change", "saturated", "cost of transport"
 Gait = dict[str, dict[str, float]]  # those of each foot by its body's name, and of the "robot"
-
-
-def contact_bodies(scene: Scene) -> Index:
-    """(ncontact,) MuJoCo's number of the body of each contact sphere."""
-    return scene.mj_model.dof_bodyid[scene.contact_link + (5 if scene.floating else -1)]  # a link's last dof
-
-
-def trace(scene: Scene, qpos: Array) -> tuple[Array, Array]:
-    """Depth (F, nc) below and slide (F - 1, nc) along the ground of contact spheres' lowest points, m; qpos (F, nq)."""
-    model, data, bodies = scene.mj_model, mujoco.MjData(scene.mj_model), contact_bodies(scene)
-    # A link's frame has the axes of its body and sits at the anchor of its joint.
-    centre = model.jnt_pos[model.body_jntadr[bodies] + model.body_jntnum[bodies] - 1] + scene.contact_position
-    place, turn = np.empty((len(qpos), len(bodies), 3)), np.empty((len(qpos), len(bodies), 3, 3))
-    for k, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        place[k], turn[k] = data.xpos[bodies], data.xmat[bodies].reshape(-1, 3, 3)
-    lowest = centre - scene.contact_radius[:, None] * turn[:, :, 2]  # in the body's frame
-    point = place + np.einsum("fcij,fcj->fci", turn, lowest)
-    moved = place[1:] + np.einsum("fcij,fcj->fci", turn[1:], lowest[:-1]) - point[:-1]
-    return scene.ground_height - point[..., 2], np.linalg.norm(moved[..., :2], axis=-1)
 
 
 def work(scene: Scene, dt: float, qpos: Array, action: Array) -> float:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim.training import distributed
+from diffsim.training.errors import fail
 
 PLAIN: dict[str, Any] = dict(weight_decay=0.0, eps=1e-8, amsgrad=False, maximize=False)  # torch.optim.Adam's defaults
 
@@ -60,7 +61,12 @@ class ClippedAdam:
         nn.utils.vector_to_parameters(vector, self.parameters)
 
     def step(self, loss: Tensor) -> Tensor:
-        """One descent step; returns the gradient's norm () before clipping."""
+        """One descent step; returns the gradient's norm () before clipping.
+
+        Raises ValueError if the loss has no gradient at all, as of a task that leaves torch's graph.
+        """
+        if not loss.requires_grad:
+            fail("the loss has no gradient: observe and reward must be torch operations, without detach and no_grad")
         gradient = distributed.average(self.flatten(torch.autograd.grad(loss, self.parameters)))
         norm = torch.linalg.vector_norm(gradient)
         good = norm < self.skip_norm

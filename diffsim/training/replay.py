@@ -35,10 +35,9 @@ class ReplayBuffer(nn.Module):
         self.count: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def add(self, transitions: Transition) -> None:
-        """Store B transitions; raises ValueError if they are more than the buffer keeps."""
+        """Store B transitions, no more than the buffer keeps."""
         columns = [tensor if tensor.dim() > 1 else tensor.unsqueeze(1) for tensor in transitions]
-        if (number := len(columns[0])) > self.size:
-            raise ValueError(f"{number} transitions at once do not fit into a replay buffer of {self.size}")
+        number = len(columns[0])
         place = (self.count + torch.arange(number, device=self.count.device)) % self.size
         self.rows.index_copy_(0, place, torch.cat(columns, 1))
         self.count += number

@@ -14,8 +14,7 @@ import diffsim
 from diffsim import Clip
 from diffsim.tasks.imitation.tracking import G1Track
 from diffsim.training import SavedPolicy
-
-POLICIES = Path(diffsim.__file__).parent / "policies"
+from diffsim.training.checkpoint import POLICIES
 
 
 class Nothing(nn.Module):

@@ -14,12 +14,11 @@ from common import parse
 from learners import refusal
 from tables import read_csv
 
-import diffsim
 from diffsim.tasks import TASKS
 from diffsim.terrain import uneven
+from diffsim.training.checkpoint import POLICIES
 
 BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
-POLICIES = Path(diffsim.__file__).parent / "policies"
 
 
 def test_errors_are_those_of_means_over_a_second() -> None:

@@ -18,9 +18,9 @@ import diffsim
 from diffsim import Clip, DiffEnv, Integration, read_clip
 from diffsim.tasks import Task
 from diffsim.training import SavedPolicy
+from diffsim.training.checkpoint import POLICIES
 from diffsim.training.evaluation import SEED
 
-POLICIES = Path(diffsim.__file__).parent / "policies"
 PUCK = """
 <mujoco>
   <option gravity="0 0 0"/>

@@ -16,9 +16,9 @@ from torch import Tensor
 import diffsim
 from diffsim import Integration, Simulator
 from diffsim.training import evaluate, load_policy
+from diffsim.training.checkpoint import POLICIES
 from diffsim.training.errors import UsageError
 
-POLICIES = Path(diffsim.__file__).parent / "policies"
 DT = 1 / 60
 
 

@@ -8,70 +8,12 @@ import pytest
 import reference
 from scenes import (
     MUSCLE,
-    SHOULDER,
     free_states,
-    leg_scene,
     parse,
     pendulum,
     robot,
     tendon,
-    without,
 )
-
-
-def test_welded_bodies_are_merged():
-    scene = parse(
-        robot("""
-        <body>
-          <joint axis="0 1 0"/> <inertial pos="1 0 0" mass="1" diaginertia="0.1 0.2 0.25"/>
-          <body pos="0 0 2" quat="0 1 0 0">
-            <inertial pos="3 0 1" mass="3" diaginertia="0.3 0.4 0.5"/>
-            <geom type="sphere" size="0.1" pos="0 1 0"/>
-          </body>
-        </body>""")
-    )
-    assert scene.nlink == 2 and scene.mass[1] == 4
-    # The welded body's centre of mass is (3, 0, 1) in the link's frame, so the two lie (2, 0, 1) apart.
-    np.testing.assert_allclose(scene.com[1], [2.5, 0, 0.75])
-    apart = np.array([2.0, 0.0, 1.0])
-    steiner = 1 * 3 / (1 + 3) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
-    np.testing.assert_allclose(scene.inertia[1], np.diag([0.4, 0.6, 0.75]) + steiner)
-    np.testing.assert_allclose(scene.contact_position, [[0, -1, 2]], atol=1e-15)
-
-
-def test_body_with_several_joints_becomes_links_in_a_row():
-    scene = parse(
-        robot("""
-        <body pos="0 0 3" quat="0.6 0 0.8 0">
-          <joint type="slide" axis="2 0 0" pos="0.1 0.2 0.3"/>
-          <joint type="hinge" axis="0 1 0" pos="0.4 0 0" ref="0.3"/>
-          <geom type="sphere" size="0.1" pos="0 0 1"/>
-          <body pos="1 0 0"> <joint axis="0 0 1"/> <geom type="sphere" size="0.2"/> </body>
-        </body>""")
-    )
-    assert scene.nlink == 4 and not scene.floating
-    np.testing.assert_array_equal(scene.parent, [0, 0, 1, 2])
-    np.testing.assert_array_equal(scene.slide, [False, True, False, False])
-    np.testing.assert_allclose(scene.axis[1:], [[1, 0, 0], [0, 1, 0], [0, 0, 1]], atol=1e-15)
-    np.testing.assert_array_equal(scene.joint_ref, [0, 0, 0.3, 0])
-    np.testing.assert_array_equal(scene.qpos0, [0, 0.3, 0])
-    assert scene.mass[0] == scene.mass[1] == 0 and (scene.mass[2:] > 0).all()
-    np.testing.assert_allclose(scene.position[2:], [[0.3, -0.2, -0.3], [0.6, 0, 0]])
-
-
-def test_ball_joint_becomes_three_links():
-    scene = parse(SHOULDER)
-    np.testing.assert_array_equal(scene.ball, [-1, 0, 1, 2, -1])
-    np.testing.assert_array_equal(scene.parent, [0, 0, 1, 2, 3])
-    np.testing.assert_array_equal(scene.qpos_adr[1:], [0, 1, 2, 4])
-    np.testing.assert_array_equal(scene.axis[1:4], np.eye(3))
-    np.testing.assert_array_equal(scene.mass, [0, 0, 0, 1.5, 1])
-    np.testing.assert_array_equal(scene.armature[1:4], 0.05)
-    np.testing.assert_array_equal(scene.motor_link, [2, 3])
-    np.testing.assert_allclose(scene.gear, [5, -6])
-    np.testing.assert_allclose(scene.motor_bias, [0, -6])
-    assert (scene.nq, scene.nv, scene.nball) == (5, 4, 1)
-    assert scene.features == {"ball", "slide", "stiffness", "damping", "motor"}
 
 
 def test_box_touches_with_its_corners():
@@ -148,39 +90,6 @@ def test_only_what_may_touch_the_ground_touches():
     assert parse(robot(f'<body><geom type="box" size="1 1 1"/>{arm}</body>')).ncontact == 1  # its base is no ground
     drawn = '<geom type="cylinder" size="0.1 0.1" contype="0" conaffinity="0"/>'
     assert parse(pendulum(inside=drawn)).ncontact == 1
-
-
-def test_joint_and_motor_numbers():
-    scene = parse(
-        pendulum(
-            'armature="0.1" damping="0.2" stiffness="0.3" springref="0.4" range="-0.5 0.6" axis="0 3 4"',
-            rest='<actuator><motor joint="hinge" gear="10" ctrlrange="-1 2" ctrllimited="true"/>'
-            '<motor joint="hinge" gear="-3"/></actuator>',
-        )
-    )
-    numbers = [getattr(scene, n)[1] for n in ("armature", "damping", "stiffness", "spring_ref", "lower", "upper")]
-    assert numbers == [0.1, 0.2, 0.3, 0.4, -0.5, 0.6]
-    np.testing.assert_allclose(scene.axis[1], [0, 0.6, 0.8])
-    # ctrl in [-1, 1] over [-1, 2]: 1.5 ctrl + 0.5; an unlimited motor takes it as it is.
-    np.testing.assert_array_equal(scene.motor_link, [1, 1])
-    np.testing.assert_allclose(scene.gear, [15, -3])
-    np.testing.assert_allclose(scene.motor_bias, [5, 0])
-
-
-def test_muscles():
-    """Segments between two links, by pairs of links."""
-    scene = leg_scene()
-    pelvis, thigh, shin = 0, 3, 4
-    np.testing.assert_array_equal(scene.motor_link, [0, 0, shin, 0, 0])
-    np.testing.assert_allclose(scene.gear, [200, 150, 7, 125, 50])
-    np.testing.assert_allclose(scene.motor_bias, [200, 150, 0, 125, 50])  # N, at half the activation
-    pairs = [(pelvis, thigh)] * 3 + [(pelvis, shin)] + [(thigh, shin)] * 4
-    np.testing.assert_array_equal(scene.segment_link, pairs)
-    np.testing.assert_array_equal(scene.segment_muscle, [0, 1, 3, 4, 1, 3, 4, 4])
-    np.testing.assert_allclose(scene.segment_position[3], [[0.05, 0.1, 0.05], [-0.03, 0, -0.05]])
-    assert {"muscle", "ball"} < scene.features
-    bare = without(scene, "muscle")
-    assert bare.features == scene.features - {"muscle"} and bare.nu == 5
 
 
 def test_strength_of_muscles():

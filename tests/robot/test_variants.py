@@ -10,6 +10,7 @@ from scenes import parse
 
 from diffsim import Integration, Scene, SceneError, Simulator, startup
 from diffsim.robot.constraint import constrained
+from diffsim.robot.report import approximations
 
 H = 0.002  # s
 # A sphere in the ground and a driven leg within its limits; a variant fills one of the places.
@@ -165,5 +166,5 @@ def test_a_step_is_mujocos_or_the_file_says_why_not(place: str, text: str) -> No
         data.qpos, data.qvel, data.ctrl = *state, low + 0.65 * (high - low)
         mujoco.mj_step(m, data)
         errors.append(abs(found[k] - data.qvel).max() / (1e-6 + abs(data.qvel - state[1]).max()))
-    rough = [sentence for sentence in scene.approximations if not sentence.startswith("A control of")]
+    rough = [sentence for sentence in approximations(scene) if not sentence.startswith("A control of")]
     assert bool(rough) == (max(errors) > 1e-4)

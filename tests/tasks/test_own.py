@@ -8,15 +8,16 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from learners import ROOT
 from scenes import parse as scene_of
 from torch import Tensor
 
 import diffsim
 from diffsim.tasks import TASKS, Task, TaskError, find_task
-from diffsim.tasks.base import way_forward
+from diffsim.tasks.base import ASSETS, way_forward
 from diffsim.training.evaluation import fitting
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_robot.xml"
+EXAMPLE = ROOT / "examples" / "own_robot.xml"
 TASK = """
 from diffsim.tasks import Task
 
@@ -132,7 +133,7 @@ def test_where_the_file_of_a_robot_is_sought(tmp_path: Path, monkeypatch: pytest
         assert task.load_robot().path == str(folder / "own_robot.xml")
     for folder in (here, there):
         (folder / "hopper.xml").write_text(SLED)
-    hopper = Path(diffsim.__file__).parent / "assets" / "hopper.xml"
+    hopper = ASSETS / "hopper.xml"
     assert TASKS["hopper"].load_robot().path == str(hopper)
     stand = "from diffsim.tasks.hopper import Hopper\nclass Stand(Hopper): pass\n"
     (there / "stand.py").write_text(stand)
@@ -225,6 +226,13 @@ def test_a_task_starts_at_the_keyframe() -> None:
         (dict(reward=lambda self, obs, action: obs[:, 0].log()), "what reward returns for the start is not finite"),
         (dict(observe=lambda self, qpos, qvel, action: qpos / 0), "what observe returns for the start is not finite"),
         (dict(min_height=5.0), "an episode ends where it starts; obs[0] is 0, and min_height is 5.0"),
+        (dict(min_height="low"), "min_height is 'low', must be a number of meters, or None"),
+        (dict(forward_column=99), "forward_column is 99, must be a column of qpos, 0 to 4, or None"),
+        (dict(episode_length=0), "episode_length is 0, must be an integer of at least 1"),
+        (
+            dict(terminated=lambda self, obs: obs[:, 0]),
+            "what terminated returns for two observations is (torch.float32, (2,)), must be (torch.bool, (2,))",
+        ),
         (dict(terminated=lambda self, obs: obs[:, 0] == 0), "an episode ends where it starts; obs[0] is 0"),
     ],
 )  # fmt: skip
@@ -243,6 +251,9 @@ def test_what_is_missing_or_misspelt_is_named() -> None:
 
     assert refused(episode_lenght=5) == "task 'wrong' has 'episode_lenght': is 'episode_length' meant?"
     assert refused(terminate=lambda self, obs: obs) == "task 'wrong' has 'terminate': is 'terminated' meant?"
+    nested = type("Nested", (Bare,), {"name": "a/b"})
+    with pytest.raises(TaskError, match="name is 'a/b', must be the name of a folder, without a slash"):
+        diffsim.DiffEnv(nested(), scene_of(EXAMPLE.read_text()), 1)
     assert refused(ground=0.1) == "task 'wrong' has 'ground', which is the terrain: give it another name"
     assert refused(reward=Task.reward) == "task 'wrong' has no method 'reward'"
     assert refused(observe=Task.observe) == "task 'wrong' has no method 'observe'"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,12 +10,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-import diffsim.tasks
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks import TASKS
+from diffsim.tasks.base import ASSETS
 
 Array = NDArray[np.float64]
-ASSETS = Path(diffsim.tasks.__file__).parent.parent / "assets"
 
 # What a robot is, and the sum of it: each number's logarithm with a weight of its own
 FIELDS = """body_pos body_quat body_mass body_ipos body_inertia jnt_type jnt_axis jnt_range jnt_stiffness dof_damping

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import ranks
 import torch
-from learners import ROOT, SCRIPTS, assert_same, refusal, run
+from learners import PATH, SCRIPTS, assert_same, refusal, run
 
 import shac
 from diffsim.env import DiffEnv
@@ -32,8 +32,7 @@ def directory(tmp_path_factory):
     """Of the runs of two ranks."""
     directory = tmp_path_factory.mktemp("ranks")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", ranks.__file__]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    subprocess.run([*command, str(directory), *SETTING], env=environment, check=True, timeout=300)
+    subprocess.run([*command, str(directory), *SETTING], env=os.environ | PATH, check=True, timeout=300)
     return directory
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import get_type_hints
 
+import numpy as np
 import pytest
 import torch
 from learners import SCRIPTS, assert_refuses, refusal
@@ -18,12 +19,14 @@ import bptt
 import diffsim
 import gps
 import mbpo
+import pfpn
 import pfpn_sac
 import pods
 import ppo_baseline
 import sac_baseline
 import sapo
 import shac
+from diffsim.terrain import uneven
 from diffsim.training import checkpoint, errors, flags, parse, ranges
 from diffsim.training.evaluation import make_env
 
@@ -88,16 +91,17 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant, humanoid"),
         ("--env walker --accuracy fast", "task 'walker' has no preset 'fast' on soft contact; choose from default"),
         ("--env cartpole --rough 10", "cartpole touches no ground, so it has no terrain"),
+        ("--env ant --clip humanoid_run", "task 'ant' tracks no clip; humanoid_imitation, g1_track do"),
+        ("--env humanoid_imitation --clip nowhere", "--clip: no such clip: nowhere"),
         ("--env walker --rough 50", "--rough must be from 0 to 45, not 50.0"),
         ("--substeps 5 --integrator extrapolated", "substeps is 5, must be even"),
+        ("--contact mujoco --integrator implicit", "--integrator implicit is for --contact soft, and the contact"),
         ("--device nonsense", "nonsense"),
         ("--device cuda", "device 'cuda' asked for, but PyTorch sees 0 CUDA GPUs here; choose cpu"),
         ("--run-dir {file}", "cannot write to run directory {file}: Not a directory"),
         ("--run-dir {file}/deeper", "cannot write to run directory {file}/deeper: Not a directory"),
         (f"--run-dir {300 * 'a'}", "File name too long"),
         ("--run-dir {trained}", "{trained} holds another run's checkpoint.pt"),
-        ("--resume {file}.pt", "no such checkpoint: {file}.pt"),
-        ("--evaluate {file}", "{file} is not a complete checkpoint of shac.py"),
         ("--evaluate {other}", "{other} is a checkpoint of 'other', not of shac.py"),
         ("--resume {elsewhere} --device cpu --iterations 9", "{elsewhere} was trained on cuda:0, which cpu cannot"),
         ("--evaluate {trained}/checkpoint.pt --run-dir {file}", "cannot write to run directory {file}"),
@@ -117,6 +121,48 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp_path, capsys):
     assert_refuses(shac, arguments, message, tiny_run, tmp_path, capsys)
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "message"),
+    [
+        (
+            sapo,
+            "--env cartpole --num-envs 10 --population 4",
+            "--num-envs 10 cannot be split evenly among --pop",
+        ),
+        *((x, "--env humanoid_imitation", "depends on the past, which planned states do not") for x in (gps, pods)),
+        (mbpo, "--env humanoid_imitation --sample-enhance 4", "do not hold the past, on which humanoid_imitation"),
+        (pods, "--env ant", "ant ends episodes early, and all sequences have one length: give --no-early-termination"),
+        (pods, "--env hopper --order 2", "hopper ends episodes early"),
+        (pods, "--env cartpole --horizon 100", "--horizon 100 does not divide the 240 control steps of an episode"),
+        (pfpn, "--particles 1", "--particles must be from 2 to 1,000, not 1"),
+        (pfpn, "--lr-bounds 1e-2 1e-3", "must be two numbers, the first not above the second, not (0.01, 0.001)"),
+        *((pfpn, f"--initial-log-std {x}", f"--initial-log-std must be from -5 to 2, not {x}") for x in ("nan", "2.5")),
+        (pfpn_sac, "--buffer-size 10", "--buffer-size 10 is smaller than a rollout of 4096 steps"),
+        (sac_baseline, "--seed-steps 640 --iterations 20", "640 leave no update in --iterations 20: at most 639"),
+        (sac_baseline, "--actor-updates 2", "--actor-updates 2 are more than --updates-per-step 1"),
+        (sac_baseline, "--critics 2 --critic-subset 3", "--critic-subset 3 is larger than --critics 2"),
+        (sac_baseline, "--buffer-size 10", "--buffer-size 10 holds no iteration of 32 steps of 128"),
+        (sac_baseline, "--tau 2", "--tau must be in [0, 1]"),
+        (mbpo, "--seed-steps 64 --iterations 4", "--seed-steps 64 leave no update in --iterations 4: at most 63"),
+        (mbpo, "--models 1 --elites 1", "--models must be from 2 to 1,000, not 1"),
+        (mbpo, "--elites 8", "--elites 8 are more than --models 7"),
+        (mbpo, "--num-envs 1", "--num-envs must be at least 2: one environment is held out"),
+        (mbpo, "--rollout-lengths 3 2", "--rollout-lengths 3 2: the first must not exceed the second"),
+        (mbpo, "--buffer-size 10", "--buffer-size 10 is less than the 64 transitions of a step"),
+        (mbpo, "--sample-enhance 1 --randomise mass=0.9:1.1", "--sample-enhance takes Jacobians of one robot"),
+        (
+            mbpo,
+            "--sample-enhance 1 --rough 5",
+            "takes Jacobians of a robot on a plane: leave out --rough",
+        ),
+    ],
+)
+def test_flags_of_a_learner_that_do_not_go_together_are_one_line(script, arguments, message, tmp_path, capsys):
+    words = arguments.split() if "--env" in arguments else ["--env", "ant", *arguments.split()]
+    assert message in refusal(lambda: script.main(words), capsys)
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_tyro_cannot_parse_is_told_without_boxes_and_colours(tiny_run, tmp_path, monkeypatch, capsys):
@@ -224,6 +270,11 @@ def test_accuracy_is_stored_and_can_be_replaced():
         assert numbers(*words) == (accurate.integrator, accurate.substeps, accurate.theta)
     assert numbers("--accuracy", "accurate", "--substeps", "2") == (accurate.integrator, 2, accurate.theta)
     assert numbers("--substeps", "16", "--integrator", "semi_implicit") == ("semi_implicit", 16, 0.0)
+
+
+def test_rough_ground_is_as_steep_as_the_flag():
+    args = parse(shac.Args, "--env hopper --device cpu --rough 12".split())
+    np.testing.assert_array_equal(make_env(args, 3, seed=5).scene.terrain, uneven(12.0, 3, 5))
 
 
 def test_what_a_checkpoint_decides(capsys):

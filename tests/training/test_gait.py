@@ -11,12 +11,12 @@ import pytest
 from learners import SCRIPTS
 from numpy.typing import NDArray
 
-import diffsim
 from diffsim import Scene, load_scene
+from diffsim.tasks.base import ASSETS
 from diffsim.training import evaluation, gait
+from diffsim.training.checkpoint import POLICIES
 
 Array = NDArray[np.float64]
-PACKAGE = Path(diffsim.__file__).parent
 DT, STRIDE = 0.01, 50  # s, frames
 SETTLED = round(gait.SETTLING / DT)
 
@@ -122,13 +122,13 @@ def test_only_what_lies_between_the_first_second_and_the_end_counts(biped: Scene
 
 
 def test_a_robot_without_ground_has_no_gait() -> None:
-    scene = load_scene(PACKAGE / "assets" / "cartpole.xml")
+    scene = load_scene(ASSETS / "cartpole.xml")
     assert measured(scene, np.tile(scene.qpos0, (300, 1))) == {}
 
 
 @pytest.mark.parametrize("name", ["half_cheetah", "humanoid", "humanoid_mtu"])
 def test_depth_is_that_of_mujocos_contacts(name: str, rng: np.random.Generator) -> None:
-    scene = load_scene(PACKAGE / "assets" / f"{name}.xml")
+    scene = load_scene(ASSETS / f"{name}.xml")
     model, data = scene.mj_model, mujoco.MjData(scene.mj_model)
     bodies, compared = gait.contact_bodies(scene), 0
     for _ in range(20):
@@ -149,7 +149,7 @@ def test_depth_is_that_of_mujocos_contacts(name: str, rng: np.random.Generator) 
 
 
 def test_an_evaluation_reports_the_gait(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = str(PACKAGE / "policies" / "ant.pt")
+    path = str(POLICIES / "ant.pt")
     flags = f"--evaluate {path} --eval-episodes 2 --integrator semi_implicit --device cpu --run-dir {tmp_path}"
     SCRIPTS["sapo"].main(flags.split())
     returns, _, *table = capsys.readouterr().out.splitlines()

@@ -10,15 +10,6 @@ from diffsim.training import graph
 from diffsim.training.evaluation import Player
 
 
-def test_on_a_cpu_there_is_nothing_to_capture() -> None:
-    def function() -> int:
-        return 1
-
-    assert graph.capture(function, "cpu") is function
-    assert graph.capture(function, torch.device("cpu"), diffsim.make("cartpole", num_envs=1)) is function
-    graph.release()
-
-
 def windows(name: str, captured: bool, poison: int | None = None, adjoint_clip: float = 0.0) -> list[torch.Tensor]:
     """Rewards, their gradient and the state of six windows; one environment is thrown out of the finite numbers."""
     torch.manual_seed(0)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 import diffsim
 import sapo
 import shac
-from diffsim.tasks import TASKS, Task
+from diffsim.tasks import TASKS
 from diffsim.tasks.mirror import Mirror, Reflection
 from diffsim.training import ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
@@ -170,8 +170,3 @@ def test_what_the_actor_sees_needs_its_own_image(capsys: pytest.CaptureFixture[s
     x = torch.randn(5, 3)
     expected = (f(x) + swap(f(swap(x)))) / 2
     torch.testing.assert_close(folded(seeing(None, f, mirror), swap)(x), expected)
-
-
-def test_without_a_mirror_nothing_changes() -> None:
-    network = nn.Sequential(nn.Linear(2, 1))
-    assert [*folded(seeing(None, network), None)] == [*network] and Task.symmetric is False

@@ -14,25 +14,24 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from learners import refusal
+from learners import PATH, refusal
 
 import diffsim
 from diffsim import __main__ as command
 from diffsim import startup
 from diffsim.robot.mjcf import load_scene
 from diffsim.tasks import Ant
+from diffsim.tasks.base import ASSETS
 from diffsim.terrain import step
 from diffsim.training import load_policy, make_policy_env
 from diffsim.view import drive
 from diffsim.view.drive import Handler, Pilot, Server, Stage, Wish
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGE = b"<p>the page</p><script>act()</script>"
 
 
@@ -153,7 +152,7 @@ def test_a_turned_robot_looks_the_same_to_itself(rng):
     """What the ant's task observes does not depend on where its way leads, if state and way turn alike."""
     task = Ant(dtype=torch.float64)
     task._target = torch.tensor([1e12, 0.0], dtype=torch.float64)  # else the way turns a little as the robot moves
-    scene = load_scene(ROOT / "diffsim" / "assets" / "ant.xml")
+    scene = load_scene(ASSETS / "ant.xml")
     qpos, qvel = (torch.tensor(rng.normal(size=(5, n))) for n in (scene.nq, scene.nv))
     qpos[:, 3:7] /= qpos[:, 3:7].norm(dim=1, keepdim=True)
     there = drive.turned(0.7, qpos, qvel)
@@ -247,15 +246,14 @@ def test_the_ant_turns_to_where_it_is_sent():
     ],
 )
 def test_mistakes_are_one_line(arguments, message, stage, capsys):
-    names = {"go2": str(ROOT / "diffsim" / "policies" / "go2.pt"), "taken": stage[1]}
+    names = {"go2": str(command.shipped("go2")), "taken": stage[1]}
     assert message.format(**names) in refusal(lambda: command.main(arguments.format(**names).split()), capsys)
 
 
 @pytest.mark.slow
 def test_a_browser_drives(browser):
-    path = os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
     words = [sys.executable, "-m", "diffsim", "drive", "go2", "--port", "0"]
-    options = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path})
+    options = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | PATH)
     driven = subprocess.Popen(words, **options)
     try:
         assert driven.stdout and driven.stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,12 +12,11 @@ import mujoco
 import numpy as np
 import pytest
 
-import diffsim
 from diffsim import terrain
 from diffsim.robot.mjcf import load_scene
+from diffsim.tasks.base import ASSETS
 from diffsim.view import render, web
 
-ASSETS = Path(diffsim.__file__).parent / "assets"
 TETRA = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]) / 4
 MESHES = f"""<mujoco>
   <asset>

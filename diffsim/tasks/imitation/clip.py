@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from importlib.resources import files
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -15,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from diffsim.tasks.base import ASSETS
 from diffsim.tasks.imitation.kinematics import difference
 
 CONTROL_DT = 1 / 60  # s
@@ -113,8 +113,7 @@ class Clip:
 
 def shipped() -> dict[str, Path]:
     """The files of the clips that are part of the package, by name."""
-    folder = Path(str(files("diffsim") / "assets" / "clips"))
-    return {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    return {path.stem: path for path in sorted((ASSETS / "clips").glob("*.npz"))}
 
 
 def read_clip(source: str | Path) -> Clip:

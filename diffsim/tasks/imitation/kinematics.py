@@ -34,12 +34,12 @@ def matrix(quat: Tensor) -> Tensor:
 
 
 class Kinematics:
-    """Of a robot with a free root and hinges at their bodies' origins, as ant and humanoid; else raises ValueError."""
+    """Of a robot with a free root and, on each other body, hinges at its origin, as ant; else raises ValueError."""
 
     def __init__(self, model: mujoco.MjModel, device: torch.device | str, dtype: torch.dtype) -> None:
-        free, *others = model.jnt_type
-        if free != FREE or model.nbody < 2 or any(kind != HINGE for kind in others) or np.any(model.jnt_pos):
-            raise ValueError("forward kinematics needs a free root and hinges at the origins of their bodies")
+        free, others = model.jnt_type[0], model.jnt_type[1:]
+        if free != FREE or any(others != HINGE) or np.any(model.jnt_pos) or not model.body_jntnum[1:].all():
+            raise ValueError("forward kinematics needs a free root and hinges at the origins of the other bodies")
 
         def tensor(values: object) -> Tensor:
             return torch.tensor(np.array(values), device=device, dtype=dtype)
@@ -51,9 +51,6 @@ class Kinematics:
         self.parents, self._count = model.body_parentid.tolist(), model.nbody
         first = [adr - 1 for adr in model.body_jntadr.tolist()]  # among the hinges
         self._hinges = [range(adr, adr + n) for adr, n in zip(first, model.body_jntnum.tolist(), strict=True)]
-        for body in range(2, model.nbody):
-            if not self._hinges[body]:
-                raise ValueError(f"body {model.body(body).name!r} has no joint")
         at = torch.eye(3, device=device, dtype=dtype).repeat(len(axes), 1, 1)
         at[first[2:]] = own[2:]
         self._turns = at, at @ cross, at @ cross @ cross

@@ -49,9 +49,6 @@ class Imitation(Task):
         step = self.first_step(rand)
         return self._qpos[step], self._qvel[step]
 
-    def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
-        raise ValueError(f"an observation of task {self.name!r} depends on the time: use observe_with")
-
 
 class HumanoidImitation(Imitation):
     """The robot of the humanoid task. The reference is at frame `step` of the clip, which goes round if it is a loop.

@@ -10,14 +10,16 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from diffsim.robot.contact import trace
 from diffsim.robot.mjcf import load_scene
-from diffsim.robot.scene import Scene
+from diffsim.robot.scene import Array, Scene
 from diffsim.tasks.base import Contact
 from diffsim.tasks.imitation.clip import FASTEST, Clip
-from diffsim.tasks.imitation.kinematics import Kinematics, difference
+from diffsim.tasks.imitation.kinematics import difference
 from diffsim.tasks.imitation.task import STRAY, Imitation, draw
 from diffsim.tasks.locomotion import push, rotate, score
 from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
@@ -28,24 +30,14 @@ STANDING = 0.05  # share of a clip's frames in which a foot may be in the ground
 REACH = 0.4  # rad, by how much an action changes a servo's target: its range is the clip's and so much to both sides
 BEFORE_END = 60  # frames, at least, that an episode has of its clip, if this is longer
 AHEAD = 3  # frames, how much earlier the reference is seen
-SLIPPING = 2.5  # recorded feet slip less than a fourth of what they seem to with another order of the quaternion
+SLIPPING = 2.5  # recorded feet slip less than a third of what they seem to with another order of the quaternion
 STILL = 0.01  # m/s of the feet, below which a clip may stand still in any order
 TURNED = 1.0  # rad; the episode ends when the root is turned from the reference's by more
 
 
-def soles(scene: Scene, kinematics: Kinematics, qpos: Tensor) -> Tensor:
-    """(T, points, 3) m, where the robot's points of contact are with qpos (T, nq)."""
-    positions, rotations = kinematics(qpos)
-    link, point = torch.from_numpy(scene.contact_link).long(), torch.from_numpy(scene.contact_position)
-    places = positions[:, link] + (rotations[:, link] * point.unsqueeze(-2)).sum(-1)
-    return places - torch.from_numpy(scene.contact_radius).unsqueeze(-1) * places.new_tensor((0.0, 0.0, 1.0))
-
-
-def slip(points: Tensor) -> float:
-    """The median way [m] that the lowest of the points (T, points, 3) goes in a frame: one that bears the robot stays
-    where it is."""
-    lowest = points[:-1, :, 2:].argmin(1, keepdim=True).expand(-1, -1, 3)
-    return float(points.diff(dim=0).gather(1, lowest).norm(dim=-1).median())
+def slip(depth: Array, slide: Array) -> float:
+    """The median slide [m] of the deepest point in a frame, see `trace`: one that bears the robot stays where it is."""
+    return float(np.median(np.take_along_axis(slide, depth[:-1].argmax(1)[:, None], 1)))
 
 
 class Tracking(Imitation):
@@ -84,8 +76,7 @@ class Tracking(Imitation):
     ) -> None:
         super().__init__(device, dtype, clip)
         scene = self.load_robot()
-        kinematics = Kinematics(scene.mj_model, "cpu", torch.float64)
-        parts = [self._prepare(motion, scene, kinematics) for motion in self.clip.motions()]
+        parts = [self._prepare(motion, scene) for motion in self.clip.motions()]
         frames = torch.tensor([len(part.qpos) for part in parts], device="cpu")
         ends = frames.cumsum(0) - 1
         qvel = torch.cat([part.velocity(self.control_dt) for part in parts])
@@ -102,7 +93,7 @@ class Tracking(Imitation):
             torch.tensor(bound, device=device, dtype=dtype) for bound in self._scene.mj_model.actuator_ctrlrange.T
         )
 
-    def _prepare(self, motion: Clip, scene: Scene, kinematics: Kinematics) -> Clip:
+    def _prepare(self, motion: Clip, scene: Scene) -> Clip:
         """A motion at the rate of control, smoothed, from above the origin on, with its feet on the ground."""
         motion.check(scene.mj_model)
         found = motion.smoothed(SMOOTH).at(self.control_dt)
@@ -119,14 +110,14 @@ class Tracking(Imitation):
             raise ValueError(f"clip {motion}: {which}, more than a motor's {FASTEST:g}; is it played too fast?")
         root, quat, joints = found.qpos.split((3, 4, self.joints), dim=1)
         shifts = {0: "", 1: "xyzw, but is read as wxyz", -1: "wxyz, but is read as xyzw"}
-        points = {k: soles(scene, kinematics, torch.cat((root, quat.roll(k, 1), joints), 1)) for k in shifts}
-        slips = {k: slip(each) / self.control_dt for k, each in points.items()}
+        feet = {k: trace(scene, torch.cat((root, quat.roll(k, 1), joints), 1).numpy()) for k in shifts}
+        slips = {k: slip(*each) / self.control_dt for k, each in feet.items()}
         best = min(slips, key=slips.__getitem__)
         if slips[0] > max(SLIPPING * slips[best], STILL):
             raise ValueError(
                 f"clip {motion}: feet slip by {slips[0]:.2g} m/s; the root's quaternion seems to be {shifts[best]}"
             )
-        found.qpos[:, :3] -= torch.stack((*root[0, :2], points[0][..., 2].amin(1).quantile(STANDING)))
+        found.qpos[:, :3] -= torch.stack((*root[0, :2], torch.from_numpy(-feet[0][0].max(1)).quantile(STANDING)))
         return found
 
     def _within_reach(self, scene: Scene) -> Scene:
@@ -187,7 +178,8 @@ class Tracking(Imitation):
         return self._qpos[step], self._qvel[step]
 
     def ghost(self, memory: Tensor) -> Tensor:
-        return self.reference(memory)[0]
+        qpos = self.reference(memory)[0]
+        return qpos if self.ground is None else self.ground.lift(qpos)
 
     def metadata(self) -> dict[str, str]:
         """See Task; the frames of reference_qpos are so many control steps ahead."""

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import ModuleType
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from learners import refusal
 from scenes import task_scene
 from torch import Tensor
 
 import diffsim
-import gps
-import mbpo
-import pods
 import ppo_baseline
 import shac
 from diffsim import Clip, read_clip
@@ -340,20 +335,6 @@ def test_checkpoints_hold_the_clip(tmp_path: Path) -> None:
     assert other.clip == read_clip("humanoid_run")
 
 
-def test_flags(capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_a_task_that_tracks_has_a_clip() -> None:
     assert parse(shac.Args, ["--env", "humanoid_imitation"]).clip == read_clip("humanoid_run")
     assert parse(shac.Args, ["--env", "humanoid"]).clip is None
-    line = refusal(lambda: parse(shac.Args, ["--env", "ant", "--clip", "humanoid_run"]), capsys)
-    assert line.endswith("--clip is for humanoid_imitation, g1_track: ant tracks no motion")
-    line = refusal(lambda: parse(shac.Args, ["--env", "humanoid_imitation", "--clip", "nowhere"]), capsys)
-    assert "--clip: no such clip: nowhere" in line
-
-
-@pytest.mark.parametrize(("script", "flags"), [(gps, ""), (pods, ""), (mbpo, "--sample-enhance 4")])
-def test_planners_refuse_what_depends_on_the_time(
-    script: ModuleType, flags: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = refusal(lambda: parse(script.Args, ["--env", "humanoid_imitation", *flags.split()]), capsys)
-    assert "depend" in line and "humanoid_imitation" in line
-    with pytest.raises(ValueError, match="depends on the time: use observe_with"):
-        HumanoidImitation().observe(torch.zeros(1, NQ), torch.zeros(1, NV), torch.zeros(1, NU))
