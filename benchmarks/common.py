@@ -188,7 +188,7 @@ def parse(kind: type[F], description: str | None, argv: Sequence[str] | None = N
         fail("--output and --update-results exclude each other")
     args.device = choose_device(args.device)
     try:
-        check_device("cpu" if args.draw_only else args.device)
+        check_device(args.device)
     except ValueError as error:
         fail(error)
     if args.update_results and (found := tables.unknown(tables.origin(args.device))):

@@ -11,18 +11,22 @@ from common import RESULTS, ROOT
 from gps_variants import VariantArgs
 from tables import read_csv
 
+import mbpo
 import pfpn
 import pfpn_sac
 import ppo_baseline
+import sac_baseline
 import sapo
 import shac
 from diffsim.training import parse
 
 SCRIPTS = {
     "benchmarks/gps_variants": VariantArgs,
+    "mbpo": mbpo.Args,
     "pfpn": pfpn.Args,
     "pfpn_sac": pfpn_sac.Args,
     "ppo_baseline": ppo_baseline.Args,
+    "sac_baseline": sac_baseline.Args,
     "shac": shac.Args,
     "sapo": sapo.Args,
 }
