@@ -140,6 +140,8 @@ def make(
     scene = task.scene()
     asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance, touchdown=touchdown)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
+    if contact == "mujoco" and not integration.constrained:
+        raise ValueError(f"integrator {integrator!r} is for soft contact, but the contact is mujoco")
     if penalty and integration.constrained:
         raise ValueError("penalty sets constants of the penalty law, but the contact is mujoco")
     scene = scene.with_penalty(penalty or {})

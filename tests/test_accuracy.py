@@ -70,6 +70,8 @@ def test_arguments_override_the_preset():
     wrong |= {"'faster' on soft contact; .*fast, accurate, default": dict(accuracy="faster")}
     wrong |= {"'fast' on mujoco contact; .*default, accurate": dict(accuracy="fast", contact="mujoco")}
     wrong |= {"unknown contact 'hard'; choose from soft, mujoco": dict(contact="hard")}
+    contradicting = dict(contact="mujoco", integrator="implicit")
+    wrong |= {"integrator 'implicit' is for soft contact, but the contact is mujoco": contradicting}
     for message, arguments in wrong.items():
         with pytest.raises(ValueError, match=message):
             diffsim.make("hopper", 1, **arguments)
