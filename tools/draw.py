@@ -336,7 +336,7 @@ def bars() -> None:
             first.bar(at, middle, 0.18, yerr=(middle - low, high - middle), capsize=2, color=colour, label=learner)
             second.bar(at, [max(bar.total, bar.training) for bar in own], 0.18, color=colour, alpha=0.4)
             second.bar(at, [bar.training for bar in own], 0.18, color=colour, label=learner)
-        labels = "return, median and range", "measured seconds\nof training; light: total"
+        labels = "return, median and range", "seconds of training;\nlight: total"
         for panel, text in zip((first, second), labels, strict=True):
             panel.set_ylabel(text, fontsize=9)
             panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8, va="top")
