@@ -32,8 +32,8 @@ def load_demonstration(system: System, path: Path, steps: int) -> list[tuple[Ten
             arrays = {name: file[name] for name in ("qpos", "qvel", "action")}
             control_dt = float(file["control_dt"]) if "control_dt" in file else PERIOD
     except Exception as error:  # zipfile and numpy raise whatever broken bytes lead them to
-        why = " ".join(str(error).split())
-        raise ValueError(f"{path} is not an .npz with qpos, qvel and action: {why}") from error
+        why = f": {error.args[0]}" if isinstance(error, KeyError) else ""  # others advise to load what is no data
+        raise ValueError(f"{path} is not an .npz with qpos, qvel and action{why}") from error
     if not math.isclose(control_dt, system.control_dt, rel_tol=1e-6):
         raise ValueError(f"{path} has control steps of {control_dt:.4g} s, not of {system.control_dt:.4g} s")
     parts, sizes = [], {"qpos": (steps + 1, system.nq), "qvel": (steps + 1, system.nv), "action": (steps, system.nu)}

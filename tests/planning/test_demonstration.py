@@ -50,7 +50,7 @@ def test_several_trajectories_in_one_file(tmp_path: Path, rng: np.random.Generat
         ({"qpos": np.full((20, 2), np.nan)}, "qpos holds numbers that are not finite"),
         ({"qpos": np.full((20, 2), 1j)}, r"qpos has shape \(20, 2\) of complex128"),
         ({"control_dt": np.array([0.02, 0.02])}, "is not an .npz with qpos, qvel and action"),
-        ({"action": np.array(["a"], dtype=object)}, "is not an .npz with qpos, qvel and action"),
+        ({"action": np.array(["a"], dtype=object)}, "is not an .npz with qpos, qvel and action$"),
     ],
 )
 def test_refusals(changes: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
