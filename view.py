@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +56,8 @@ class Args:
 @command
 def main(argv: Sequence[str] | None = None) -> None:
     with in_one_line(argv):
-        args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
+        options, name = (tyro.conf.FlagCreatePairsOff,), Path(sys.argv[0]).name
+        args = tyro.cli(Args, prog=name, args=argv, description=__doc__, config=options)
     args.check()
     torch.set_num_threads(1)  # operations this small gain nothing from more
     try:

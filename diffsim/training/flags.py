@@ -14,6 +14,7 @@ import tyro
 from diffsim.sim.integration import PASSES, TOLERANCE
 from diffsim.tasks import FILE, TASKS, Accuracy, Contact, Imitation, Task, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
+from diffsim.terrain import STEEPEST
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, in_one_line
 from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Range, Repeats, check_ranges, flag
@@ -36,7 +37,7 @@ EVALUATED = OPTIONS - {"control_dt"} | {
     *"accuracy device eval_episodes evaluate finer quiet rough run_dir threads".split()
 }
 ENV = f"task: {', '.join(TASKS)}, or a file of your own, my_task.py or my_task.py:Class (docs/own_robot.md)"
-Slope = Annotated[float, Range("from 0 to 45", lambda degrees: 0 <= degrees <= 45)]
+Slope = Annotated[float, Range(f"from 0 to {STEEPEST:g}", lambda degrees: 0 <= degrees <= STEEPEST)]
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -272,7 +273,8 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
 
 def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
     with in_one_line(argv):
-        args = tyro.cli(kind, args=argv, default=defaults, description=sys.modules[kind.__module__].__doc__)
+        about = sys.modules[kind.__module__].__doc__
+        args = tyro.cli(kind, prog=Path(sys.argv[0]).name, args=argv, default=defaults, description=about)
     try:
         args.clip = read_clip(args.clip) if isinstance(args.clip, str) else args.clip
     except ValueError as error:

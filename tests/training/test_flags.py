@@ -26,6 +26,7 @@ import ppo_baseline
 import sac_baseline
 import sapo
 import shac
+import view
 from diffsim.terrain import uneven
 from diffsim.training import checkpoint, errors, flags, parse, ranges
 from diffsim.training.evaluation import make_env
@@ -174,6 +175,12 @@ def test_what_tyro_cannot_parse_is_told_without_boxes_and_colours(tiny_run, tmp_
         assert refusal(lambda: parse(shac.Args, ["--gamma"]), capsys).startswith(message)
         for word in ("x" * 300, "a," * 90, "-----", "a-----b"):
             assert f" {word}" in refusal(lambda word=word: parse(shac.Args, ["--seeds", word]), capsys)
+
+
+@pytest.mark.parametrize("script", [shac, view], ids=["shac", "view"])
+def test_help_names_the_script_without_its_folder(script, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["/a/folder/script.py"])  # as `diffsim train` and `diffsim view` start it
+    assert help_of(script, capsys).startswith("usage: script.py [-h]")
 
 
 def test_tyros_help_has_the_terminals_width_and_its_warnings_are_told(monkeypatch, capsys):
