@@ -23,7 +23,7 @@ from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, TaskError, find_task
 from diffsim.tasks.imitation.clip import Clip, read_clip
-from diffsim.terrain import uneven
+from diffsim.terrain import STEEPEST, uneven
 
 __all__ = [
     "TASKS",
@@ -99,7 +99,7 @@ def make(
             clip of the package.
         terrain: replaces the plane z = 0: vertices (x, z) [m] of one profile, (K, 2), or of one for each environment,
             (N, K, 2), see Scene.with_terrain and diffsim.terrain. The task then measures heights from the ground below
-            the root. A number: the steepest slope [degrees] of `uneven` ground, which the seed draws.
+            the root. A number from 0 to 45: the steepest slope [degrees] of `uneven` ground; the seed draws it.
         control_dt: seconds of a control step. Default: the task's.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task reports a fall.
@@ -140,12 +140,14 @@ def make(
     scene = task.scene()
     asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance, touchdown=touchdown)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
-    if contact == "mujoco" and not integration.constrained:
+    if contact == "mujoco" and not integration.check().constrained:
         raise ValueError(f"integrator {integrator!r} is for soft contact, but the contact is mujoco")
     if penalty and integration.constrained:
         raise ValueError("penalty sets constants of the penalty law, but the contact is mujoco")
     scene = scene.with_penalty(penalty or {})
     if is_real(terrain):
+        if not 0 <= terrain <= STEEPEST:
+            raise ValueError(f"terrain is {terrain!r}, must be from 0 to {STEEPEST:g} degrees, or profiles")
         count = check_count("num_envs", num_envs)
         terrain = uneven(float(terrain), count, 0 if seed is None else check_seed(seed))
     scene = scene if terrain is None else scene.with_terrain(terrain)

@@ -20,6 +20,7 @@ from torch import Tensor
 from diffsim.robot.scene import Array, Scene
 
 MOST_SEGMENTS = 10_000  # of rough ground
+STEEPEST = 45.0  # degrees, of uneven ground that robots are put on
 SEGMENT, LENGTH, LEVEL = 0.4, 30.0, 0.5  # m, of uneven ground: its segments, its sides, its level middle
 
 

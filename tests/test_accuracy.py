@@ -72,6 +72,7 @@ def test_arguments_override_the_preset():
     wrong |= {"unknown contact 'hard'; choose from soft, mujoco": dict(contact="hard")}
     contradicting = dict(contact="mujoco", integrator="implicit")
     wrong |= {"integrator 'implicit' is for soft contact, but the contact is mujoco": contradicting}
+    wrong |= {"unknown integrator 'explicit'; choose from": dict(contact="mujoco", integrator="explicit")}
     for message, arguments in wrong.items():
         with pytest.raises(ValueError, match=message):
             diffsim.make("hopper", 1, **arguments)

@@ -207,6 +207,10 @@ def test_environment_that_blows_up_is_reset_and_counted(name):
             for x in (None, "extrapolated", "mujoco")
         ),
         ("passes is 0, must be an integer of at least 1", dict(passes=0)),
+        *(
+            (f"terrain is {x}, must be from 0 to 45 degrees", dict(name="hopper", terrain=x))
+            for x in (45.5, -1, np.nan)
+        ),
         ("penalty constant mu is 'a'", dict(name="hopper", penalty={"mu": "a"})),
         (r"penalty constant k_n is 1e\+39", dict(name="hopper", penalty={"k_n": 1e39})),  # infinite in the kernels
         *(("control_dt is", dict(control_dt=x)) for x in (0.0, -1.0, np.nan, np.inf, "a")),

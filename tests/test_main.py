@@ -112,6 +112,7 @@ def test_an_export_is_the_policy_alone(trained, tmp_path, capsys):
     command.main(["export", str(tmp_path / "other.pt"), str(small)])
     assert (after.simulator, load_policy(small).simulator) == ("diffsim", "another")
     assert "trained on cartpole, not on ant" in refusal(lambda: before.task("ant"), capsys)
+    assert before.task("my_cart.py") == "my_cart.py"  # what a user names is a user's to name
     assert "holds only a policy" in refusal(lambda: shac.main(["--resume", str(small)]), capsys)
 
 

@@ -7,6 +7,7 @@ al. 2022, appendix A.3); what it leaves open (start states, substeps) follows it
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Mapping
@@ -169,15 +170,17 @@ class Task:
 
     def _check_attributes(self, nq: int) -> None:
         """That those can be used which would otherwise fail when a run has begun."""
-        length, column = self.episode_length, self.forward_column
-        for name, fits, allowed in (
-            ("name", Path(self.name).name == self.name != "", "the name of a folder, without a slash"),
-            ("episode_length", isinstance(length, Integral) and length >= 1, "an integer of at least 1"),
-            ("min_height", self.min_height is None or is_real(self.min_height), "a number of meters, or None"),
-            ("forward_column", column in (None, *range(nq)), f"a column of qpos, 0 to {nq - 1}, or None"),
+        name, length, height, column = self.name, self.episode_length, self.min_height, self.forward_column
+        whole, numbered = (isinstance(value, Integral) and is_real(value) for value in (length, column))
+        found = column is None or (numbered and column in range(nq))
+        for attribute, fits, allowed in (
+            ("name", str(name) == name == Path(name).name not in ("", ".."), "the name of a folder, without a slash"),
+            ("episode_length", whole and length >= 1, "an integer of at least 1"),
+            ("min_height", height is None or (is_real(height) and height > -math.inf), "a number of meters, or None"),
+            ("forward_column", found, f"a column of qpos, 0 to {nq - 1}, or None"),
         ):
             if not fits:
-                raise TaskError(f"task {self.name!r}: {name} is {getattr(self, name)!r}, must be {allowed}")
+                raise TaskError(f"task {name!r}: {attribute} is {getattr(self, attribute)!r}, must be {allowed}")
 
     @classmethod
     def presets(cls, contact: str | None = None) -> dict[str, Integration]:

@@ -71,12 +71,12 @@ class SavedPolicy:
     def task(self, given: str | None = None) -> str:
         """The name of its task, or the given file of an own one: what a checkpoint names is data, and no code to run.
 
-        Raises ValueError if the policy was trained on a file's task and none is given, or the other way round.
+        Raises ValueError if the policy was trained on a file's task and none is given, or on another one of TASKS.
         """
         own = FILE.fullmatch(trained := self.args["env"])
         if own and given is None:
             fail(f"a policy of your own task: give its file, whose code runs, by --env {trained} (drive: as robot)")
-        if not own and given not in (None, trained):
+        if not own and given != trained and given in TASKS:
             fail(f"a policy that was trained on {trained}, not on {given}")
         return given or self.args["env"]
 

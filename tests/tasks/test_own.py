@@ -228,6 +228,8 @@ def test_a_task_starts_at_the_keyframe() -> None:
         (dict(min_height=5.0), "an episode ends where it starts; obs[0] is 0, and min_height is 5.0"),
         (dict(min_height="low"), "min_height is 'low', must be a number of meters, or None"),
         (dict(forward_column=99), "forward_column is 99, must be a column of qpos, 0 to 4, or None"),
+        (dict(forward_column=1.0), "forward_column is 1.0, must be a column of qpos, 0 to 4, or None"),
+        (dict(min_height=float("nan")), "min_height is nan, must be a number of meters, or None"),
         (dict(episode_length=0), "episode_length is 0, must be an integer of at least 1"),
         (
             dict(terminated=lambda self, obs: obs[:, 0]),
@@ -251,9 +253,10 @@ def test_what_is_missing_or_misspelt_is_named() -> None:
 
     assert refused(episode_lenght=5) == "task 'wrong' has 'episode_lenght': is 'episode_length' meant?"
     assert refused(terminate=lambda self, obs: obs) == "task 'wrong' has 'terminate': is 'terminated' meant?"
-    nested = type("Nested", (Bare,), {"name": "a/b"})
-    with pytest.raises(TaskError, match="name is 'a/b', must be the name of a folder, without a slash"):
-        diffsim.DiffEnv(nested(), scene_of(EXAMPLE.read_text()), 1)
+    for name in ("a/b", "..", 5):
+        nested = type("Nested", (Bare,), {"name": name})
+        with pytest.raises(TaskError, match=f"name is {name!r}, must be the name of a folder, without a slash"):
+            diffsim.DiffEnv(nested(), scene_of(EXAMPLE.read_text()), 1)
     assert refused(ground=0.1) == "task 'wrong' has 'ground', which is the terrain: give it another name"
     assert refused(reward=Task.reward) == "task 'wrong' has no method 'reward'"
     assert refused(observe=Task.observe) == "task 'wrong' has no method 'observe'"
