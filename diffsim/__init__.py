@@ -147,7 +147,7 @@ def make(
     scene = scene.with_penalty(penalty or {})
     if is_real(terrain):
         if not 0 <= terrain <= STEEPEST:
-            raise ValueError(f"terrain is {terrain!r}, must be from 0 to {STEEPEST:g} degrees, or profiles")
+            raise ValueError(f"terrain is {terrain}, must be from 0 to {STEEPEST:g} degrees, or profiles")
         count = check_count("num_envs", num_envs)
         terrain = uneven(float(terrain), count, 0 if seed is None else check_seed(seed))
     scene = scene if terrain is None else scene.with_terrain(terrain)

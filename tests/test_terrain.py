@@ -207,7 +207,7 @@ def test_a_number_of_degrees_makes_uneven_ground():
     for count, degrees, seed, message in (
         (0, 12.0, 5, "num_envs is 0, must be an integer of at least 1"),
         (3, 12.0, 2.5, "seed is 2.5, must be one integer"),
-        (3, np.float32(95), 5, "degrees is 95.0, must lie between -90 and 90"),
+        (3, np.float32(95), 5, "terrain is 95.0, must be from 0 to 45 degrees"),
     ):
         with pytest.raises(ValueError, match=message):
             diffsim.make("hopper", count, terrain=degrees, seed=seed)
