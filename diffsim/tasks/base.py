@@ -173,8 +173,9 @@ class Task:
         name, length, height, column = self.name, self.episode_length, self.min_height, self.forward_column
         whole, numbered = (isinstance(value, Integral) and is_real(value) for value in (length, column))
         found = column is None or (numbered and column in range(nq))
+        named = isinstance(name, str) and name == Path(name).name and name not in ("", "..")
         for attribute, fits, allowed in (
-            ("name", str(name) == name == Path(name).name not in ("", ".."), "the name of a folder, without a slash"),
+            ("name", named, "the name of a folder, without a slash"),
             ("episode_length", whole and length >= 1, "an integer of at least 1"),
             ("min_height", height is None or (is_real(height) and height > -math.inf), "a number of meters, or None"),
             ("forward_column", found, f"a column of qpos, 0 to {nq - 1}, or None"),
@@ -239,9 +240,10 @@ class Task:
     def observe(self, qpos: Tensor, qvel: Tensor, action: Tensor) -> Tensor:
         """Observation (..., obs_dim) of qpos (..., nq) and qvel (..., nv).
 
-        action (..., nu) is the one that led there, clipped to [-1, 1]; zeros at the start of an episode.
+        action (..., nu) is the one that led there, clipped to [-1, 1]; zeros at the start of an episode. Raises a
+        NotImplementedError if the task's observation depends on its memory.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"an observation of task {self.name!r} depends on its memory: use observe_with")
 
     def begin(self, rand: Tensor) -> Tensor:
         """The memory (..., num_memory) at the start of an episode from rand (..., num_random); none by default."""

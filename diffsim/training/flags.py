@@ -103,7 +103,7 @@ class Flags:
 
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
-        if self.contact == "mujoco" != self.integrator:
+        if self.contact == "mujoco" and self.integrator != "mujoco":
             fail(f"--integrator {self.integrator} is for --contact soft, and the contact is MuJoCo's")
 
     @classmethod

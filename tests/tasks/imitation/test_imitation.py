@@ -338,3 +338,8 @@ def test_checkpoints_hold_the_clip(tmp_path: Path) -> None:
 def test_only_a_task_that_tracks_has_a_clip() -> None:
     assert parse(shac.Args, ["--env", "humanoid_imitation"]).clip == read_clip("humanoid_run")
     assert parse(shac.Args, ["--env", "humanoid"]).clip is None
+
+
+def test_an_observation_without_the_time_is_refused(task: HumanoidImitation) -> None:
+    with pytest.raises(NotImplementedError, match="depends on its memory: use observe_with"):
+        task.observe(torch.zeros(1, NQ), torch.zeros(1, NV), torch.zeros(1, NU))
