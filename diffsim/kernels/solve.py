@@ -274,9 +274,10 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
         g_base = vec6()
         if wp.static(FLOATING):
             g_base = join(links[0].R * base.gw, base.gv)
+        again = T(0.0)  # not T(s): where the loop is unrolled, float64(s) makes s itself a float
         for s in range(SOLVES):
             if wp.static(DAMPED and BASE_DAMPED):
-                g_base = g_base + T(s) * T(m.base_damping) * nodes[0].W
+                g_base = g_base + again * T(m.base_damping) * nodes[0].W
             for i in range(here.n):
                 nodes[i].g = nodes[i].gqd
                 if wp.static(DAMPED):
@@ -284,7 +285,8 @@ def factor_solve(spec: KernelSpec) -> wp.Function:
                     within = T(1.0)
                     if wp.static(CLAMP):
                         within = nodes[i].free
-                    nodes[i].g = nodes[i].gqd + T(s) * joint.damping(m, here.at + i, within) * nodes[i].lam
+                    nodes[i].g = nodes[i].gqd + again * joint.damping(m, here.at + i, within) * nodes[i].lam
             solve(m, here, ck, SOLVES * here.row + s, links, nodes, g_base)
+            again = T(1.0)
 
     return solve_all
