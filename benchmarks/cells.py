@@ -43,7 +43,7 @@ LEARNERS: dict[str, str] = CASES["learners"]  # script and flags
 
 
 class Group(NamedTuple):
-    machine: str  # the folder of results/ and runs/paper/
+    machine: str  # the folder of results/ and runs/paper/; another GPU is as good as the one that is named
     learners: Sequence[str]
     tasks: Sequence[str]
     seeds: int
@@ -128,9 +128,8 @@ class Cell(NamedTuple):
 
     @property
     def groups(self) -> list[Group]:
-        every = (
-            group for group in GROUPS.values() if (group.machine, True) == (self.machine, self.seed <= group.seeds)
-        )
+        every = (group for group in GROUPS.values() if (group.machine == "cpu") == (self.machine == "cpu"))
+        every = (group for group in every if self.seed <= group.seeds)
         return [group for group in every if self.learner in group.learners and self.task in group.tasks]
 
     @property

@@ -63,12 +63,17 @@ class Args(ScriptFlags):
         """Whether a cell's seconds mean something."""
         return cell.timed and not self.shared
 
+    def group(self, name: str) -> Group:
+        """On this machine's GPU, if it has one and the group is of a GPU."""
+        group = GROUPS[name]
+        return group if "cpu" in (self.place, group.machine) else group._replace(machine=self.place)
+
 
 def wanted(args: Args) -> Iterator[Cell]:
     """Each once, those of seed 1 of all groups first."""
     found = {
         (seed, Cell(group.machine, learner, task, seed)): None
-        for group in (GROUPS[name] for name in args.only)
+        for group in map(args.group, args.only)
         for learner in group.learners
         for task in group.tasks
         for seed in range(1, group.seeds + 1)
@@ -129,7 +134,7 @@ def points(args: Args, cell: Cell) -> list[Row]:
 
 def curves(args: Args, name: str) -> dict[tuple[str, str], list[Curve]]:
     """By learner and task, of a group's seeds, where all of them are there; with seconds if the group is timed."""
-    group = GROUPS[name]
+    group = args.group(name)
     directory = args.directory.parent / group.machine
     rows, known = read_csv(directory / "curves.csv"), cells.paces(directory)
     for row in rows:
@@ -168,7 +173,7 @@ def panel(group: Group, found: Mapping[tuple[str, str], list[Curve]], task: str,
 
 def pictured(args: Args, name: str) -> None:
     """Draw the curves of learners whose seeds are all there, of tasks that have any."""
-    group, found = GROUPS[name], curves(args, name)
+    group, found = args.group(name), curves(args, name)
     tasks = [task for task in group.tasks if any((learner, task) in found for learner in group.learners)]
     group = group._replace(tasks=tasks)
     grid = [[panel(group, found, task, x) for task in tasks] for x in ("control_steps", "seconds")]
@@ -212,21 +217,32 @@ def tell(value: float, form: str) -> str:
 
 def table(args: Args, name: str) -> list[Row]:
     """A line for each learner and task of which all seeds are there, of one revision and one kind of machine."""
-    group, lines = GROUPS[name], list[Row]()
-    rows = read_cells(args.directory.parent / group.machine)
+    group, lines = args.group(name), list[Row]()
+    rows, elsewhere = read_cells(args.directory.parent / group.machine), totals(args, group)
     for task in group.tasks:
         for learner in group.learners:
             seeds = max(each.seeds for each in Cell(group.machine, learner, task, 1).groups)  # the same in all tables
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
             own = [row for row in own if int(row["seed"]) <= seeds and cells.counts(row, group.timed)]
             if len(own) == seeds and len({row["trained on"] for row in own}) == 1:
-                lines.append(line(own))
+                lines.append({**line(own), **elsewhere.get((learner, task), {})})
     return lines
+
+
+def totals(args: Args, group: Group) -> dict[tuple[str, str], Row]:
+    """In all (s) of the first seeds that were trained on another GPU for their seconds, by learner and task."""
+    found = dict[tuple[str, str], Row]()
+    for path in sorted(args.directory.parent.glob("*/cells.csv")) if group.machine != "cpu" else ():
+        if (place := path.parent.name) not in ("cpu", group.machine):
+            rows = (row for row in read_csv(path) if row["seed"] == "1" and cells.counts(row, group.timed))
+            own = {(row["learner"], row["task"]): float(row["in all (s)"]) for row in rows if row["in all (s)"]}
+            found |= {key: {"in all (s)": f"{value:.0f}", "on": f" {place}"} for key, value in own.items()}
+    return found
 
 
 def seconds(row: Row) -> str:
     """Of the training, marked if computed from the time of an iteration, and in all, from the command to its end."""
-    whole = f" ({row['in all (s)']})" if row["in all (s)"] else ""
+    whole = f" ({row['in all (s)']}{row.get('on', '')})" if row["in all (s)"] else ""
     return f"{row['training (s)']}{row['paced']}{whole}"
 
 
@@ -253,7 +269,7 @@ def printed(args: Args, name: str) -> str:
 def check(args: Args) -> str:
     """What is missing, a line for each learner and task."""
     lines, missing, count = list[str](), dict[tuple[str, str, str], list[Cell]](), 0
-    known = {name: read_cells(common.RESULTS / name) for name in {GROUPS[g].machine for g in args.only}}
+    known = {name: read_cells(common.RESULTS / name) for name in {cell.machine for cell in wanted(args)}}
     for cell in wanted(args):
         count += 1
         if not cells.done(known[cell.machine], cell):

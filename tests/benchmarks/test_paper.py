@@ -58,6 +58,9 @@ def test_every_cell_is_there_once_the_first_seeds_first() -> None:
     (cell,) = (cell for cell in some if cell.learner == "sac_large")
     command = "python sac_baseline.py --env humanoid --seed 2 --device cuda --large-batch --accuracy fast"
     assert cell.command == f"{command} --iterations 400"
+    other = paper.Args(only=("headline", "cores"), learners=("sapo",), env=("hopper",), seeds=(4,), machine="h100")
+    assert [*paper.wanted(other)] == [one._replace(machine="h100"), one._replace(machine="cpu")]
+    assert one._replace(machine="h100").timed
 
 
 def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> None:
@@ -71,6 +74,23 @@ def test_a_line_has_all_seeds_of_one_revision(known: list[dict[str, str]]) -> No
         known[4][column] = before
     known[4]["seed"] = "6"
     assert paper.table(paper.Args(), "headline") == []
+
+
+def test_a_line_has_the_total_of_another_gpu(known: list[dict[str, str]], tmp_path: Path) -> None:
+    args, total = paper.Args(output=tmp_path / "cpu"), known[0] | {"in all (s)": "77.6"}
+    for machine, other, shown in (
+        ("h100", {}, "63 (78 h100)"),
+        ("h100", {"seed": "2"}, "63"),
+        ("h100", {"revision": "bbbbbbb"}, "63"),
+        ("h100", {"task": "ant"}, "63"),
+        ("cpu", {}, "63"),
+        ("h200", {}, "63"),
+    ):
+        path = tmp_path / machine / "cells.csv"
+        tables.replace_csv(path, [total | other], paper.KEY, "cpu")
+        (line,) = paper.table(args, "headline")
+        assert paper.seconds(line) == shown
+        path.unlink()
 
 
 def test_a_cell_that_shared_its_gpu_has_the_seconds_of_the_pace(
