@@ -319,7 +319,7 @@ def measured_bars() -> dict[str, list[Bar]]:
 
 
 def bars() -> None:
-    """Return and seconds of learners on one H200, as in the tables of docs/experiments.md and docs/transfer.md."""
+    """Return and seconds of learners on one H200 (some totals: an H100), as in the tables of docs/experiments.md and docs/transfer.md."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5.2), dpi=200)
@@ -336,7 +336,7 @@ def bars() -> None:
             first.bar(at, middle, 0.18, yerr=(middle - low, high - middle), capsize=2, color=colour, label=learner)
             second.bar(at, [max(bar.total, bar.training) for bar in own], 0.18, color=colour, alpha=0.4)
             second.bar(at, [bar.training for bar in own], 0.18, color=colour, label=learner)
-        labels = "return, median and range", "seconds of training;\nlight: total"
+        labels = "return, median and range", "seconds of training; light:\ntotal, some on an H100"
         for panel, text in zip((first, second), labels, strict=True):
             panel.set_ylabel(text, fontsize=9)
             panel.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks], fontsize=8, va="top")
