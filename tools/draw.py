@@ -319,7 +319,7 @@ def measured_bars() -> dict[str, list[Bar]]:
 
 
 def bars() -> None:
-    """Return and seconds of learners on one H200 (some totals: an H100), as in the tables of docs/experiments.md and docs/transfer.md."""
+    """Return and seconds of learners, as in the tables of docs/experiments.md and docs/transfer.md."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5.2), dpi=200)
