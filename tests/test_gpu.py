@@ -58,7 +58,7 @@ def test_kernels_with_every_feature_compile_for_a_gpu_without_one() -> None:
             assert function in source, function
 
 
-@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(wp.float32, marks=pytest.mark.slow), wp.float64])
 def test_kernels_with_constraints_compile_for_a_gpu_without_one(dtype: type) -> None:
     scene = constrained(task_scene("ant"), 1 / 240)
     spec = kernel_spec(scene, divide(scene, 4), dtype, implicit=False, env_last=True, varied=True, constrained=True)

@@ -27,7 +27,7 @@ MOTOR = '<motor joint="swing" gear="4" ctrlrange="-1 1"/>'
 @pytest.fixture(scope="module")
 def pendulum(tmp_path_factory):
     path = tmp_path_factory.mktemp("tune") / "pendulum.xml"
-    path.write_text(PENDULUM.format(joint='name="swing"', motor=MOTOR))
+    path.write_text(PENDULUM.format(joint='name="swing" stiffness="0.1"', motor=MOTOR))  # the stiff one's kernels
     return path
 
 

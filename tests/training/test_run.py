@@ -266,7 +266,8 @@ def test_other_hyperparameters_hold_from_a_resume_on(tmp_path):
 # What it shows --------------------------------------------------------------------------------------------------------
 
 
-def test_a_run_goes_on_by_new_episodes_on_other_ground(tmp_path):
+def test_a_run_goes_on_by_new_episodes_on_other_ground(tmp_path, monkeypatch):
+    monkeypatch.setattr(diffsim.Simulator, "advance", lambda _, qpos, qvel, ctrl: (qpos, qvel + 0.01 * ctrl.sum()))
     words = "--env hopper --num-envs 4 --horizon 4 --critic-iterations 1 --eval-episodes 1 --eval-every 0 --quiet"
     flags = [*words.split(), *"--device cpu --rough 20 --iterations 2 --stop-after 1 --run-dir".split()]
     shac.main([*flags, str(first := tmp_path / "first")])
