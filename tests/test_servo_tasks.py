@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
+
 import mujoco
 import numpy as np
 import pytest
@@ -29,6 +31,11 @@ def test_servos_hold_targets_within_the_joints_limits_and_the_motors_torques() -
     inside = data.ctrl <= model.actuator_ctrlrange[:, 1]  # MuJoCo bounds targets
     assert inside.sum() > 3 and (expected[inside] == torque[inside]).any()
     np.testing.assert_allclose(data.actuator_force[inside], expected[inside], rtol=1e-6)
+
+
+def test_the_trot_is_that_of_the_results() -> None:
+    """The returns of docs/pfpn.md are of imitating it."""
+    assert sha256(TROT.read_bytes()).hexdigest()[:16] == "cf63ee7a370641a7"
 
 
 @pytest.fixture(params=["humanoid", "dog"])
