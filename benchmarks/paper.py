@@ -202,7 +202,7 @@ def line(rows: Sequence[Cells]) -> Row:
     returns, task = numbers(rows, "return"), rows[0]["task"]
     shown: dict[str, object] = {"task": task, "learner": rows[0]["learner"]}
     shown["return"] = f"{median(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}]"
-    shown |= {name: middle(rows, name, ".0f") for name in ("training (s)", "in all (s)")}
+    shown["training (s)"] = middle(rows, "training (s)", ".0f")
     shown |= {"falls": f"{max(numbers(rows, 'falls')):.2f}"}
     target = RETURNS[task].target
     time, steps = (median(numbers(rows, f"{x} to {target}") or [math.nan]) for x in ("seconds", "control_steps"))
@@ -218,31 +218,32 @@ def tell(value: float, form: str) -> str:
 def table(args: Args, name: str) -> list[Row]:
     """A line for each learner and task of which all seeds are there, of one revision and one kind of machine."""
     group, lines = args.group(name), list[Row]()
-    rows, elsewhere = read_cells(args.directory.parent / group.machine), totals(args, group)
+    rows, total = read_cells(args.directory.parent / group.machine), totals(args, group)
     for task in group.tasks:
         for learner in group.learners:
             seeds = max(each.seeds for each in Cell(group.machine, learner, task, 1).groups)  # the same in all tables
             own = [row for row in rows if (row["learner"], row["task"]) == (learner, task)]
             own = [row for row in own if int(row["seed"]) <= seeds and cells.counts(row, group.timed)]
             if len(own) == seeds and len({row["trained on"] for row in own}) == 1:
-                lines.append({**line(own), **elsewhere.get((learner, task), {})})
+                lines.append({**line(own), **total.get((learner, task), {"in all (s)": ""})})
     return lines
 
 
 def totals(args: Args, group: Group) -> dict[tuple[str, str], Row]:
-    """In all (s) of the first seeds that were trained on another GPU for their seconds, by learner and task."""
-    found = dict[tuple[str, str], Row]()
-    for path in sorted(args.directory.parent.glob("*/cells.csv")) if group.machine != "cpu" else ():
-        if (place := path.parent.name) not in ("cpu", group.machine):
-            rows = (row for row in read_csv(path) if row["seed"] == "1" and cells.counts(row, group.timed))
-            own = {(row["learner"], row["task"]): float(row["in all (s)"]) for row in rows if row["in all (s)"]}
-            found |= {key: {"in all (s)": f"{value:.0f}", "on": f" {place}"} for key, value in own.items()}
+    """In all (s) of seed 1 by learner and task; "on" another GPU, if it was trained there as well for its seconds."""
+    found, machines = dict[tuple[str, str], Row](), args.directory.parent
+    others = {path.parent.name for path in machines.glob("*/cells.csv")} - {"cpu", group.machine}
+    for place in (group.machine, *sorted(others if group.machine != "cpu" else ())):
+        for row in read_csv(machines / place / "cells.csv"):
+            if row["seed"] == "1" and row["in all (s)"] and cells.counts(row, group.timed):
+                total = {"in all (s)": f"{float(row['in all (s)']):.0f}", "on": "" if place == group.machine else place}
+                found[row["learner"], row["task"]] = total
     return found
 
 
 def seconds(row: Row) -> str:
     """Of the training, marked if computed from the time of an iteration, and in all, from the command to its end."""
-    whole = f" ({row['in all (s)']}{row.get('on', '')})" if row["in all (s)"] else ""
+    whole = f" ({row['in all (s)']} {row['on']}".rstrip() + ")" if row["in all (s)"] else ""
     return f"{row['training (s)']}{row['paced']}{whole}"
 
 
