@@ -22,11 +22,22 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.planning import REAL, AfterStep, LinearGaussian, Plan, Samples, SampleSet, Sum, Surprisal, System, Tracking
-from diffsim.planning.controller import gaussian_log_prob, maximum_entropy_controllers
-from diffsim.planning.demonstration import follow_demonstration, load_demonstration
-from diffsim.planning.ilqr import ilqr
-from diffsim.planning.lbfgs import maximise
+from diffsim.extra.planning import (
+    REAL,
+    AfterStep,
+    LinearGaussian,
+    Plan,
+    Samples,
+    SampleSet,
+    Sum,
+    Surprisal,
+    System,
+    Tracking,
+)
+from diffsim.extra.planning.controller import gaussian_log_prob, maximum_entropy_controllers
+from diffsim.extra.planning.demonstration import follow_demonstration, load_demonstration
+from diffsim.extra.planning.ilqr import ilqr
+from diffsim.extra.planning.lbfgs import maximise
 from diffsim.tasks import find_task
 from diffsim.tasks.base import ASSETS
 from diffsim.training import distributed, evaluate_checkpoint, fail, script

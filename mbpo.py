@@ -23,15 +23,15 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from diffsim import DiffEnv
-from diffsim.planning import System
+from diffsim.extra.learning.ensemble import Ensemble
+from diffsim.extra.learning.replay import ReplayBuffer, Transition
+from diffsim.extra.planning import System
 from diffsim.tasks import find_task
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Batch, Count, Few, Fraction, Natural, Positive, Repeats, Several, SomeWidths, Widths
-from diffsim.training.replay import ReplayBuffer, Transition
 
 # Policies and values: as SAC's, from Table 3 of the SHAC paper. Rollout lengths: MBPO's released settings.
 # fmt: off
@@ -109,7 +109,7 @@ class Args(ParallelFlags):
     def check(self) -> None:
         super().check()
         first, last = self.rollout_lengths
-        rows, past = self.num_envs * (1 + self.sample_enhance), find_task(self.env).num_memory
+        rows, task = self.num_envs * (1 + self.sample_enhance), find_task(self.env)
         jacobians = "--sample-enhance takes Jacobians of"
         most = self.iterations * self.steps - 1
         seeding = f"--seed-steps {self.seed_steps} leave no update in --iterations {self.iterations}: at most {most}"
@@ -120,9 +120,10 @@ class Args(ParallelFlags):
             f"--elites {self.elites} are more than --models {self.models}": self.elites > self.models,
             f"--rollout-lengths {first} {last}: the first must not exceed the second": first > last,
             f"--buffer-size {self.buffer_size} is less than the {rows} transitions of a step": self.buffer_size < rows,
-            f"{jacobians} states that do not hold the past, on which {self.env} depends": self.sample_enhance and past,
-            f"{jacobians} one robot: leave out --randomise": self.sample_enhance and self.randomise,
-            f"{jacobians} a robot on a plane: leave out --rough": self.sample_enhance and self.rough,
+            f"{jacobians} states that do not hold the past, on which {self.env} depends": self.sample_enhance
+            and task.num_memory,
+            f"{jacobians} one robot, but {self.env} has ranges": self.sample_enhance and task.varied_by,
+            f"{jacobians} a robot on a plane, but {self.env} is rough": self.sample_enhance and hasattr(task, "slope"),
         }
         for message, found in wrong.items():
             if found:

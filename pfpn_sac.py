@@ -22,13 +22,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
+from diffsim.extra.learning.ensemble import Ensemble
+from diffsim.extra.learning.replay import ReplayBuffer, Transition
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import Likeliest, ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Batch, Count, Decay, Fraction, NonNegative, Positive, Repeats, Several, SomeWidths
-from diffsim.training.replay import ReplayBuffer, Transition
 
 # The settings of sac_baseline.py, so that only the policy differs. A task that is not in the table has the humanoid's.
 # fmt: off

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.planning import REAL, AfterStep, Cost, Sum, System, ilqr
+from diffsim.extra.planning import REAL, AfterStep, Cost, Sum, System, ilqr
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task, find_task
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.tasks.mirror import Mirror
+from diffsim.extra.mirror import Mirror
 from diffsim.training import Run, distributed, script
 from diffsim.training.flags import SymmetricFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, moments, seeing

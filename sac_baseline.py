@@ -21,13 +21,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
+from diffsim.extra.learning.ensemble import Ensemble
+from diffsim.extra.learning.replay import ReplayBuffer, Transition
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.ensemble import Ensemble
 from diffsim.training.flags import ParallelFlags
 from diffsim.training.layers import ObsNormalizer, mlp, seeing
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Batch, Count, Few, Finite, Fraction, Natural, Positive, Repeats, SomeWidths
-from diffsim.training.replay import ReplayBuffer, Transition
 
 # Table 3 of the SHAC paper; networks, seed steps, hopper and half_cheetah: its authors' released settings.
 # fmt: off

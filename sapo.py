@@ -20,10 +20,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv, Integration
+from diffsim.extra.learning.ensemble import Ensemble, EnsembleAdam
+from diffsim.extra.mirror import Mirror
 from diffsim.tasks import TASKS
-from diffsim.tasks.mirror import Mirror
 from diffsim.training import Run, distributed, fail, script
-from diffsim.training.ensemble import Ensemble, EnsembleAdam
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import ObsNormalizer, folded, make_even, mlp, seeing
 from diffsim.training.ranges import Decay, Few, Finite, Fraction, Positive, Repeats, SomeWidths

@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from diffsim import DiffEnv
-from diffsim.tasks.mirror import Mirror
+from diffsim.extra.mirror import Mirror
 from diffsim.training import ClippedAdam, ObsNormalizer, Run, distributed, fail, script
 from diffsim.training.flags import WindowFlags
 from diffsim.training.layers import Chain, folded, make_even, mlp, seeing

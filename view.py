@@ -17,10 +17,10 @@ from typing import Annotated, Any
 import torch
 import tyro
 
+from diffsim.extra import gait, render
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
 from diffsim.training.errors import in_one_line
-from diffsim.training.evaluation import SEED, VIDEO_SECONDS, gait_lines
-from diffsim.view import render
+from diffsim.training.evaluation import SEED, VIDEO_SECONDS
 
 
 @dataclass
@@ -72,8 +72,7 @@ def show(args: Args) -> None:
     env = make_policy_env(saved, args.episodes, env=args.env, **changes)
     evaluation = evaluate(env, saved.network, args.seed)
     print(f"{env.task.name}, {saved}, {args.episodes} episodes: {evaluation}")
-    if feet := evaluation.gait():
-        print(gait_lines(feet))
+    print(*gait.lines(gait.of_evaluation(evaluation)), sep="\n")
     print(f"video: {evaluation.save_video(args.video, args.seconds, size=args.size)}")
 
 

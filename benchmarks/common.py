@@ -17,6 +17,7 @@ import tyro
 from tables import ROOT, Row
 
 from diffsim import DiffEnv
+from diffsim.extra.variation import on_a_plane
 from diffsim.sim.options import check_device
 from diffsim.tasks import TaskError, find_task
 from diffsim.training import NonNegative, Positive, SavedPolicy, command, fail, load_policy, make_policy_env
@@ -140,9 +141,10 @@ class Case(NamedTuple):
         """The cells of ABOUT."""
         args = self.saved.args
         learner = " ".join((self.saved.script, *(args[name] for name in ("policy",) if name in args)))
-        learner += "".join(f" --{name}" for name in ("symmetric", "randomise") if args.get(name))
+        learner += " --symmetric" if args.get("symmetric") else ""
+        learner += " randomised" if self.env.task.varied_by else ""
         learner += f" --initial-log-std {first:g}" if (first := args.get("initial_log_std")) else ""
-        learner += f" --rough {slope:g}" if (slope := args.get("rough")) else ""
+        learner += f" rough {slope:g}" if (slope := getattr(find_task(self.saved.task()), "slope", 0.0)) else ""
         contact = " ".join((args.get("contact", "soft"), *args.get("penalty", ())))
         values = self.label, self.env.task.name, learner, contact, args["seed"], self.saved.iteration
         return dict(zip(ABOUT, values, strict=True))
@@ -164,7 +166,10 @@ def load_case(path: Path, num_envs: int, device: str) -> Case:
         fail(f"{path} was trained elsewhere: {error}")
     run = path.parent if path.name == "checkpoint.pt" else path.with_suffix("")
     return Case(
-        f"{run.parent.name}/{run.name}", path, saved, make_policy_env(saved, num_envs, device=device, rough=0.0)
+        f"{run.parent.name}/{run.name}",
+        path,
+        saved,
+        make_policy_env(saved, num_envs, device=device, env=on_a_plane(saved.task())),
     )
 
 

@@ -18,10 +18,10 @@ import torch
 import tyro
 from torch import Tensor
 
-from diffsim.planning import System, save_demonstration
+from diffsim.extra.planning import System, save_demonstration
+from diffsim.extra.robots.walker import Walker
 from diffsim.tasks.hopper import Hopper
 from diffsim.tasks.humanoid import Humanoid
-from diffsim.tasks.walker import Walker
 from diffsim.training import command, fail, load_policy, parse
 from diffsim.training.evaluation import make_env
 

@@ -21,9 +21,10 @@ from tables import ROOT
 from torch import Tensor
 
 from diffsim import DiffEnv
-from diffsim.planning import REAL, System
+from diffsim.extra.planning import REAL, System
+from diffsim.extra.terrain import incline, rough
 from diffsim.robot.scene import Array, Scene, TerrainError
-from diffsim.terrain import Elevation, incline, rough
+from diffsim.sim.elevation import Elevation
 from diffsim.training import evaluate_checkpoint, fail, script
 from diffsim.training.evaluation import Evaluation
 

@@ -29,11 +29,12 @@ from common import ABOUT, Case, Part, load_case, measured, run
 from tables import Row, grouped, middle, numbers
 from worlds import Array, OtherFile, State, in_double, pushes, rollout
 
-from diffsim.tasks.joystick import Joystick
-from diffsim.terrain import Elevation, uneven
-from diffsim.training import Positive, fail, gait
+from diffsim.extra import gait
+from diffsim.extra.robots.joystick import Joystick
+from diffsim.extra.terrain import STEEPEST, uneven
+from diffsim.sim.elevation import Elevation
+from diffsim.training import Positive, fail
 from diffsim.training.checkpoint import HOME
-from diffsim.training.flags import Slope
 from diffsim.training.ranges import Range
 
 FORWARD, SIDEWAYS, TURNING = (-1.0, -0.5, 0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0)
@@ -43,6 +44,7 @@ WALK = COMMANDS.index((0.5, 0.0, 0.0))
 RACE = (0.1, 0.05)  # m/s, errors to which learners race
 PROFILE, STARTS, NEAR = 1_000_000, 4.0, 0.3  # seed of the rough ground; m, where commands start, and how long they are
 PAGE = "joystick.md"
+Slope = Annotated[float, Range(f"from 0 to {STEEPEST:g}", lambda degrees: 0 <= degrees <= STEEPEST)]
 Long = Annotated[float, Range("at least 3", lambda seconds: seconds >= 3)]  # the first second does not count
 
 
@@ -60,6 +62,7 @@ def follow(case: Case, world: OtherFile, args: Args, profile: Array | None = Non
     (T, n, nq), actions (T, n, nu), falls (n,)."""
     task, scene, n = in_double(case.env), case.env.scene, len(COMMANDS)
     late = args.latency / 1e3 / task.control_dt
+    assert isinstance(task, Joystick)
     task.disturbances = {**task.disturbances, "latency": (late, late)}
     push = pushes(args.push, task.control_dt, np.random.default_rng(1))
     rest = torch.tensor(task.start).double().repeat(n, 1)  # the keyframe
@@ -222,7 +225,7 @@ def race(rows: list[dict[str, str]]) -> list[Row]:
 def rough(rows: list[dict[str, str]]) -> list[Row]:
     """Who is whole on the steepest ground, and errors on each. A column for each task, learner and trained slope."""
     rows = [row | {"by": row["learner"].partition(" ")[0]} for row in rows]
-    rows = [row | {"on": f"{row['learner'].partition(' --rough ')[2] or 0}°"} for row in rows]
+    rows = [row | {"on": f"{row['learner'].partition(' rough ')[2] or 0}°"} for row in rows]
     columns = {", ".join(key): group for key, group in sorted(grouped(rows, "task", "by", "on").items())}
     slopes, lines = sorted({row["rough"] for row in rows}, key=float), list[Row]()
     for title, column, form, worst in (("whole", "whole", ".0%", min), ("error (m/s)", "error", ".3f", max)):

@@ -3,7 +3,7 @@
     python benchmarks/peer.py                                            control steps per second of all
     python benchmarks/peer.py --parts train --env ant --seconds 100      ppo_baseline.py, trained in mujoco_warp
     python benchmarks/transfer.py runs/learning/ppo_mujoco_warp/ant__1   judges its policy here and in MuJoCo
-    python benchmarks/peer.py --parts train --env g1_track -- --clip g1_jazz_walk
+    python benchmarks/peer.py --parts train --env g1_track
 
 What follows "--" goes to ppo_baseline.py. mujoco_warp has at most 10 iterations of Newton's method and 20 of the line
 search, as in its own benchmark of a humanoid; this simulator passes until it has converged to its tolerance.
@@ -31,6 +31,7 @@ from worlds import FASTEST, MuJoCo, mujoco_model
 
 import diffsim
 import ppo_baseline
+from diffsim.tasks import find_task
 from diffsim.training import Count, Positive, Run, fail, graph, parse
 
 PartName = Literal["speed", "train"]
@@ -139,12 +140,13 @@ def mj_steps(sim: diffsim.Simulator, qpos: Tensor, qvel: Tensor, actions: Tensor
 
 def train(args: Args, name: Name) -> Iterator[Row]:
     """ppo_baseline.py's training, for some seconds. Its rollout is no CUDA graph: each control step in it is one."""
-    flags = (
-        f"--env {name} --seed {args.seed} --device {args.device} --contact mujoco {PPO} --randomise --run-dir".split()
-    )
-    settings = parse(ppo_baseline.Args, [*flags, f"{args.runs}/ppo_mujoco_warp/{name}__{args.seed}", *args.arguments])
-    if settings.contact != "mujoco" or settings.randomise:
-        fail("mujoco_warp has its own contact, which does not vary: leave out --contact and --randomise")
+    flags = f"--env {name}:randomise=none --seed {args.seed} --device {args.device} --contact mujoco {PPO}".split()
+    folder = f"{args.runs}/ppo_mujoco_warp/{name}__{args.seed}"
+    settings = parse(ppo_baseline.Args, [*flags, "--run-dir", folder, *args.arguments])
+    if settings.contact != "mujoco" or find_task(settings.env).varied_by:
+        fail(
+            "mujoco_warp has its own contact, which does not vary: leave out --contact and ranges after the task's name"
+        )
     training = Run(settings)
     training.simulator = "mujoco_warp"
     env = training.make_env(settings.num_envs, settings.horizon)

@@ -25,7 +25,7 @@ from torch import Tensor
 from worlds import Here, State, Step, rollout, starts
 
 from diffsim import DiffEnv, Simulator
-from diffsim.tasks import HumanoidImitation
+from diffsim.extra.robots.imitation.task import HumanoidImitation
 from diffsim.training import Count, fail
 from diffsim.training.evaluation import SEED
 

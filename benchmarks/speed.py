@@ -26,11 +26,11 @@ from tables import Row
 
 import diffsim
 from diffsim import Scene, Simulator
+from diffsim.extra.terrain import rough
+from diffsim.extra.tune.front import clock
 from diffsim.kernels.lanes import divide
 from diffsim.sim.launcher import TooLargeError
-from diffsim.terrain import rough
 from diffsim.training import Count, fail, graph
-from diffsim.tune.front import clock
 
 Robot = Literal["go1", "go2", "g1"]  # of the physics table alone
 TECHNIQUES = "cuda graph", "cuda graph, one thread per environment", "cuda, eager"

@@ -30,8 +30,8 @@ from joystick import training
 from tables import Row, grouped, markdown, middle, numbers
 from worlds import Array, OtherFile, State, pushes, rollout
 
-from diffsim import read_clip
-from diffsim.tasks.imitation.tracking import Tracking
+from diffsim.extra.robots.imitation.clip import read_clip
+from diffsim.extra.robots.imitation.tracking import Tracking
 from diffsim.training import Count, SavedPolicy, fail
 
 OFF = 0.05  # rad, of the joints at the start
@@ -76,7 +76,8 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     if not isinstance(own := case.env.task, Tracking):
         fail(f"{path} was trained on {own.name}, which is not judged by its clip's root")
     clip = own.clip if args.clip is None else read_clip(args.clip)
-    task = type(own)(dtype=torch.float64, clip=clip)
+    task = type(own).with_clip(clip)(dtype=torch.float64)
+    assert isinstance(task, Tracking)
     task.bind(case.env.scene)
     task.low, task.high = own.low.double(), own.high.double()  # other clips do not move the servos' range
     count = len(task.motions[0])
@@ -109,7 +110,7 @@ def groups(rows: list[dict[str, str]]) -> Iterator[tuple[str, list[dict[str, str
     """A policy's name for each clip, learner (if not sapo) and device (if not a GPU), over seeds; its rows, and those
     with the file's friction and no push."""
     for (clip, learner, device), group in grouped(rows, "clip", "learner", "device").items():
-        name, drawn, _ = learner.partition(" --randomise")
+        name, drawn, _ = learner.partition(" randomised")
         policy = ", ".join((clip, *(() if name == "sapo" else (name,)), *(() if device == "cuda" else (device,))))
         plain = [row for row in group if float(row["friction"]) == 1 and float(row["push"]) == 0]
         yield policy + ("" if drawn else ", not randomised"), group, plain

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffsim import DiffEnv, Scene, Simulator, load_scene
+from diffsim.extra.render import slabs
 from diffsim.sim.launcher import available_cores
-from diffsim.tasks import Imitation, Task
+from diffsim.tasks import Task
 from diffsim.training import fail
 from diffsim.training.evaluation import SEED
-from diffsim.view.render import slabs
 
 Array = NDArray[np.float64]
 FASTEST = 1e5  # m/s or rad/s; beyond it a robot is lost, as in Simulator
@@ -307,9 +307,7 @@ def episodes(world: World, task: Task, policy: Callable[[Tensor], Tensor], start
 
 def in_double(env: DiffEnv) -> Task:
     """The environment's task in float64 on the CPU."""
-    task = env.task
-    twin = type(task)(dtype=torch.float64, clip=task.clip) if isinstance(task, Imitation) else None
-    return (twin or type(task)(dtype=torch.float64)).bind(env.scene)
+    return type(env.task)(dtype=torch.float64).bind(env.scene)
 
 
 def travel(case: Case, world: World, steps: int) -> Motion:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
@@ -14,24 +13,18 @@ from numpy.typing import ArrayLike
 from diffsim import startup
 from diffsim.env import DiffEnv, check_seed
 from diffsim.kernels.lanes import Division
-from diffsim.numpy_env import NumpyEnv, NumpyVectorEnv
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene, SceneError
-from diffsim.sim.integration import Integration, check_count, is_real
+from diffsim.sim.integration import Integration, check_count
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import check_device, check_dtype
 from diffsim.sim.simulator import Simulator
-from diffsim.tasks import TASKS, Accuracy, Contact, Imitation, Task, TaskError, find_task
-from diffsim.tasks.imitation.clip import Clip, read_clip
-from diffsim.terrain import STEEPEST, uneven
+from diffsim.tasks import TASKS, Accuracy, Contact, Task, TaskError, find_task
 
 __all__ = [
     "TASKS",
-    "Clip",
     "DiffEnv",
     "Integration",
-    "NumpyEnv",
-    "NumpyVectorEnv",
     "Scene",
     "SceneError",
     "Simulator",
@@ -39,7 +32,6 @@ __all__ = [
     "TaskError",
     "load_scene",
     "make",
-    "read_clip",
 ]
 
 
@@ -60,7 +52,6 @@ def make(
     contact: Contact | None = None,
     penalty: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float32,
-    clip: Clip | Path | str | None = None,
     terrain: ArrayLike | None = None,
     control_dt: float | None = None,
     stochastic_init: bool = True,
@@ -83,7 +74,8 @@ def make(
         obs, reward, terminated, truncated, info = env.step(torch.zeros(64, 8))
 
     Args:
-        name: one of diffsim.TASKS, a file with a task of your own ("my_task.py" or "my_task.py:Class"), or its class.
+        name: one of diffsim.TASKS, one with options ("go2:rough=20", "g1_track:walk.npz", see docs/tasks.md), a file
+            with a task of your own ("my_task.py" or "my_task.py:Class"), or its class.
         num_envs: number of environments N.
         device: "cpu" or a CUDA device.
         seed: of the random start states, commands and noise; by default another one for each environment that is made.
@@ -95,11 +87,9 @@ def make(
             g1, g1_track and tasks of your own, "soft" for the others.
         penalty: constants of the penalty law that replace the MJCF's, e.g. {"k_n": 1e5}, see docs/physics.md.
         dtype: torch.float32 or torch.float64.
-        clip: motions that g1_track or humanoid_imitation tracks, or their file or folder, see read_clip. Default: a
-            clip of the package.
-        terrain: replaces the plane z = 0: vertices (x, z) [m] of one profile, (K, 2), or of one for each environment,
-            (N, K, 2), see Scene.with_terrain and diffsim.terrain. The task then measures heights from the ground below
-            the root. A number from 0 to 45: the steepest slope [degrees] of `uneven` ground; the seed draws it.
+        terrain: replaces the plane z = 0, or the task's own ground: vertices (x, z) [m] of one profile, (K, 2), or of
+            one for each environment, (N, K, 2), see Scene.with_terrain and diffsim.extra.terrain. The task then
+            measures heights from the ground below the root.
         control_dt: seconds of a control step. Default: the task's.
         stochastic_init: draw start states; otherwise each episode starts from the task's unperturbed one.
         early_termination: end episodes where the task reports a fall.
@@ -126,13 +116,7 @@ def make(
     device, dtype = check_device(device), check_dtype(dtype)
     kind = find_task(name)
     startup.check_kernel_cache()
-    if clip is None:
-        task = kind(device, dtype)
-    elif issubclass(kind, Imitation):
-        task = kind(device, dtype, clip if isinstance(clip, Clip) else read_clip(clip))
-    else:
-        others = ", ".join(name for name, task in TASKS.items() if issubclass(task, Imitation))
-        raise ValueError(f"task {kind.name!r} tracks no clip; {others} do")
+    task = kind(device, dtype)
     if control_dt is not None and control_dt != task.control_dt:
         if task.num_memory:  # its times count in control steps
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
@@ -145,11 +129,9 @@ def make(
     if penalty and integration.constrained:
         raise ValueError("penalty sets constants of the penalty law, but the contact is mujoco")
     scene = scene.with_penalty(penalty or {})
-    if is_real(terrain):
-        if not 0 <= terrain <= STEEPEST:
-            raise ValueError(f"terrain is {terrain}, must be from 0 to {STEEPEST:g} degrees, or profiles")
+    if terrain is None:
         count = check_count("num_envs", num_envs)
-        terrain = uneven(float(terrain), count, 0 if seed is None else check_seed(seed))
+        terrain = kind.terrain(count, 0 if seed is None else check_seed(seed))
     scene = scene if terrain is None else scene.with_terrain(terrain)
     episodes: Any = dict(stochastic_init=stochastic_init, early_termination=early_termination)
     episodes |= dict(max_episode_steps=max_episode_steps, adjoint_clip=adjoint_clip, render_mode=render_mode)
@@ -158,22 +140,16 @@ def make(
     return DiffEnv(task, scene, num_envs, seed=seed, horizon=horizon, **episodes, **options)
 
 
-def _make_one(name: str, **arguments: Any) -> NumpyEnv:
-    return NumpyEnv(make(name, num_envs=1, horizon=1, **arguments))
-
-
-def _make_numpy(name: str, num_envs: int, **arguments: Any) -> NumpyVectorEnv:
-    return NumpyVectorEnv(make(name, num_envs, horizon=1, **arguments))
-
+EPISODE_STEPS = {"cartpole": 240, "g1_track": 500}  # of the others Task.episode_length
 
 # Two ids of each task: gymnasium.make makes the same environment of both, gymnasium.make_vec one on tensors and one in
 # NumPy, which has an id of its own because many libraries take an id and no further argument.
-for _name, _task in TASKS.items():
-    for _suffix, _vector in (("", "make"), ("-numpy", "_make_numpy")):
+for _name in TASKS:
+    for _suffix, _vector in (("", "diffsim:make"), ("-numpy", "diffsim.extra.numpy_env:make_vec")):
         gymnasium.register(
             id=f"diffsim/{_name.title().replace('_', '')}{_suffix}-v0",
-            entry_point="diffsim:_make_one",
-            vector_entry_point=f"diffsim:{_vector}",
-            max_episode_steps=_task.episode_length,
+            entry_point="diffsim.extra.numpy_env:make_one",
+            vector_entry_point=_vector,
+            max_episode_steps=EPISODE_STEPS.get(_name, Task.episode_length),
             kwargs={"name": _name},
         )

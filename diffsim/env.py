@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import pkgutil
 from collections.abc import Iterable
 from numbers import Integral
 from typing import Any, Literal
@@ -18,14 +19,15 @@ from torch import Tensor
 
 from diffsim.robot.scene import Scene
 from diffsim.sim.adjoint import ClipAdjoint
+from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration, check_count, is_real
 from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
-from diffsim.terrain import Elevation
 
 State = tuple[Tensor, Tensor, Tensor, Tensor]  # qpos, qvel, observation and memory, (N, ...) each
 Frames = tuple[NDArray[np.uint8], ...]  # each (height, width, 3)
+RENDERER = "diffsim.extra.render:Renderer"  # loaded with the first picture
 STATISTICS = ("episodes", "return", "length", "nonfinite")  # see DiffEnv.take_statistics
 
 
@@ -227,9 +229,7 @@ class DiffEnv(VectorEnv):
         if not self.render_mode:
             raise RuntimeError('there is no picture without a render_mode: make the environment with "rgb_array"')
         if self._renderer is None:
-            from diffsim.view import render  # here: otherwise no picture is loaded
-
-            self._renderer = render.Renderer(self.scene, *render.VIDEO_SIZE)
+            self._renderer = pkgutil.resolve_name(RENDERER)(self.scene)
         return tuple(self._renderer.draw(row, profile=k) for k, row in enumerate(self.qpos.numpy(force=True)))
 
     def close_extras(self, **_: Any) -> None:

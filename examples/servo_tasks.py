@@ -1,20 +1,22 @@
 """Imitation as in the PFPN paper: a policy sets the targets of servos 30 times a second. A humanoid and a dog.
 
 python pfpn.py --env examples/servo_tasks.py:HumanoidServo --seed 1
-python pfpn.py --env examples/servo_tasks.py:Dog --clip examples/dog_trot.npz --seed 1
+python pfpn.py --env examples/servo_tasks.py:Dog --seed 1
 python tools/record_trot.py                             records such a clip, from the shipped policy of go2
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import ClassVar
 
 import mujoco
 from torch import Tensor
 
-from diffsim.tasks import Contact, HumanoidImitation
+from diffsim.extra.robots.imitation.task import HumanoidImitation
+from diffsim.extra.robots.joystick import Go2
+from diffsim.tasks import Contact
 from diffsim.tasks.base import ASSETS
-from diffsim.tasks.joystick import Go2
 
 STIFFNESS = 2.0  # 1/rad: a servo gives its motor's largest torque half a radian from the target
 
@@ -44,6 +46,7 @@ class Dog(HumanoidImitation):
     contact: ClassVar[Contact] = "mujoco"
     control_dt, episode_length, substeps = 1 / 30, 600, 8
     obs_dim = 39
+    default_clip = str(Path(__file__).with_name("dog_trot.npz"))
     ends = ("FL", "FR", "RL", "RR")
 
     def terminated(self, obs: Tensor) -> Tensor:

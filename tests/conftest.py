@@ -12,7 +12,7 @@ import torch
 from browser import CHROMIUM, Browser
 
 import shac
-from diffsim.view import render
+from diffsim.extra import render
 
 torch.set_num_threads(1)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it to what they run in the background

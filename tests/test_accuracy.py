@@ -13,6 +13,7 @@ from scenes import BALL, DISTINCT, HINGE, OSCILLATOR, acting_states, leg_scene, 
 from warp._src.context import ModuleBuilder
 
 import diffsim
+from diffsim.extra.terrain import incline
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
@@ -20,7 +21,6 @@ from diffsim.kernels.spec import kernel_spec
 from diffsim.sim.integration import INTEGRATORS, Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import TASKS
-from diffsim.terrain import incline
 
 SHAC_TASKS = ("cartpole", "hopper", "half_cheetah", "ant", "humanoid", "humanoid_mtu")
 SETTINGS = [  # and the order of each

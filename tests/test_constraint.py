@@ -30,11 +30,11 @@ from test_gradient import differences, gradients, weights
 from test_terrain import HILLS, everywhere, hopping, pressed
 
 import diffsim
+from diffsim.extra.terrain import incline
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.terrain import incline
 from diffsim.training.checkpoint import POLICIES, load_policy
 
 ROBOTS = ("hopper", "half_cheetah", "ant", "humanoid")

@@ -11,7 +11,7 @@ import pytest
 from learners import ROOT
 from PIL import Image, ImageSequence
 
-from diffsim.tasks.joystick import Go2
+from diffsim.extra.robots.joystick import Go2
 from diffsim.training.checkpoint import POLICIES
 
 

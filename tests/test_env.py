@@ -17,6 +17,7 @@ from scenes import task_scene
 from torch.autograd import forward_ad
 
 import diffsim
+from diffsim.extra.numpy_env import NumpyVectorEnv
 from diffsim.sim.integration import INTEGRATORS
 from diffsim.tasks import TASKS
 
@@ -340,7 +341,7 @@ def test_other_derivatives_than_backward_are_refused(kind, integrator):
 @pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
 def test_environments_cannot_be_copied(copied):
     env = diffsim.make("cartpole", num_envs=2)
-    for thing in (env, env.sim, diffsim.NumpyVectorEnv(env)):
+    for thing in (env, env.sim, NumpyVectorEnv(env)):
         with pytest.raises(TypeError, match=r"cannot be pickled or copied.*state_dict\(\)"):
             copied(thing)
     assert_same(copy.deepcopy(env.state_dict())["qpos"], env.qpos)

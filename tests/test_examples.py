@@ -25,7 +25,7 @@ from learners import PATH, ROOT
 from scenes import with_motors
 
 import diffsim
-from diffsim.__main__ import POLICIES, main
+from diffsim.extra.commands import POLICIES, main
 from diffsim.training import load_policy
 
 EXAMPLES = ROOT / "examples"

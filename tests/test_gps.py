@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from extra.planning.systems import normal
 from learners import assert_refuses, assert_same, read_progress, run
-from planning.systems import normal
 from torch import Tensor
 
 import diffsim
 import gps
-from diffsim.planning import LinearGaussian, System, save_demonstration
+from diffsim.extra.planning import LinearGaussian, System, save_demonstration
 from diffsim.training import evaluate, load_policy, make_policy_env, parse
 from diffsim.training.checkpoint import load, restore
 from diffsim.training.evaluation import make_env

@@ -14,6 +14,7 @@ import warp as wp
 from scenes import SOFT, leg, parse, task_scene
 
 import diffsim
+from diffsim.extra.terrain import rough
 from diffsim.kernels.backward import backward_kernel
 from diffsim.kernels.forward import forward_kernel
 from diffsim.kernels.lanes import divide
@@ -22,7 +23,6 @@ from diffsim.robot.constraint import constrained
 from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.terrain import rough
 
 HORIZON = 32
 KNEE = '<joint name="knee"'

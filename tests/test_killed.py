@@ -19,7 +19,7 @@ from learners import PATH, ROOT, assert_same, read_progress
 
 pytestmark = pytest.mark.slow
 COMMON = "--env cartpole --device cpu --iterations 6 --eval-every 4 --eval-episodes 2 --quiet --threads 1"
-WINDOWS = "--num-envs 6 --horizon 16 --randomise motor=0.7:1.3 mass=0.5:2 --redraw 4"
+WINDOWS = "--env cartpole:motor=0.7:1.3,mass=0.5:2 --num-envs 6 --horizon 16"
 REPLAY = "--num-envs 5 --steps 8 --buffer-size 2000 --batch-size 32 --hidden 16 16"
 FLAGS = {
     "shac": f"{WINDOWS} --critic-iterations 2",

@@ -16,10 +16,10 @@ from learners import PATH, ROOT, refusal
 
 import diffsim
 import shac
-from diffsim import __main__ as command
 from diffsim import startup
+from diffsim.extra import commands as command
+from diffsim.extra import render
 from diffsim.training import load_policy
-from diffsim.view import render
 
 
 @pytest.fixture
@@ -169,7 +169,7 @@ import signal, sys, threading
 before = sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT)
 import diffsim, diffsim.training
 assert before == (sys.excepthook, threading.excepthook, signal.getsignal(signal.SIGINT))
-assert "diffsim.view" not in sys.modules  # no training needs it
+assert "diffsim.extra.render" not in sys.modules  # no training needs it
 """
     subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | PATH)
 

@@ -15,8 +15,9 @@ from torch import Tensor
 
 import diffsim
 import mbpo
-from diffsim.planning import System
-from diffsim.training import Transition, parse
+from diffsim.extra.learning.replay import Transition
+from diffsim.extra.planning import System
+from diffsim.training import parse
 
 FLAGS = (
     "--env ant --device cpu --hidden 16 --model-hidden 16 16 --num-envs 4 --steps 4 --batch-size 32 --seed-steps 0 "

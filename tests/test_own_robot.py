@@ -16,7 +16,7 @@ import diffsim
 import ppo_baseline
 import shac
 import view
-from diffsim.__main__ import main as diffsim_main
+from diffsim.extra.commands import main as diffsim_main
 from diffsim.training import checkpoint, parse
 
 PAGE = (ROOT / "docs" / "own_robot.md").read_text()

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 import os
+import pkgutil
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
+from collections.abc import Iterator
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from learners import PATH
 
 import diffsim
-from diffsim.__main__ import LEARNERS
+from diffsim.extra.commands import LEARNERS
 
 pytest.importorskip("hatchling")
 
@@ -90,7 +95,7 @@ def test_every_part_can_be_imported_by_its_name() -> None:
     import diffsim.robot.scene as scene
 
     assert scene.Scene is diffsim.Scene and diffsim.robot.scene is scene
-    for part in ("kernels", "planning", "robot", "sim", "tasks", "training", "view"):
+    for part in ("extra", "kernels", "robot", "sim", "tasks", "training"):
         assert importlib.import_module(f"diffsim.{part}") is getattr(diffsim, part)
 
 
@@ -104,14 +109,59 @@ def test_no_script_imports_another() -> None:
             assert not scripts.keys() & {part.partition(".")[0] for part in names}, name
 
 
-def test_imports_go_down_the_drawing() -> None:
-    """CONTRIBUTING.md draws the floors of the package. What a module imports when it is itself imported lies below."""
-    floors = ("robot startup", "kernels terrain", "sim", "tasks", "env", "planning training view", "tune")
-    floor = {name: height for height, names in enumerate(floors) for name in names.split()}
+FLOORS = {"kernels": "robot", "sim": "kernels", "tasks": "sim", "env": "tasks", "training": "env"}  # by what lies below
+
+
+def below(part: str) -> set[str]:
+    return {FLOORS[part]} | below(FLOORS[part]) if part in FLOORS else set()
+
+
+def core() -> dict[str, ast.Module]:
+    """The modules of the package except those of diffsim.extra, by their names."""
     package = Path(diffsim.__file__).parent
-    for path in package.rglob("*.py"):
-        own = path.relative_to(package).with_suffix("").parts[0]
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("diffsim.") and own in floor:
-                other = str(node.module).split(".")[1]
-                assert own == other or floor[other] < floor[own], f"{path} imports {node.module}"
+    paths = (path.relative_to(package.parent).with_suffix("") for path in package.rglob("*.py"))
+    names = [".".join(path.parts).removesuffix(".__init__") for path in paths if path.parts[1] != "extra"]
+    files = {name: importlib.util.find_spec(name) for name in names}
+    return {name: ast.parse(Path(str(spec.origin)).read_text()) for name, spec in files.items() if spec}
+
+
+def imports(name: str, tree: ast.Module) -> Iterator[str]:
+    """The modules that a module imports anywhere in its source; of "from a import b" both a and a.b."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{name} has a relative import"
+            yield str(node.module)
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_the_core_does_not_import_the_extras() -> None:
+    """Neither in a function nor for types. What it uses of them it names in a string."""
+    named = set()
+    for name, tree in core().items():
+        found = [each for each in imports(name, tree) if re.match(r"diffsim\.extra(\.|$)", each)]
+        assert not found, f"{name} imports {found[0]}"
+        texts = (node.value for node in ast.walk(tree) if isinstance(node, ast.Constant))
+        named |= {text for text in texts if isinstance(text, str) and re.fullmatch(r"diffsim(\.\w+)*:\w+", text)}
+    assert any(text.startswith("diffsim.extra.") for text in named)
+    for text in named:
+        assert callable(pkgutil.resolve_name(text)), text
+
+
+def test_imports_go_down_the_drawing() -> None:
+    """CONTRIBUTING.md draws the floors of the core. A module imports its own floor and those below."""
+    for name, tree in core().items():
+        own = name.split(".")[1] if "." in name else ""
+        for other in imports(name, tree):
+            part = other.split(".")[1] if other.startswith("diffsim.") else ""
+            if own in {*FLOORS, "robot"} and part in {*FLOORS, "robot"}:
+                assert part == own or part in below(own), f"{name} imports {other}"
+
+
+def test_importing_the_package_loads_no_extra() -> None:
+    for module in ("diffsim", "diffsim.tasks", "diffsim.env"):
+        program = f"import sys, {module}; print([name for name in sys.modules if name.startswith('diffsim.extra')])"
+        command = [sys.executable, "-c", program]
+        found = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | PATH).stdout
+        assert found.strip() == "[]", module

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from extra.planning.systems import Linear, normal
 from learners import assert_resumes, read_progress, run
-from planning.systems import Linear, normal
 from torch import Tensor
 
 import diffsim
 import pods
+from diffsim.extra.export import export_policy
 from diffsim.sim.simulator import Simulator
-from diffsim.training import export_policy, parse
+from diffsim.training import parse
 
 
 def build(*flags: str, task: str = "cartpole", num_envs: int = 3, dtype: torch.dtype = torch.float32) -> pods.PODS:

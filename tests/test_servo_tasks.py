@@ -11,7 +11,7 @@ import servo_tasks
 import torch
 from tables import ROOT
 
-from diffsim import read_clip
+from diffsim.extra.robots.imitation.clip import read_clip
 from diffsim.tasks.base import ASSETS
 
 TROT = ROOT / "examples" / "dog_trot.npz"
@@ -41,7 +41,7 @@ def test_the_trot_is_that_of_the_results() -> None:
 @pytest.fixture(params=["humanoid", "dog"])
 def task(request: pytest.FixtureRequest) -> servo_tasks.HumanoidImitation:
     if request.param == "dog":
-        return servo_tasks.Dog(dtype=torch.float64, clip=read_clip(TROT))
+        return servo_tasks.Dog(dtype=torch.float64)
     return servo_tasks.HumanoidServo(dtype=torch.float64)
 
 
@@ -60,7 +60,7 @@ def test_the_reference_has_every_second_frame_of_the_clip(task: servo_tasks.Huma
 
 
 def test_a_dog_that_lies_down_ends_its_episode() -> None:
-    task = servo_tasks.Dog(dtype=torch.float64, clip=read_clip(TROT))
+    task = servo_tasks.Dog(dtype=torch.float64)
     qpos, qvel = task.reset(torch.full((2, 1), 0.5, dtype=torch.float64))
     qpos[1, 2] = 0.15
     obs = task.observe_with(qpos, qvel, qvel, torch.zeros(2, 1, dtype=torch.float64))

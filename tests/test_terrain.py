@@ -13,12 +13,14 @@ from scenes import BALL, PENDULUM, acting_states, parse, run, task_scene, unit
 from test_gradient import check_gradients
 
 import diffsim
+from diffsim.extra import render
+from diffsim.extra.drive import web
+from diffsim.extra.render import slabs
+from diffsim.extra.terrain import incline, step, uneven
 from diffsim.robot.scene import Scene, TerrainError
+from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
-from diffsim.terrain import LENGTH, LEVEL, Elevation, incline, rough, step, uneven
-from diffsim.view import render, web
-from diffsim.view.render import slabs
 
 IMPLICIT = Integration("implicit", 8, 0.5)  # of the ball; the hopper is explicit, so that two kernels do for all
 # A valley, a ridge, a wall and a short segment; a ball of 0.1 m fits between all of them.
@@ -200,17 +202,19 @@ def test_feet_of_a_joystick_task_are_seen_over_the_ground_below_them():
         torch.testing.assert_close(seen[1] - seen[0], torch.tensor([front, front, hind, hind]).double().expand(2, 4))
 
 
-def test_a_number_of_degrees_makes_uneven_ground():
-    env = diffsim.make("hopper", 3, terrain=12.0, seed=5)
+def test_an_option_makes_uneven_ground():
+    env = diffsim.make("hopper:rough=12", 3, seed=5)
     np.testing.assert_array_equal(env.scene.terrain, uneven(12.0, 3, 5))
-    assert diffsim.make("hopper", 3, terrain=None, seed=5).scene.terrain is None
-    for count, degrees, seed, message in (
-        (0, 12.0, 5, "num_envs is 0, must be an integer of at least 1"),
-        (3, 12.0, 2.5, "seed is 2.5, must be one integer"),
-        (3, np.float32(95), 5, "terrain is 95.0, must be from 0 to 45 degrees"),
+    assert diffsim.make("hopper", 3, seed=5).scene.terrain is None
+    profile = step(0.1)  # which is given takes its place
+    np.testing.assert_array_equal(diffsim.make("hopper:rough=12", 3, terrain=profile).scene.terrain, profile[None])
+    for name, count, seed, message in (
+        ("hopper:rough=12", 0, 5, "num_envs is 0, must be an integer of at least 1"),
+        ("hopper:rough=12", 3, 2.5, "seed is 2.5, must be one integer"),
+        ("hopper:rough=95", 3, 5, "'rough=95': the steepest slope must be above 0 and at most 45 degrees"),
     ):
         with pytest.raises(ValueError, match=message):
-            diffsim.make("hopper", count, terrain=degrees, seed=seed)
+            diffsim.make(name, count, seed=seed)
 
 
 def test_environments_that_share_a_task_have_their_own_ground():
@@ -261,44 +265,6 @@ def test_what_cannot_have_a_terrain_says_so():
         diffsim.make("hopper", 3, terrain=[PLANE, PLANE])
     with pytest.raises(ValueError, match="hopper has no terrain"):
         Elevation(task_scene("hopper"), "cpu", torch.float64)
-
-
-def test_generated_profiles():
-    np.testing.assert_allclose(incline(-45.0, start=2.0), [[1, 0], [2, 0], [3, -1]], atol=1e-12)
-    np.testing.assert_allclose(step(-0.3), [[0, 0], [1, 0], [1, -0.3], [2, -0.3]])
-    profile = rough(7, segment=2.0, degrees=15.0, length=20.0, start=3.0)
-    x, z = profile.T
-    assert profile.shape == (13, 2)
-    np.testing.assert_allclose(x, [2.0, *np.arange(3.0, 24.0, 2.0), 24.0])
-    angles = np.degrees(np.arctan(np.diff(z) / np.diff(x)))
-    assert angles[0] == angles[-1] == 0 and 5 < abs(angles).max() < 15
-    assert np.array_equal(profile, rough(7, 2.0, 15.0, 20.0, 3.0)) and not np.array_equal(
-        profile, rough(8, 2.0, 15.0, 20.0, 3.0)
-    )
-    profiles = uneven(20.0, 4, seed=-3)
-    x, z = np.moveaxis(profiles, 2, 0)
-    assert (z[abs(x) <= LEVEL] == 0).all()
-    np.testing.assert_allclose([-x.min(), x.max()], LENGTH + LEVEL + 1)
-    angles = np.degrees(np.arctan(np.diff(z) / np.diff(x)))
-    np.testing.assert_allclose(abs(angles).max(1), [5, 10, 15, 20], rtol=0.08)  # profile by profile
-    assert (abs(angles).max(1) < [5, 10, 15, 20]).all() and abs(angles.mean()) < 3
-    assert len(np.unique(z[:, -1])) == len(np.unique(z[:, 0])) == 4
-    assert np.array_equal(profiles, uneven(20.0, 4, -3)) and not np.array_equal(profiles, uneven(20.0, 4, 4))
-    for make, message in (
-        (lambda: uneven(95.0, 1), "degrees is 95.0, must lie between -90 and 90"),
-        (lambda: incline(90.0), "degrees is 90.0, must lie between -90 and 90"),
-        (lambda: step(0.0), "height is 0.0, must be finite and not 0"),
-        *(
-            (lambda w=w: rough(0, *w), f"length is {w[2]}, must be 1 to 10000 segments of {w[0]}")
-            for w in ((0.0, 10.0, 50.0), (4.0, 10.0, 1.0), (1e-300, 10.0, 50.0), (np.nan, 10.0, 50.0))
-        ),
-        *((lambda s=s: rough(s), f"seed is {s}, must be an integer of at least 0") for s in (1.5, np.inf, np.nan, -1)),
-    ):
-        with pytest.raises(ValueError, match=message):
-            make()
-    for profile in (incline(1.0, start=np.inf), step(1.0, start=np.inf), rough(0, start=np.nan)):
-        with pytest.raises(TerrainError):
-            task_scene("hopper").with_terrain(profile)
 
 
 def test_pictures_show_it(opengl):

@@ -11,7 +11,7 @@ import torch
 from learners import refusal
 
 import view
-from diffsim import __main__ as command
+from diffsim.extra import commands as command
 from diffsim.training import load_policy, make_policy_env
 
 

@@ -12,14 +12,13 @@ import diffsim
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 HEAD = """# API
 
-`python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. `NumpyEnv`
-and `NumpyVectorEnv`: [gymnasium.md](gymnasium.md). `read_clip`: [tracking.md](tracking.md#clips). `SceneError` and
-`TaskError` are `ValueError`s.
+`python tools/api.py` writes this page from docstrings; `help` shows more. N is the number of environments. `SceneError`
+and `TaskError` are `ValueError`s.
 """
 NAMES = "make DiffEnv Simulator Integration Task load_scene".split()
 # Methods that few programs need
 INTERNAL = """pin carry_over take_statistics advance check_tensor rewind tangent explicit replaced check load_robot
-scene bind presets integration falls metadata over ghost program disturb observe_with""".split()
+scene bind presets integration falls has_mirror configured terrain stored restored over ghost disturb observe_with""".split()
 
 
 def signature(thing: object) -> str:

@@ -17,8 +17,8 @@ import torch
 import tyro
 from tyro.conf import Positional
 
-from diffsim.__main__ import POLICIES
-from diffsim.tasks.joystick import Joystick
+from diffsim.extra.commands import POLICIES
+from diffsim.extra.robots.joystick import Joystick
 from diffsim.training import command, evaluate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))

@@ -32,13 +32,13 @@ from PIL import Image, ImageDraw, ImageFont
 from tyro.conf import Positional
 
 from diffsim import TASKS, Scene
-from diffsim.__main__ import DEMO_EPISODES, POLICIES
+from diffsim.extra.commands import DEMO_EPISODES, POLICIES
+from diffsim.extra.gait import TOUCHING
+from diffsim.extra.render import Frame, Renderer, whole_file
+from diffsim.extra.robots.imitation.tracking import Tracking
+from diffsim.extra.robots.joystick import Joystick
 from diffsim.robot.contact import contact_bodies, trace
-from diffsim.tasks.imitation.tracking import Tracking
-from diffsim.tasks.joystick import Joystick
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
-from diffsim.training.gait import TOUCHING
-from diffsim.view.render import Frame, Renderer, whole_file
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from common import Case, load_case  # noqa: E402

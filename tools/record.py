@@ -14,9 +14,9 @@ import tyro
 from torch import Tensor
 from tyro.conf import Positional
 
-from diffsim.tasks.imitation.clip import Clip, tangent
+from diffsim.extra.render import whole_file
+from diffsim.extra.robots.imitation.clip import Clip, tangent
 from diffsim.training import command, evaluate, fail, load_policy, make_policy_env
-from diffsim.view.render import whole_file
 
 SETTLING = 3.0  # s at the start of the episode that are left out
 SHORTEST = 0.3  # s

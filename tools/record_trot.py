@@ -13,8 +13,8 @@ from record import close, cycle
 from torch import Tensor
 
 import diffsim
+from diffsim.extra.robots.imitation.clip import Clip
 from diffsim.tasks.base import ASSETS
-from diffsim.tasks.imitation.clip import Clip
 from diffsim.training import load_policy
 
 COMMAND = (0.8, 0.0, 0.0)  # m/s forward, which the recorded dog follows

@@ -1,34 +1,75 @@
-"""The tasks, one file each."""
+"""The tasks of the paper, one file each, and the names of all others, which are loaded when they are asked for."""
 
 from __future__ import annotations
 
-from diffsim.tasks.ant import Ant
-from diffsim.tasks.base import Accuracy, Contact, Task, TaskError
-from diffsim.tasks.cartpole import CartPole
-from diffsim.tasks.half_cheetah import HalfCheetah
-from diffsim.tasks.hopper import Hopper
-from diffsim.tasks.humanoid import Humanoid
-from diffsim.tasks.humanoid_mtu import HumanoidMTU
-from diffsim.tasks.imitation.task import HumanoidImitation, Imitation
-from diffsim.tasks.imitation.tracking import G1Track
-from diffsim.tasks.joystick import G1, Go1, Go2
-from diffsim.tasks.own import FILE, task_of_file
-from diffsim.tasks.swimmer import Swimmer
-from diffsim.tasks.walker import Walker
+import pkgutil
+import re
+from collections.abc import Iterator, Mapping
 
-TASKS: dict[str, type[Task]] = {
-    task.name: task
-    for task in (
-        *(CartPole, Hopper, HalfCheetah, Ant, Humanoid, HumanoidMTU, Swimmer, Walker, HumanoidImitation),
-        *(Go1, Go2, G1, G1Track),
-    )
+from diffsim.tasks.base import Accuracy, Contact, Task, TaskError
+
+FILE = re.compile(r"(.+\.py)(?::(\w+))?")  # a task of your own: my_task.py or my_task.py:Class
+OWN_TASK = "diffsim.extra.own_task:task_of_file"
+REGISTERED = {
+    "cartpole": "diffsim.tasks.cartpole:CartPole",
+    "hopper": "diffsim.tasks.hopper:Hopper",
+    "half_cheetah": "diffsim.tasks.half_cheetah:HalfCheetah",
+    "ant": "diffsim.tasks.ant:Ant",
+    "humanoid": "diffsim.tasks.humanoid:Humanoid",
+    "humanoid_mtu": "diffsim.tasks.humanoid_mtu:HumanoidMTU",
+    # not in the paper
+    "swimmer": "diffsim.extra.robots.swimmer:Swimmer",
+    "walker": "diffsim.extra.robots.walker:Walker",
+    "humanoid_imitation": "diffsim.extra.robots.imitation.task:HumanoidImitation",
+    "go1": "diffsim.extra.robots.joystick:Go1",
+    "go2": "diffsim.extra.robots.joystick:Go2",
+    "g1": "diffsim.extra.robots.joystick:G1",
+    "g1_track": "diffsim.extra.robots.imitation.tracking:G1Track",
 }
 
 
+class Tasks(Mapping[str, type[Task]]):
+    """The registered tasks by name. A class is imported when it is first looked up."""
+
+    def __getitem__(self, name: str) -> type[Task]:
+        kind: type[Task] = pkgutil.resolve_name(REGISTERED[name])
+        return kind
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(REGISTERED)
+
+    def __len__(self) -> int:
+        return len(REGISTERED)
+
+
+TASKS = Tasks()
+_restored: dict[str, type[Task]] = {}  # those that a checkpoint brought along, by the name with which it was trained
+
+
+def base_name(name: str) -> str:
+    """Return a task's name without the options that follow it."""
+    return name if FILE.fullmatch(name) else name.partition(":")[0]
+
+
 def find_task(name: str | type[Task]) -> type[Task]:
-    """The task of a name in TASKS or of a file, my_task.py or my_task.py:Class; a class is one. Raises TaskError."""
+    """Return the class of a task; raises TaskError if there is none.
+
+    Args:
+        name: one of TASKS; one of them with options, "go2:rough=20" or "g1_track:walk.npz", see Task.configured; a file
+            with a task of your own, "my_task.py" or "my_task.py:Class"; or a class, which is returned as it is.
+    """
     if isinstance(name, type) and issubclass(name, Task):
         return name
-    if name not in TASKS and not FILE.fullmatch(str(name)):
+    if FILE.fullmatch(str(name)):
+        kind: type[Task] = pkgutil.resolve_name(OWN_TASK)(name)
+        return kind
+    base, options = base_name(str(name)), str(name).partition(":")[2]
+    if base not in TASKS:
         raise TaskError(f"unknown task {name!r}: choose from {', '.join(TASKS)}, or give a file such as my_task.py")
-    return TASKS.get(name) or task_of_file(name)
+    return _restored.get(name) or (TASKS[base].configured(options) if options else TASKS[base])
+
+
+def restore_task(name: str, stored: dict[str, object]) -> None:
+    """Let `find_task` return the task of a name as a checkpoint stored it (Task.stored), without its files."""
+    if stored:
+        _restored[name] = TASKS[base_name(name)].restored(name, stored)

@@ -9,30 +9,30 @@ from __future__ import annotations
 
 import math
 import os
+import pkgutil
 import sys
-from collections.abc import Mapping
 from difflib import get_close_matches
+from functools import cached_property
 from numbers import Integral
 from pathlib import Path
-from types import MappingProxyType
-from typing import ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import mujoco
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from diffsim.robot.mjcf import load_scene
 from diffsim.robot.scene import Scene
+from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import TOLERANCE, Integration, is_real
-from diffsim.tasks.mirror import Mirror
-from diffsim.terrain import Elevation
 
 Accuracy = Literal["fast", "default", "accurate"]
 Contact = Literal["soft", "mujoco"]
 Asset: TypeAlias = str | os.PathLike[str] | mujoco.MjModel | mujoco.MjSpec
 RATE = {"soft": 960, "mujoco": 240}  # 1/s, substeps of a task that does not say how many
+OPTIONS = "diffsim.extra.variation:configure"  # what reads options after a task's name
 LIKENESS = 0.9  # of a misspelt name, by difflib's measure
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
@@ -61,11 +61,10 @@ class Task:
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
     touchdown: ClassVar[bool] = True  # of the presets on MuJoCo's contact, see Integration
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
-    randomise: ClassVar[tuple[str, ...]] = ()  # ranges that learners draw unless told otherwise, as in --randomise
+    mirrored_by: ClassVar[str | None] = None  # "module:function" that makes its `mirror`
+    varied_by: ClassVar[str | None] = None  # "module:Class" of what a training changes, see extra/variation.py
     num_memory: ClassVar[int] = 0  # numbers kept for each environment from step to step: see begin and remember
     num_noise: ClassVar[int] = 0  # random numbers per control step, for `remember`
-    # Ranges of what `disturb` does, by names of --randomise: "latency" [control steps], "push" [m/s], "pull" [m/s^2]
-    disturbances: Mapping[str, tuple[float, float]] = MappingProxyType({})
     episode_length: ClassVar[int] = 1000  # control steps
     control_dt: float = 1 / 60  # s
     min_height: ClassVar[float | None] = None  # m; the episode ends when obs[0] is below
@@ -74,6 +73,7 @@ class Task:
     spread: tuple[float, ...] | float = 0.0
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
+        self.device, self.dtype = torch.device(device), dtype
         self._start = torch.tensor(self.start, device=device, dtype=dtype)
         self._spread = torch.tensor(self.spread, device=device, dtype=dtype)
         self._nq, self._quaternions = (len(self.start) + 1) // 2, list[int]()
@@ -222,10 +222,41 @@ class Task:
         """Whether episodes end where the robot falls, not only by time."""
         return cls.min_height is not None or cls.terminated is not Task.terminated
 
-    @property
-    def mirror(self) -> Mirror:
-        """How the task looks with left and right exchanged; raises ValueError if it has no mirror image."""
-        raise ValueError(f"task {self.name!r} has no mirror image")
+    @classmethod
+    def has_mirror(cls) -> bool:
+        """Whether the task has a mirror image."""
+        return cls.mirrored_by is not None
+
+    @cached_property
+    def mirror(self) -> Any:
+        """How the task looks with left and right exchanged, see extra/mirror.py; raises ValueError if it has no image.
+
+        It is made when first asked for, which a CUDA graph cannot capture, so ask before.
+        """
+        if self.mirrored_by is None:
+            raise ValueError(f"task {self.name!r} has no mirror image")
+        return pkgutil.resolve_name(self.mirrored_by)(self)
+
+    @classmethod
+    def configured(cls, options: str) -> type[Task]:
+        """Return the task with the options that follow its name and a colon; raises TaskError for unknown ones."""
+        configured: type[Task] = pkgutil.resolve_name(OPTIONS)(cls, options)
+        return configured
+
+    @classmethod
+    def terrain(cls, num_envs: int, seed: int) -> np.ndarray | None:
+        """Return the profiles of its ground, (K, 2) or (num_envs, K, 2), see Scene.with_terrain; None: a plane."""
+        return None
+
+    @classmethod
+    def stored(cls) -> dict[str, Any]:
+        """Return what a checkpoint must hold of it to make it again, besides its name: data that torch.save takes."""
+        return {}
+
+    @classmethod
+    def restored(cls, name: str, stored: dict[str, Any]) -> type[Task]:
+        """Return the task of a name, its own and options, with what `stored` gave."""
+        raise NotImplementedError
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """Start states qpos (..., nq), qvel (..., nv) from rand (..., num_random), uniform in [0, 1).
@@ -262,15 +293,6 @@ class Task:
     def ghost(self, memory: Tensor) -> Tensor | None:
         """World qpos (..., nq) of what the robot is to track, which films and pages draw next to it, or None."""
         return None
-
-    def program(self, policy: nn.Module, columns: int) -> tuple[nn.Module, dict[str, tuple[int, ...]], list[str]]:
-        """What `export` writes as ONNX of a policy of observations (batch, columns): a module, its inputs' names and
-        shapes without the batch, and its outputs' names."""
-        return policy, {"observation": (columns,)}, ["action"]
-
-    def metadata(self) -> dict[str, str]:
-        """What a program needs to know of the task that runs its policy, for `export`."""
-        return {}
 
     def disturb(self, qvel: Tensor, action: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """The qvel (..., nv) and action (..., nu) that a control step takes instead of these: pushes, delays.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -11,10 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from diffsim.tasks.base import Task
-from diffsim.tasks.mirror import PSEUDOVECTOR, VECTOR, Mirror, Reflection, Sides, reflections
 
 FORWARD_VELOCITY = 5  # column of the observation: v_x
-FREQUENCY_OF_PUSHES = 0.25  # 1/s
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
@@ -33,7 +30,8 @@ class Locomotion(Task):
     joint_spread: ClassVar[float] = 0.4  # rad
     observe_action: ClassVar[bool] = True
     target: ClassVar[float]  # m; the robot is to face the point (target, 0)
-    sides: ClassVar[Sides]  # (right, left) beginnings or ends of the names of joints and actuators, see mirror
+    sides: ClassVar[tuple[tuple[str, str], ...]]  # (right, left) beginnings or ends of names, see mirror
+    mirrored_by = "diffsim.extra.mirror:mirror_of_locomotion"
 
     def __init__(self, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         joints = len(self.start_joints)
@@ -50,16 +48,6 @@ class Locomotion(Task):
         self._progress = torch.zeros(self.obs_dim, device=device, dtype=dtype)
         up = 11 + joints + rates
         self._progress[FORWARD_VELOCITY], self._progress[up], self._progress[up + 1] = 1.0, 0.1, 1.0
-
-    @cached_property
-    def mirror(self) -> Mirror:
-        """See Task. It is made when first asked for, which a CUDA graph cannot capture, so ask before."""
-        device, dtype = self._start.device, self._start.dtype
-        qpos, qvel, action, joints, rates = reflections(self.load_robot().mj_model, self.sides, device, dtype)
-        root = (1.0, *PSEUDOVECTOR, 1.0, *VECTOR, *PSEUDOVECTOR)  # height to angular velocity
-        fixed = [Reflection.of(enumerate(signs), device, dtype) for signs in (root, (1.0, 1.0))]
-        seen = (fixed[0], joints, rates, fixed[1])  # as in observe
-        return Mirror(qpos, qvel, action, Reflection.cat((*seen, action) if self.observe_action else seen))
 
     def reset(self, rand: Tensor) -> tuple[Tensor, Tensor]:
         """Start states from rand, see Task. The root is turned by up to 7.5 degrees about a random axis."""
@@ -90,22 +78,3 @@ class Locomotion(Task):
     def progress(self, obs: Tensor) -> Tensor:
         """R_v + 0.1 R_up + R_heading of Eqs. 19, 20 and 23 (...)."""
         return (obs * self._progress).sum(-1)
-
-
-def score(square: Tensor, scale: float) -> Tensor:
-    """log(1 + square / scale): a parabola near 0; far away it does not drown the other terms, and has a slope."""
-    return torch.log1p(square / scale)
-
-
-def push(noise: Tensor, sizes: tuple[float, float], control_dt: float) -> Tensor:
-    """What a push at random, if one is due, adds to the root's horizontal velocity: (..., 2) m/s.
-
-    Args:
-        noise: (..., 3) uniform in [0, 1); 0.5 is no push.
-        sizes: the least and the largest, m/s.
-        control_dt: s, in which one comes with FREQUENCY_OF_PUSHES.
-    """
-    due, size, way = noise.split(1, dim=-1)
-    (least, most), way = sizes, 2.0 * math.pi * way
-    size = (least + (most - least) * size) * (due < control_dt * FREQUENCY_OF_PUSHES)
-    return size * torch.cat((way.cos(), way.sin()), dim=-1)

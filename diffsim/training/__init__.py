@@ -6,8 +6,7 @@ The physics knows nothing of this package.
 from __future__ import annotations
 
 from diffsim.training import distributed
-from diffsim.training.checkpoint import Learner, SavedPolicy, export_onnx, export_policy, load_policy
-from diffsim.training.ensemble import Ensemble, EnsembleAdam
+from diffsim.training.checkpoint import Learner, SavedPolicy, load_policy
 from diffsim.training.errors import UsageError, fail
 from diffsim.training.evaluation import Evaluation, evaluate, evaluate_checkpoint, make_policy_env
 from diffsim.training.flags import parse
@@ -15,5 +14,4 @@ from diffsim.training.layers import Likeliest, ObsNormalizer
 from diffsim.training.main import command, script
 from diffsim.training.optimizer import ClippedAdam
 from diffsim.training.ranges import Count, Natural, NonNegative, Positive
-from diffsim.training.replay import ReplayBuffer, Transition
 from diffsim.training.run import Run

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import io
-import logging
 import os
 import re
-import warnings
 import zipfile
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import mujoco
 import torch
 from torch import nn
 
 from diffsim.env import DiffEnv
-from diffsim.robot.elements import control_range, servos
-from diffsim.tasks import FILE, TASKS
-from diffsim.tasks.imitation.clip import Clip, read_clip, shipped
+from diffsim.tasks import FILE, TASKS, base_name, restore_task
 from diffsim.training.errors import fail
 from diffsim.training.layers import Both, First, Fold, Likeliest, ObsNormalizer
 
@@ -73,12 +67,12 @@ class SavedPolicy:
 
         Raises ValueError if the policy was trained on a file's task and none is given, or on another one of TASKS.
         """
-        own = FILE.fullmatch(trained := self.args["env"])
-        if own and given is None:
+        trained = self.args["env"]
+        if (own := FILE.fullmatch(trained)) and given is None:
             fail(f"a policy of your own task: give its file, whose code runs, by --env {trained} (drive: as robot)")
-        if not own and given != trained and given in TASKS:
+        if given is not None and not own and base_name(given) in {*TASKS} - {base_name(trained)}:
             fail(f"a policy that was trained on {trained}, not on {given}")
-        return given or self.args["env"]
+        return given or trained
 
 
 def parts(learner: Learner) -> dict[str, Any]:
@@ -99,10 +93,10 @@ def save(path: Path, script: str, learner: Learner, state: Mapping[str, Any]) ->
     """
     modules = {name: part.state_dict() for name, part in parts(learner).items()}
     policy = {"layers": _describe(learner.policy), "weights": learner.policy.state_dict()}
-    _write(path, {"format": FORMAT, "script": script, **state, "modules": modules, "policy": policy})
+    write(path, {"format": FORMAT, "script": script, **state, "modules": modules, "policy": policy})
 
 
-def _write(path: Path, content: Mapping[str, Any]) -> None:
+def write(path: Path, content: Mapping[str, Any]) -> None:
     buffer = io.BytesIO()  # torch.save to a full disk raises what says nothing of it
     torch.save(content, buffer)
     temporary = path.with_name(f"{path.name}.tmp")
@@ -135,8 +129,7 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
     try:
         with zipfile.ZipFile(path) as archive:
             whole = archive.testzip() is None  # torch does not look at the checksums that it writes
-        with torch.serialization.safe_globals([Clip]):  # the one that the policy was trained on
-            state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         form = state["format"]
         whole = whole and (form != FORMAT or state.keys() >= POLICY)
     except Exception:  # zipfile and torch.load raise whatever broken bytes lead them to
@@ -147,8 +140,7 @@ def load(path: str | os.PathLike[str], script: str | None = None) -> dict[str, A
         fail(f"{path} is a checkpoint of format {form!r}, and this version reads format {FORMAT}")
     if script not in (None, state["script"]):
         fail(f"{path} is a checkpoint of {state['script']!r}, not of {script}.py")
-    if isinstance(name := state["args"].get("clip"), str):
-        state["args"]["clip"] = read_clip(shipped().get(name, name))
+    restore_task(state["args"]["env"], state.get("task", {}))
     return state
 
 
@@ -161,87 +153,11 @@ def load_policy(path: str | os.PathLike[str]) -> SavedPolicy:
             kinds = {name: weight.dtype for name, weight in network.state_dict().items()}
         weights = {name: w.to(kinds[name]) for name, w in state["policy"]["weights"].items()}  # searched in float64
         network.load_state_dict(weights, assign=True)
-        if task := TASKS.get(state["args"]["env"]):
+        if task := TASKS.get(base_name(state["args"]["env"])):
             network(torch.zeros(1, task.obs_dim))  # on the device meta this would take seconds, of torch's imports
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
         fail(f"{path} is not a complete checkpoint: its policy's weights do not fit its layers or its task")
     return SavedPolicy(network, state["script"], state["args"], state["iteration"], state.get("simulator", HOME))
-
-
-def export_policy(path: str | os.PathLike[str], output: Path, half: bool = False) -> None:
-    """Write what load_policy needs of a checkpoint: its policy and where that comes from, some hundred kB.
-
-    A clip that comes with the package is kept by its name. half: weights are rounded to 16 bits.
-    """
-    state = load(path)
-    if isinstance(clip := state["args"].get("clip"), Clip) and clip.name in shipped():
-        state["args"]["clip"] = clip.name if read_clip(clip.name) == clip else clip
-    if half:
-        state["policy"]["weights"] = {name: w.half() for name, w in state["policy"]["weights"].items()}
-    _write(output, {name: value for name, value in state.items() if name in {"format", "simulator", *POLICY}})
-
-
-def export_onnx(saved: SavedPolicy, env: DiffEnv, output: Path) -> None:
-    """Write the policy as ONNX, "observation" (batch, n) -> "action" (batch, nu), clipped to [-1, 1] as env does.
-
-    n is how many columns the policy sees (Task.actor_dim). Some tasks have other inputs, see Task.program. `describe`
-    says what all the numbers are.
-    """
-    try:
-        import onnx
-        import onnxscript  # noqa: F401  # torch.onnx needs it
-    except ImportError:
-        fail('ONNX needs packages that are not installed: pip install -e ".[onnx]"')
-    layers, n = list(saved.network), env.task.obs_dim
-    match layers:
-        case [ObsNormalizer() as whole, First(columns=n), *others]:
-            layers = [normalizer := ObsNormalizer(n), *others]
-            normalizer.mean, normalizer.std = whole.mean[:n], whole.std[:n]
-    module, shapes, outputs = env.task.program(nn.Sequential(*layers, nn.Hardtanh()), n)
-    policy = module.eval(), tuple(torch.zeros(2, *shape) for shape in shapes.values())
-    names: dict[str, Any] = dict(input_names=[*shapes], output_names=outputs, verbose=False)
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that there is no torchvision
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch, about its own code
-        batch = ({0: torch.export.Dim("batch")},) * len(shapes)
-        # Its optimizer takes the tiny number that keeps a root from 0 for 0.
-        program: Any = torch.onnx.export(*policy, dynamo=True, dynamic_shapes=batch, optimize=False, **names)
-    model = program.model_proto
-    for node in model.graph.node:
-        del node.metadata_props[:]  # paths of this machine
-    onnx.helper.set_model_props(model, describe(saved, env, sum(shapes.get("observation", ()))))
-    output.write_bytes(model.SerializeToString())
-
-
-def describe(saved: SavedPolicy, env: DiffEnv, columns: int) -> dict[str, str]:
-    """What a program needs to know that runs the policy, as an ONNX file's metadata.
-
-    columns are those of the observation that it sees, 0 if it takes none.
-
-    Keys and formats are mjlab's where it has one: lists are separated by commas, and joints are in the action's order.
-    What does not hold for a task is left out.
-    """
-    task, m = env.task, env.scene.mj_model
-    low, high = control_range(m)
-    controls = zip(range(m.nu), low, high, strict=True)
-    told = dict(task=task.name, script=saved.script, iteration=str(saved.iteration), control_dt=str(env.control_dt))
-    told["actuators"] = joined(f"{m.actuator(a).name or a}[{least:.9g}:{most:.9g}]" for a, least, most in controls)
-    if task.obs_parts and columns:
-        seen = Counter([name for name, size in task.obs_parts for _ in range(size)][:columns])
-        told |= dict(observation_names=joined(seen), observation_sizes=joined(seen.values()))
-    if (m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT).all():
-        told["joint_names"] = joined(m.joint(j).name for j in m.actuator_trnid[:, 0])
-        if servos(m).all() and (m.actuator_gear[:, 0] == 1).all():
-            told |= dict(joint_stiffness=joined(m.actuator_gainprm[:, 0]))
-            told |= dict(joint_damping=joined(0.0 - m.actuator_biasprm[:, 2]))
-        if "joint_stiffness" in told and columns:  # target = default_joint_pos + action_scale * action
-            told |= dict(default_joint_pos=joined((low + high) / 2), action_scale=joined((high - low) / 2))
-    return told | task.metadata()
-
-
-def joined(values: Iterable[object]) -> str:
-    """Values as they are, numbers with 9 digits, separated by commas."""
-    return ",".join(f"{value:.9g}" if isinstance(value, float) else str(value) for value in values)
 
 
 def restore(learner: Learner, state: Mapping[str, Any], env: tuple[DiffEnv, Any] | None = None) -> None:

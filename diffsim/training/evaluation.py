@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-import csv
 import dataclasses
 import json
+import pkgutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -22,18 +22,20 @@ import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
 from diffsim.sim.integration import Integration
-from diffsim.training import checkpoint, gait, graph
+from diffsim.training import checkpoint, graph
 from diffsim.training.checkpoint import SavedPolicy
 from diffsim.training.directory import check_writable, say
 from diffsim.training.errors import fail
 from diffsim.training.flags import OPTIONS, Args, Flags
 
+FILM = "diffsim.extra.render:film"
+GAIT = "diffsim.extra.gait:report"
 VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
 FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
 ENOUGH = 0.97  # of the return, kept there
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
-SETTINGS = OPTIONS | {"env", "device", "eval_episodes", "rough"}
+SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
 
 
 @dataclass
@@ -91,10 +93,6 @@ class Evaluation:
         steps = int(self.lengths[number])
         return self.qpos[:steps, number].numpy(force=True), self.action[:steps, number].numpy(force=True)
 
-    def gait(self) -> gait.Gait:
-        """How the robot moves over the ground."""
-        return gait.measure(self.scene, self.control_dt, map(self.episode, range(len(self.returns))))
-
     def save_video(self, path: Path, seconds: float = VIDEO_SECONDS, **options: Any) -> Path:
         """Film the first seconds of the episode of median return, as .mp4 or .gif; returns the file.
 
@@ -103,20 +101,13 @@ class Evaluation:
         Raises:
             OSError, RuntimeError: what is missing to draw or to write, see render.film.
         """
-        from diffsim.view import render  # a run without a video draws nothing
-
         steps, scene = max(1, round(seconds / self.control_dt)), self.scene
         qpos, action = (rows[:steps] for rows in self.episode(self.median))
         ghost = None if self.ghost is None else self.ghost[:, self.median].numpy(force=True)
         if scene.terrain is not None:
             scene = scene.with_terrain(scene.terrain[self.median % len(scene.terrain)])
-        return render.film(path, scene, qpos, self.control_dt, action, ghost=ghost, **options)
-
-
-def gait_lines(parts: gait.Gait) -> str:
-    """A line for each foot, and one for the robot."""
-    lines = (", ".join(f"{name} {value:.3g}" for name, value in numbers.items()) for numbers in parts.values())
-    return "\n".join(f"{part:16}  {line}" for part, line in zip(parts, lines, strict=True))
+        film = pkgutil.resolve_name(FILM)  # a run without a video loads no OpenGL
+        return film(path, scene, qpos, self.control_dt, action, ghost=ghost, **options)
 
 
 def kept(own: float, finer: float) -> float:
@@ -204,7 +195,7 @@ def fitting(network: nn.Module, env: DiffEnv) -> nn.Module:
 def make_env(args: Flags | SimpleNamespace, num_envs: int, horizon: int = 1, seed: int = 0, **others: Any) -> DiffEnv:
     """The task as flags ask for it, with further options of diffsim.make; what is wrong ends the script."""
     options: dict[str, Any] = {name: value for name, value in vars(args).items() if name in OPTIONS}
-    options |= dict(threads=args.threads or None, terrain=getattr(args, "rough", 0.0) or None)
+    options["threads"] = args.threads or None
     try:
         return diffsim.make(args.env, num_envs, args.device, seed, horizon, **options | others)
     except ValueError as error:
@@ -260,13 +251,9 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
 
 
 def write_evaluation(args: Flags, evaluation: Evaluation, iteration: int, **found: Any) -> None:
-    """Print the gait, and leave gait.csv and evaluation.json in the run's directory."""
+    """Leave evaluation.json in the run's directory, and print and leave how the robot walks."""
     assert args.run_dir
     settings = {name: value for name, value in vars(args).items() if name in SETTINGS}
     settings |= dict(script=args.script(), iteration=iteration)
     evaluation.write_json(args.run_dir / "evaluation.json", settings, **found)
-    if numbers := evaluation.gait():
-        say(gait_lines(numbers))
-        rows = [(part, name, value) for part, values in numbers.items() for name, value in values.items()]
-        with (args.run_dir / "gait.csv").open("w", newline="") as file:
-            csv.writer(file).writerows([("part", "number", "value"), *rows])
+    pkgutil.resolve_name(GAIT)(evaluation, args.run_dir)

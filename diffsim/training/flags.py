@@ -12,32 +12,19 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 
 from diffsim.sim.integration import PASSES, TOLERANCE
-from diffsim.tasks import FILE, TASKS, Accuracy, Contact, Imitation, Task, find_task
-from diffsim.tasks.imitation.clip import Clip, read_clip
-from diffsim.terrain import STEEPEST
+from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, in_one_line
 from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Range, Repeats, check_ranges, flag
-from diffsim.training.variation import parse_ranges
 
-ClipFile = Annotated[
-    Clip | None,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="FILE",
-        instance_from_str=lambda words: words[0],  # which _cli reads: tyro's complaints have many lines
-        is_instance=lambda value: value is None or isinstance(value, Clip | str),
-        str_from_instance=lambda clip: [str(clip)],
-    ),
-]
 FIXED = ("env", "seed", "num_envs", "control_dt")  # with --resume; what else must fit, `restore` tells
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
-OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination clip control_dt".split()}
-EVALUATED = OPTIONS - {"control_dt"} | {
-    *"accuracy device eval_episodes evaluate finer quiet rough run_dir threads".split()
-}
-ENV = f"task: {', '.join(TASKS)}, or a file of your own, my_task.py or my_task.py:Class (docs/own_robot.md)"
-Slope = Annotated[float, Range(f"from 0 to {STEEPEST:g}", lambda degrees: 0 <= degrees <= STEEPEST)]
+OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination control_dt".split()}
+EVALUATED = OPTIONS - {"control_dt"} | {*"accuracy device eval_episodes evaluate finer quiet run_dir threads".split()}
+ENV = (
+    f"task: {', '.join(TASKS)}, with options as in go2:rough=20 or g1_track:walk.npz (docs/tasks.md); "
+    "or a file of your own, my_task.py or my_task.py:Class (docs/own_robot.md)"
+)
 Seed = Annotated[int, Range("below 2^62 in size", lambda value: abs(value) < 2**62)]  # ranks add to it
 
 
@@ -92,8 +79,6 @@ class Flags:
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
     early_termination: bool = True
     """end episodes when the robot falls; otherwise they end only by time"""
-    clip: ClipFile = None
-    """motions that g1_track or humanoid_imitation tracks: a file, a folder, or a shipped clip (docs/tracking.md)"""
     threads: Natural = 0
     """CPU threads of the simulator; they do not change results (0: chosen by the amount of work)"""
 
@@ -120,25 +105,11 @@ class ParallelFlags(Flags):
     """parallel environments N, over all processes of torchrun (per task)"""
     cuda_graph: bool = True
     """on a GPU, replay an iteration as CUDA graphs; otherwise the same code runs operation by operation"""
-    randomise: tuple[str, ...] = ()
-    """ranges from which environments draw: friction=0.7:1.3, stiffness, mass, motor; latency, push, pull (per task)"""
-    rough: Slope = 0.0
-    """steepest slope of rough ground along x in degrees, another profile for each environment (0: a plane)"""
-    redraw: Count = 10
-    """iterations after which the ranges of --randomise are drawn again"""
     monitor: Natural = 50
     """iterations between replays of 32 steps with 4 times the substeps (sim/state_error, sim/return_lost); 0: none"""
 
-    def task_defaults(self) -> dict[str, Any]:
-        return {"randomise": find_task(self.env).randomise}
-
     def check(self) -> None:
         super().check()
-        task = find_task(self.env)
-        try:
-            parse_ranges(self.randomise, task)
-        except ValueError as error:
-            fail(f"--randomise: {error}")
         if self.num_envs % distributed.size():
             fail(f"--num-envs {self.num_envs} cannot be split evenly among {distributed.size()} processes")
 
@@ -155,7 +126,7 @@ class SymmetricFlags(ParallelFlags):
 
     def check(self) -> None:
         super().check()
-        if self.symmetric and find_task(self.env).mirror is Task.mirror:
+        if self.symmetric and not find_task(self.env).has_mirror():
             fail(f"--symmetric: task {self.env!r} has no mirror image")
 
 
@@ -210,8 +181,6 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
         if not any(word.partition("=")[0] == flag("contact") for word in argv):
             args.contact = task.contact
         defaults = dataclasses.replace(kind(), contact=args.contact, **(_presets(args) | args.task_defaults()))
-        if issubclass(task, Imitation):
-            defaults.clip = read_clip(task.default_clip)
         args = _cli(kind, argv, defaults)
     check_ranges(args)
     (Flags.check if args.evaluate else kind.check)(args)  # no training that was allowed forbids an evaluation
@@ -257,8 +226,8 @@ def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Arg
     fixed: Iterable[str] = FIXED + kind.fixed if args.resume else [name for name in hints if name not in EVALUATED]
     may = f"; --evaluate takes {', '.join(map(flag, sorted(EVALUATED & hints.keys())))}" if args.evaluate else ""
     for name in fixed:
-        own, wanted = (getattr(each, name, None) for each in (defaults, args))
-        if str(own) != str(wanted):  # a saved path is a text
+        own, wanted = (str(getattr(each, name, None)) for each in (defaults, args))  # a saved path is a text
+        if own != wanted and not (name == "env" and base_name(own) == base_name(wanted)):
             fail(f"{path} has {flag(name)} {own}, which cannot change to {wanted}{may}")
     if args.resume:
         last = min(args.iterations, args.stop_after or args.iterations)
@@ -275,10 +244,6 @@ def _cli(kind: type[Args], argv: list[str], defaults: Args) -> Args:
     with in_one_line(argv):
         about = sys.modules[kind.__module__].__doc__
         args = tyro.cli(kind, prog=Path(sys.argv[0]).name, args=argv, default=defaults, description=about)
-    try:
-        args.clip = read_clip(args.clip) if isinstance(args.clip, str) else args.clip
-    except ValueError as error:
-        fail(f"--clip: {error}")
     args.device = distributed.choose_device(args.device)
     for name in ("resume", "evaluate"):
         if (path := getattr(args, name)) and path.is_dir():

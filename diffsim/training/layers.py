@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from diffsim.tasks.mirror import Mirror, Reflection
+from diffsim.extra.mirror import Mirror, Reflection
 from diffsim.training import distributed
 from diffsim.training.errors import fail
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import pkgutil
 import signal
 import sys
 import time
@@ -31,7 +32,6 @@ from diffsim.training.flags import Flags, ParallelFlags
 from diffsim.training.graph import Mark
 from diffsim.training.layers import ObsNormalizer
 from diffsim.training.monitor import STEPS, Monitor
-from diffsim.training.variation import Variation, parse_ranges
 
 L = TypeVar("L", bound=Learner)
 Metrics = dict[str, Tensor]
@@ -92,7 +92,7 @@ class Run:
         self.last = min(args.iterations, args.stop_after or args.iterations)
         self._totals, self._episodes = {f"sim/{name}": 0 for name in TOTALS}, EpisodeStatistics()
         self._env: DiffEnv | None = None
-        self._variation: Variation | None = None
+        self._variation: Any = None
         self._samples = 0  # control steps of an iteration, of all ranks
         self._learner: Learner | None = None
         self._normalizers: list[ObsNormalizer] = []  # of observations
@@ -118,10 +118,10 @@ class Run:
         self._samples = num_envs * horizon
         args, size = self.args, num_envs // distributed.size()
         seed = args.seed + distributed.rank() * RANK_SEED
-        ranges = parse_ranges(args.randomise, find_task(args.env)) if isinstance(args, ParallelFlags) else {}
-        self._env = make_env(args, size, horizon, seed, factors=bool(ranges), **options)
-        if isinstance(args, ParallelFlags) and ranges:
-            self._variation = Variation(self._env, ranges, args.redraw, seed)
+        varied_by = find_task(args.env).varied_by
+        self._env = make_env(args, size, horizon, seed, factors=varied_by is not None, **options)
+        if varied_by is not None:
+            self._variation = pkgutil.resolve_name(varied_by)(self._env, seed)
         return self._env
 
     @cached_property
@@ -155,8 +155,7 @@ class Run:
         if state := self._state:
             own = state["ranks"][rank]
             episodes = (self._env, own["env"]) if self._env is not None else None
-            saved, slope = state["args"], getattr(self.args, "rough", 0.0)
-            if saved.get("clip") != self.args.clip or saved.get("rough", 0.0) != slope:
+            if state["args"]["env"] != self.args.env:
                 episodes = None  # which stand on another clip's frames or on other ground: new ones begin
             checkpoint.restore(learner, state, episodes)
             self._random_numbers().set_state(own["rng"])
@@ -401,7 +400,7 @@ class Run:
         args |= dict(stop_after=0, device=self.args.device if len(ranks) == 1 else self.device.type)
         state: dict[str, Any] = dict(args=args, iteration=self.iteration, control_steps=self.control_steps)
         state |= dict(seconds=self.seconds, totals=self._totals, episodes=list(self._episodes.windows), ranks=ranks)
-        state |= dict(simulator=self.simulator)
+        state |= dict(simulator=self.simulator, task=find_task(self.args.env).stored())
         with self._writing():
             checkpoint.save(self.directory / "checkpoint.pt", self.args.script(), self._learner, state)
         self._saved = self.iteration

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from worlds import OtherFile
 
 import diffsim
-from diffsim import Clip
-from diffsim.tasks.imitation.tracking import G1Track
+from diffsim.extra.robots.imitation.clip import Clip, read_clip
+from diffsim.extra.robots.imitation.tracking import G1Track
 from diffsim.training import SavedPolicy
 from diffsim.training.checkpoint import POLICIES
 
@@ -30,8 +30,8 @@ def test_who_stands_succeeds_and_who_is_to_fly_fails() -> None:
     flight = still.clone()
     flight[:, 2] += torch.linspace(0, 2, 31, dtype=flight.dtype)
     clip = Clip("two", torch.cat((still, flight)), False, (31, 31))
-    env = diffsim.make("g1_track", 1, clip=clip)
-    task = G1Track(dtype=torch.float64, clip=clip)
+    env = diffsim.make(G1Track.with_clip(clip), 1)
+    task = G1Track.with_clip(clip)(dtype=torch.float64)
     task.bind(env.scene)
     args, saved = tracking.Args(episodes=3, push=0.1), SavedPolicy(nn.Sequential(Nothing()), "nothing", {}, 1)
     success, (root, turn, joints) = tracking.track(saved, task, OtherFile(env, 6, None, 1.0), args)
@@ -40,7 +40,7 @@ def test_who_stands_succeeds_and_who_is_to_fly_fails() -> None:
 
 
 def test_another_clip_leaves_the_servos_their_range(tmp_path: Path) -> None:
-    karate = diffsim.read_clip("g1_karate").qpos[:91]  # whose joints move less than in all of it
+    karate = read_clip("g1_karate").qpos[:91]  # whose joints move less than in all of it
     np.savez(file := tmp_path / "beginning.npz", qpos=karate, fps=60, loop=False)
     (row,) = tracking.measure(tracking.Args(clip=file, episodes=2, friction=(1.0,)), POLICIES / "g1_track.pt")
     assert row["success"] == 1 and row["joint error"] < 0.05
@@ -48,7 +48,7 @@ def test_another_clip_leaves_the_servos_their_range(tmp_path: Path) -> None:
 
 def test_tables_of_policies_variants_and_races() -> None:
     row = {"clip": "walk", "motions": "1", "seed": "1", "checkpoint": "h100/1", "push": "0", "success": "1"}
-    row |= {"learner": "sapo --randomise", "device": "cuda", "training s": "100"}
+    row |= {"learner": "sapo randomised", "device": "cuda", "training s": "100"}
     row |= {"joint error": "0.06", "root error": "0.04"}
     rows = [row | {"friction": f, "success": s} for f, s in (("0.7", "0.5"), ("1", "0.9"))]
     shared = row | {"checkpoint": "h100_shared/2", "friction": "1", "training s": "300"}

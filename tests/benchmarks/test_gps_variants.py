@@ -10,16 +10,17 @@ import gps_variants
 import numpy as np
 import pytest
 import torch
+from extra.planning.systems import jacobian_errors
 from gps_variants import Ground, named_terrains
 from learners import assert_same, refusal, run
-from planning.systems import jacobian_errors
 from scenes import task_scene
 
 import diffsim
-from diffsim.planning import save_demonstration
-from diffsim.terrain import Elevation, incline, rough
+from diffsim.extra import render
+from diffsim.extra.planning import save_demonstration
+from diffsim.extra.terrain import incline, rough
+from diffsim.sim.elevation import Elevation
 from diffsim.training import parse
-from diffsim.view import render
 
 SLOPES = "level", "incline:15:-1", "incline:-15:-1"  # all but the first begin behind the start
 SMALL = (

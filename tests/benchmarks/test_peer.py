@@ -61,5 +61,5 @@ def test_the_commands(tmp_path: Path) -> None:
 
 
 def test_what_mujoco_warp_does_not_vary(capsys: pytest.CaptureFixture[str]) -> None:
-    args = parse(peer.Args, None, "--device cpu --env hopper --parts train -- --randomise friction=0.7:1.3".split())
-    assert "leave out --contact and --randomise" in refusal(lambda: peer.main(args), capsys)
+    args = parse(peer.Args, None, "--device cpu --env hopper --parts train -- --env hopper:friction=0.7:1.3".split())
+    assert "leave out --contact and ranges after the task's name" in refusal(lambda: peer.main(args), capsys)

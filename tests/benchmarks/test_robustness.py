@@ -15,7 +15,9 @@ from tables import read_csv
 from torch import Tensor
 
 import diffsim
-from diffsim import Clip, DiffEnv, Integration, read_clip
+from diffsim import DiffEnv, Integration
+from diffsim.extra.robots.imitation.clip import Clip, read_clip
+from diffsim.extra.robots.imitation.task import HumanoidImitation
 from diffsim.tasks import Task
 from diffsim.training import SavedPolicy
 from diffsim.training.checkpoint import POLICIES
@@ -122,7 +124,7 @@ def test_a_motion_that_ends_is_refused(
     """Its end would count as a fall. A loop is welcome."""
     args = parse(robustness.Args, None, ["imitation.pt"])
     for clip in (whole := read_clip("humanoid_run")), Clip("once", whole.qpos, loop=False):
-        env = diffsim.make("humanoid_imitation", 1, clip=clip)
+        env = diffsim.make(HumanoidImitation.with_clip(clip), 1)
         case = Case("run", Path("imitation.pt"), SavedPolicy(torch.nn.Sequential(), "shac", {}, 1), env)
         monkeypatch.setattr(robustness, "load_case", lambda *_, case=case: case)
         if clip.loop:

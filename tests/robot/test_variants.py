@@ -9,8 +9,8 @@ import torch
 from scenes import parse
 
 from diffsim import Integration, Scene, SceneError, Simulator, startup
+from diffsim.extra.report import approximations
 from diffsim.robot.constraint import constrained
-from diffsim.robot.report import approximations
 
 H = 0.002  # s
 # A sphere in the ground and a driven leg within its limits; a variant fills one of the places.

@@ -13,8 +13,8 @@ from torch import nn
 
 import diffsim
 import shac
+from diffsim.extra import render
 from diffsim.training import Evaluation, evaluate, evaluation
-from diffsim.view import render
 
 
 @pytest.fixture(scope="module")

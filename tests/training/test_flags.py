@@ -27,7 +27,7 @@ import sac_baseline
 import sapo
 import shac
 import view
-from diffsim.terrain import uneven
+from diffsim.extra.terrain import uneven
 from diffsim.training import checkpoint, errors, flags, parse, ranges
 from diffsim.training.evaluation import make_env
 
@@ -91,10 +91,11 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
     [
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant, humanoid"),
         ("--env walker --accuracy fast", "task 'walker' has no preset 'fast' on soft contact; choose from default"),
-        ("--env cartpole --rough 10", "cartpole touches no ground, so it has no terrain"),
-        ("--env ant --clip humanoid_run", "task 'ant' tracks no clip; humanoid_imitation, g1_track do"),
-        ("--env humanoid_imitation --clip nowhere", "--clip: no such clip: nowhere"),
-        ("--env walker --rough 50", "--rough must be from 0 to 45, not 50.0"),
+        ("--env cartpole:rough=10", "cartpole touches no ground, so it has no terrain"),
+        ("--env ant:clip.npz", "task 'ant' has no option 'clip.npz': write rough=20, randomise=none or a range like"),
+        ("--env humanoid_imitation:nowhere", "no such clip: nowhere; give an .npz or .csv file"),
+        ("--env go2:rough=50", "'rough=50': the steepest slope must be above 0 and at most 45 degrees"),
+        ("--env go2:push=2:1", "'push=2:1': must be from 0 to inf, the smaller one first"),
         ("--substeps 5 --integrator extrapolated", "substeps is 5, must be even"),
         ("--contact mujoco --integrator implicit", "--integrator implicit is for --contact soft, and the contact"),
         ("--device nonsense", "nonsense"),
@@ -152,12 +153,12 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp
         (mbpo, "--num-envs 1", "--num-envs must be at least 2: one environment is held out"),
         (mbpo, "--rollout-lengths 3 2", "--rollout-lengths 3 2: the first must not exceed the second"),
         (mbpo, "--buffer-size 10", "--buffer-size 10 is less than the 64 transitions of a step"),
-        (mbpo, "--sample-enhance 1 --randomise mass=0.9:1.1", "--sample-enhance takes Jacobians of one robot"),
         (
             mbpo,
-            "--sample-enhance 1 --rough 5",
-            "takes Jacobians of a robot on a plane: leave out --rough",
+            "--env ant:mass=0.9:1.1 --sample-enhance 1",
+            "takes Jacobians of one robot, but ant:mass=0.9:1.1 has ran",
         ),
+        (mbpo, "--env ant:rough=5 --sample-enhance 1", "Jacobians of a robot on a plane, but ant:rough=5 is rough"),
     ],
 )
 def test_flags_of_a_learner_that_do_not_go_together_are_one_line(script, arguments, message, tmp_path, capsys):
@@ -279,8 +280,8 @@ def test_accuracy_is_stored_and_can_be_replaced():
     assert numbers("--substeps", "16", "--integrator", "semi_implicit") == ("semi_implicit", 16, 0.0)
 
 
-def test_rough_ground_is_as_steep_as_the_flag():
-    args = parse(shac.Args, "--env hopper --device cpu --rough 12".split())
+def test_rough_ground_is_as_steep_as_the_option():
+    args = parse(shac.Args, "--env hopper:rough=12 --device cpu".split())
     np.testing.assert_array_equal(make_env(args, 3, seed=5).scene.terrain, uneven(12.0, 3, 5))
 
 
@@ -291,7 +292,7 @@ def test_what_a_checkpoint_decides(capsys):
         ("--num-envs 4", "--num-envs 3, which cannot change to 4"),
         ("--seed 2", "--seed 1, which cannot change to 2"),
     ):
-        for mode, more in ("--resume", ""), ("--evaluate", "; --evaluate takes --accuracy, --clip, --contact, "):
+        for mode, more in ("--resume", ""), ("--evaluate", "; --evaluate takes --accuracy, --contact, "):
             command = [mode, str(path), *argument.split()]
             line = refusal(lambda command=command: parse(shac.Args, command), capsys)
             assert line.startswith(f"script.py: {path} has {saved}{more}") and bool(more) == ("--eval-episodes" in line)

@@ -39,8 +39,8 @@ def test_a_replay_is_what_two_simulators_make_of_the_same_actions():
 
 
 def test_it_replays_on_the_steepest_ground_of_the_training(monkeypatch):
-    args = parse(shac.Args, [*FLAGS, "--rough", "20"])
-    env = diffsim.make("hopper", 20, seed=3, horizon=4, terrain=20.0)
+    args = parse(shac.Args, [*FLAGS, "--env", "hopper:rough=20"])
+    env = diffsim.make("hopper:rough=20", 20, seed=3, horizon=4)
     monkeypatch.setattr(monitor, "STEPS", 0)
     (watch := monitor.Monitor(args, env)).replay(Sines())
     for each in watch.envs:

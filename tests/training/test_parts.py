@@ -1,4 +1,4 @@
-"""Parts of learners against plain references: optimizer, ensemble, replay buffer, running statistics."""
+"""Parts of learners against plain references: optimizer, running statistics."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 from learners import assert_same
-from torch import Tensor, nn
+from torch import nn
 
-from diffsim.training import ClippedAdam, Ensemble, EnsembleAdam, ObsNormalizer, ReplayBuffer, Transition
+from diffsim.training import ClippedAdam, ObsNormalizer
 
 # Optimizer ------------------------------------------------------------------------------------------------------------
 
@@ -44,123 +44,6 @@ def test_the_optimizer_is_bitwise_what_torchs_fused_adam_computes() -> None:
 def test_a_loss_without_a_gradient_is_named() -> None:
     with pytest.raises(ValueError, match="the loss has no gradient: observe and reward must be torch operations"):
         ClippedAdam(nn.Linear(2, 1), 0.5).step(torch.zeros(()))
-
-
-# Ensemble -------------------------------------------------------------------------------------------------------------
-
-BETAS = (0.7, 0.95)
-
-
-def network() -> nn.Sequential:
-    chain = nn.Sequential(nn.Linear(3, 5), nn.SiLU(), nn.LayerNorm(5), nn.Linear(5, 2))
-    with torch.no_grad():
-        chain[2].weight.normal_()
-        chain[2].bias.normal_()
-    return chain
-
-
-def loss(outputs: Tensor) -> Tensor:
-    """Of (..., B, 2), summed over the networks."""
-    return outputs.square().mean((-1, -2)).sum()
-
-
-def test_an_ensemble_is_its_networks_and_gives_them_back() -> None:
-    torch.manual_seed(0)
-    networks = [network() for _ in range(4)]
-    ensemble, x = Ensemble(networks), torch.randn(4, 7, 3)
-    for e, single in enumerate(networks):
-        torch.testing.assert_close(ensemble(x)[e], single(x[e]))
-        assert all(torch.equal(p, q) for p, q in zip(ensemble[e].parameters(), single.parameters(), strict=True))
-    with pytest.raises(TypeError, match="no ensemble of Conv1d: only of Linear, LayerNorm"):
-        Ensemble([nn.Sequential(nn.Conv1d(1, 1, 1))] * 2)
-    with pytest.raises(TypeError, match="no ensemble of LayerNorm and then ELU: only Linear may follow"):
-        Ensemble([nn.Sequential(nn.LayerNorm(3), nn.ELU())] * 2)(torch.ones(2, 2, 3))
-    trunk = nn.Sequential(*network()[:3])  # ends with a LayerNorm
-    torch.testing.assert_close(Ensemble([trunk] * 2)(x[:2])[1], trunk(x[1]))
-    assert torch.equal(Ensemble([trunk])(x[:1])[0], trunk(x[0]))
-
-
-def test_untied_members_learn_as_if_alone() -> None:
-    """Two networks of each of three members, one of which gets a bad gradient on the way."""
-    torch.manual_seed(0)
-    networks = [network() for _ in range(6)]
-    ensemble = Ensemble(networks)
-    together = EnsembleAdam(ensemble, 2, 3, 0.5, BETAS, tied=torch.zeros(()))
-    alone = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in networks]
-    together.lr.fill_(1e-2)
-    for scale in (1.0, 1e-4, 30.0, 1.0):
-        x = torch.randn(6, 9, 3)
-        parts = zip(alone, networks, x, strict=True)
-        norms = [optimizer.step(scale * loss(single(samples))) for optimizer, single, samples in parts]
-        torch.testing.assert_close(together.step(scale * loss(ensemble(x))), torch.stack(norms).max())
-        for e, single in enumerate(networks):
-            for p, q in zip(ensemble[e].parameters(), single.parameters(), strict=True):
-                torch.testing.assert_close(p, q)
-    before = together.vector.clone()
-    x[1, 0, 0] = math.nan
-    together.step(loss(ensemble(x)))
-    assert together.skipped == 1 and together.vector.isfinite().all()
-    assert (together.vector != before).any(-1).all()
-
-
-def test_tied_members_are_one_learner_with_the_samples_of_all() -> None:
-    torch.manual_seed(0)
-    networks = [network() for _ in range(6)]  # the first ones of three members, then the second ones
-    ensemble, tied = Ensemble(networks), torch.zeros(())
-    together = EnsembleAdam(ensemble, 2, 3, 0.5, BETAS, tied)
-    singles = networks[1], networks[4]  # member 1
-    alone = [ClippedAdam(single, 0.5, BETAS, lr=1e-2) for single in singles]
-    together.lr.fill_(1e-2)
-    for step in range(4):
-        x = torch.randn(6, 9, 3)
-        together.step(loss(ensemble(x)))
-        own = x.unflatten(0, (2, 3))
-        for single, optimizer, samples in zip(singles, alone, own if step else own[:, 1], strict=True):
-            optimizer.step(single(samples).square().mean())
-        if step == 0:
-            together.tie(1)
-            tied.fill_(1.0)
-        for e in range(6) if step else (1, 4):
-            for p, q in zip(ensemble[e].parameters(), singles[e // 3].parameters(), strict=True):
-                torch.testing.assert_close(p, q)
-
-
-# Replay buffer --------------------------------------------------------------------------------------------------------
-
-
-def transitions(*numbers: int) -> Transition:
-    """Each part of a transition is a function of its number."""
-    x = torch.tensor(numbers, dtype=torch.float32)
-    obs = torch.stack((x, -x), 1)
-    return Transition(obs, x.unsqueeze(1), 100 + x, obs + 1000, x % 2)
-
-
-def test_samples_are_uniform_over_the_last_transitions() -> None:
-    buffer = ReplayBuffer(10, 2, 1)
-    buffer.add(transitions(0, 1, 2, 3))
-    assert set(buffer.sample(500).reward.tolist()) == {100, 101, 102, 103}
-    buffer.add(transitions(4, 5, 6, 7))
-    buffer.add(transitions(8, 9, 10, 11))  # over the first two
-    sample = buffer.sample(20_000)
-    x = (sample.reward - 100).long()
-    counts = torch.bincount(x, minlength=12)
-    assert (counts[:2] == 0).all() and (counts[2:] > 1700).all() and (counts[2:] < 2300).all()
-    for part, expected in zip(sample, transitions(*x.tolist()), strict=True):
-        assert torch.equal(part, expected)
-
-
-def test_a_full_buffer_keeps_its_size() -> None:
-    """In a larger one rows would be sampled that nothing has filled."""
-    old, young = ReplayBuffer(4, 2, 1), ReplayBuffer(4, 2, 1)
-    young.add(transitions(0, 1, 2))
-    assert young.state_dict()["_extra_state"].shape == (3, 7)  # the filled rows alone
-    for _ in range(2):
-        old.add(transitions(0, 1, 2))
-    for size in (3, 5):
-        with pytest.raises(ValueError, match=f"4 transitions, and a replay buffer that holds {size}"):
-            ReplayBuffer(size, 2, 1).load_state_dict(old.state_dict())
-        (copy := ReplayBuffer(size, 2, 1)).load_state_dict(young.state_dict())  # not full: any that has room
-        assert torch.equal(copy.rows[:3], young.rows[:3]) and copy.count == 3
 
 
 # Running statistics ---------------------------------------------------------------------------------------------------

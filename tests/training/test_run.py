@@ -26,6 +26,7 @@ import bptt
 import diffsim
 import shac
 from diffsim.env import DiffEnv
+from diffsim.tasks import REGISTERED
 from diffsim.tasks.cartpole import CartPole
 from diffsim.training import ClippedAdam, Run, checkpoint, evaluate, load_policy, parse
 from diffsim.training.directory import COLUMNS
@@ -181,7 +182,8 @@ def test_the_first_number_of_a_task_that_is_none_is_named(part, tmp_path, monkey
         def reward(self, obs: Tensor, action: Tensor) -> Tensor:
             return super().reward(obs, action).where((obs[..., 1] < 2.0) | (part != "reward"), math.nan)
 
-    monkeypatch.setitem(diffsim.TASKS, "faulty", Faulty)
+    monkeypatch.setattr(sys.modules[__name__], "Faulty", Faulty, raising=False)
+    monkeypatch.setitem(REGISTERED, "faulty", f"{__name__}:Faulty")
     argv = [*TINY, "--env", "faulty", "--iterations", "60", "--quiet", "--run-dir", str(tmp_path)]
     error = refusal(lambda: bptt.main(argv), capsys)
     first = len(read_progress(tmp_path)) + 1
@@ -268,12 +270,12 @@ def test_other_hyperparameters_hold_from_a_resume_on(tmp_path):
 
 def test_a_run_goes_on_by_new_episodes_on_other_ground(tmp_path, monkeypatch):
     monkeypatch.setattr(diffsim.Simulator, "advance", lambda _, qpos, qvel, ctrl: (qpos, qvel + 0.01 * ctrl.sum()))
-    words = "--env hopper --num-envs 4 --horizon 4 --critic-iterations 1 --eval-episodes 1 --eval-every 0 --quiet"
-    flags = [*words.split(), *"--device cpu --rough 20 --iterations 2 --stop-after 1 --run-dir".split()]
+    words = "--num-envs 4 --horizon 4 --critic-iterations 1 --eval-episodes 1 --eval-every 0 --quiet"
+    flags = [*words.split(), *"--device cpu --env hopper:rough=20 --iterations 2 --stop-after 1 --run-dir".split()]
     shac.main([*flags, str(first := tmp_path / "first")])
     for rough, length in (("20", 8), ("10", 4)):
         shutil.copytree(first, path := tmp_path / rough)
-        shac.main(["--resume", str(path), "--rough", rough, "--stop-after", "2", "--quiet"])
+        shac.main(["--resume", str(path), "--env", f"hopper:rough={rough}", "--stop-after", "2", "--quiet"])
         (rank,) = checkpoint.load(path / "checkpoint.pt")["ranks"]
         assert (rank["env"]["episode_step"] == length).all()
 

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 import diffsim
 import sapo
 import shac
+from diffsim.extra.mirror import Mirror, Reflection
 from diffsim.tasks import TASKS
-from diffsim.tasks.mirror import Mirror, Reflection
 from diffsim.training import ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
 from diffsim.training.layers import folded, seeing

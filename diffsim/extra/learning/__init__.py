@@ -1,0 +1,1 @@
+"""Parts that several learners share and others lack."""

@@ -1,0 +1,1 @@
+"""Tasks that are not of the SHAC paper."""

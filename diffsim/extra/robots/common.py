@@ -1,0 +1,29 @@
+"""Terms and disturbances that the tasks of robots with servos share."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+FREQUENCY_OF_PUSHES = 0.25  # 1/s
+
+
+def score(square: Tensor, scale: float) -> Tensor:
+    """log(1 + square / scale): a parabola near 0; far away it does not drown the other terms, and has a slope."""
+    return torch.log1p(square / scale)
+
+
+def push(noise: Tensor, sizes: tuple[float, float], control_dt: float) -> Tensor:
+    """What a push at random, if one is due, adds to the root's horizontal velocity: (..., 2) m/s.
+
+    Args:
+        noise: (..., 3) uniform in [0, 1); 0.5 is no push.
+        sizes: the least and the largest, m/s.
+        control_dt: s, in which one comes with FREQUENCY_OF_PUSHES.
+    """
+    due, size, way = noise.split(1, dim=-1)
+    (least, most), way = sizes, 2.0 * math.pi * way
+    size = (least + (most - least) * size) * (due < control_dt * FREQUENCY_OF_PUSHES)
+    return size * torch.cat((way.cos(), way.sin()), dim=-1)
