@@ -47,7 +47,6 @@ def make(
     theta: float | None = None,
     passes: int | None = None,
     tolerance: float | None = None,
-    touchdown: bool | None = None,
     accuracy: Accuracy = "default",
     contact: Contact | None = None,
     penalty: Mapping[str, float] | None = None,
@@ -80,7 +79,7 @@ def make(
         device: "cpu" or a CUDA device.
         seed: of the random start states, commands and noise; by default another one for each environment that is made.
         horizon: largest number of differentiable steps between two calls of DiffEnv.detach.
-        substeps, integrator, theta, passes, tolerance, touchdown: replace parts of the preset, see Integration.
+        substeps, integrator, theta, passes, tolerance: replace parts of the preset, see Integration.
         accuracy: preset of the integration, "fast" (soft contact only), "default" (the papers') or "accurate", see
             docs/numerics.md.
         contact: "soft" (penalty law) or "mujoco" (MuJoCo's constraints). Default: the task's, "mujoco" for go1, go2,
@@ -122,7 +121,7 @@ def make(
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
     scene = task.scene()
-    asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance, touchdown=touchdown)
+    asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance)
     integration = task.integration(accuracy, contact).replaced(integrator, **asked)
     if contact == "mujoco" and not integration.check().constrained:
         raise ValueError(f"integrator {integrator!r} is for soft contact, but the contact is mujoco")

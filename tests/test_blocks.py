@@ -30,7 +30,7 @@ from diffsim.sim.simulator import Simulator
 
 CONTROL_DT = 1 / 60
 SEMI, IMPLICIT, EXTRAPOLATED = (Integration(name, 8) for name in ("semi_implicit", "implicit", "extrapolated"))
-MUJOCO = Integration("mujoco", 4, passes=60, tolerance=1e-6, touchdown=False)
+MUJOCO = Integration("mujoco", 4, passes=60, tolerance=1e-6)
 _, SMALL, BLOCK = BLOCKS
 COUNT = BLOCK + 1
 

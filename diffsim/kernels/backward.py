@@ -377,7 +377,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         seconds: t.U,  # of a substep
         implicitness: t.U,
         substeps: int,
-        touchdown: int,  # see Integration, read with constraints
         # checkpoint in
         row0: int,
         ck: t.Checkpoint,
@@ -389,7 +388,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         nonfinite_gradients: wp.array(dtype=int),
     ):
         here = lane(m, first, wp.tid(), T(seconds), T(implicitness), batch.factors)
-        here.touchdown = touchdown
         links = wp.zeros(shape=SLOTS, dtype=Link)
         nodes = wp.zeros(shape=SLOTS, dtype=Node)
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)

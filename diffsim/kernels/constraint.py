@@ -18,12 +18,6 @@ joint's: `add_contacts` and `joint_constraint`.
 On a terrain (terrain.py) a contact's law and its adjoint act in the frame E of the feature that the sphere touches.
 
 The adjoint begins at phi = -f . w with w the velocity of the point under lambda: `add_contacts_adjoint`.
-
-A contact begins with a jump of its force, which no derivative within the law sees: where a sphere that sinks by s in a
-substep has just met the ground, ds / s of such substeps join or leave as its height changes by ds, each with the
-acceleration that f gives the robot without this contact. Under lambda the point then moves with w + A H w. A is its
-inverse inertia, for which the inverse weight stands. This is the saltation of hybrid systems (Kong et al., "Saltation
-Matrices", Proceedings of the IEEE 112(6), 2024).
 """
 
 from functools import cache
@@ -38,8 +32,6 @@ from diffsim.kernels.spatial import spatial
 from diffsim.kernels.spec import KernelSpec
 from diffsim.kernels.terrain import terrain_contact
 from diffsim.kernels.wide import blocks
-
-LEAST_SINKING = 1e-3  # m in a substep: a sphere that grazes the ground has a jump without bound, which is noise
 
 
 @cache
@@ -285,11 +277,6 @@ def constraint_law(spec: KernelSpec) -> SimpleNamespace:
                 moves = in_frame(E, point_velocity(link.V, p))
                 g_jar = H * w
                 g_r = g_jar[2] * state[3] - wp.dot(f, w) * state[1]
-                if here.touchdown == 1:
-                    numbers = m.contact_numbers[c]
-                    sinks = wp.max(-here.h * moves[2], T(LEAST_SINKING))
-                    jump = wp.dot(f, w + T(numbers[4]) * g_jar) / sinks
-                    g_r = g_r + pick(T(numbers[10]) - distance, sinks, jump, T(0.0))
                 if wp.static(VARIED):
                     by_k = T(0.5) * of[1] * wp.dot(g_jar, moves) + g_jar[2] * state[2]
                     by_mu = by_friction(state[0], of[2], T(m.contact_numbers[c][3]), jar, w)

@@ -21,7 +21,6 @@ class Integration(NamedTuple):
         theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); 0 unless implicit.
         passes: only "mujoco": most passes of Newton's method per substep.
         tolerance: only "mujoco": residual that ends them, see Simulator.residual.
-        touchdown: only "mujoco": gradients include the jumps with which contacts begin, see docs/adjoint.md.
     """
 
     integrator: str = "semi_implicit"
@@ -29,7 +28,6 @@ class Integration(NamedTuple):
     theta: float = 0.0
     passes: int = PASSES
     tolerance: float = TOLERANCE
-    touchdown: bool = True
 
     @classmethod
     def explicit(cls, kind: str, substeps: int) -> Integration:
@@ -60,8 +58,6 @@ class Integration(NamedTuple):
             raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
         if not is_real(self.tolerance) or not 0 < self.tolerance < 1:
             raise ValueError(f"tolerance is {self.tolerance!r}, must lie between 0 and 1")
-        if not isinstance(self.touchdown, bool):
-            raise ValueError(f"touchdown is {self.touchdown!r}, must be True or False")
         return self._replace(substeps=substeps, passes=check_count("passes", self.passes, MOST_PASSES))
 
 

@@ -253,7 +253,7 @@ class Simulator:
         missed, blown_up = wp.from_torch(self.unconverged), wp.from_torch(self.nonfinite_gradients)
         if kernel == "forward":
             return [*scalars, how.passes, real(how.tolerance), batch, int(record), row0, rows, nonfinite, missed]
-        return [*scalars, int(how.touchdown), row0, rows, batch, nonfinite, gradients, blown_up]
+        return [*scalars, row0, rows, batch, nonfinite, gradients, blown_up]
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(

@@ -59,7 +59,6 @@ class Task:
     forward_column: int | None  # of qpos [m], grows as the robot moves forward; None if it does not travel
     actor_dim: ClassVar[int | None] = None  # how many of them, the first ones, the actor sees; None: all, as a critic
     obs_parts: ClassVar[tuple[tuple[str, int], ...]] = ()  # its parts' names and sizes, for `export`; empty: unnamed
-    touchdown: ClassVar[bool] = True  # of the presets on MuJoCo's contact, see Integration
     symmetric: ClassVar[bool] = False  # whether learners treat left and right alike unless told otherwise
     mirrored_by: ClassVar[str | None] = None  # "module:function" that makes its `mirror`
     varied_by: ClassVar[str | None] = None  # "module:Class" of what a training changes, see extra/variation.py
@@ -198,7 +197,6 @@ class Task:
         own = hasattr(cls, "substeps") and contact == cls.contact
         explicit = Integration.explicit(contact, cls.substeps if own else max(1, round(RATE[contact] * cls.control_dt)))
         if explicit.constrained:
-            explicit = explicit._replace(touchdown=cls.touchdown)
             accurate = explicit.replaced(substeps=4 * explicit.substeps, tolerance=TOLERANCE / 10)
             return {"default": explicit, "accurate": accurate}
         others = {name: getattr(cls, name) for name in ("fast", "accurate") if hasattr(cls, name)}

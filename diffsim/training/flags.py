@@ -19,7 +19,7 @@ from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Range
 
 FIXED = ("env", "seed", "num_envs", "control_dt")  # with --resume; what else must fit, `restore` tells
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
-OPTIONS = {*"integrator substeps theta passes tolerance touchdown contact early_termination control_dt".split()}
+OPTIONS = {*"integrator substeps theta passes tolerance contact early_termination control_dt".split()}
 EVALUATED = OPTIONS - {"control_dt"} | {*"accuracy device eval_episodes evaluate finer quiet run_dir threads".split()}
 ENV = (
     f"task: {', '.join(TASKS)}, with options as in go2:rough=20 or g1_track:walk.npz (docs/tasks.md); "
@@ -73,8 +73,6 @@ class Flags:
     """with --integrator mujoco: at most this many passes of Newton's method per substep"""
     tolerance: Fraction = TOLERANCE
     """with --integrator mujoco: residual that ends the passes (per --accuracy)"""
-    touchdown: bool = True
-    """with --integrator mujoco: gradients include the jump at which a contact begins (docs/adjoint.md)"""
     contact: Contact = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
     early_termination: bool = True

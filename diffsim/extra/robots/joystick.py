@@ -336,4 +336,3 @@ class G1(Joystick):
     name, asset, robot = "g1", "g1.xml", humanoid()
     alive, smooth = 2.5, 1.0
     ranges = {name: Joystick.ranges[name] for name in ("friction", "mass", "motor", "latency")} | {"push": (0.5, 1.5)}
-    touchdown = False  # its hard soles chatter, and then the jumps' slopes are noise

@@ -54,7 +54,6 @@ class Tracking(Imitation):
     joints: ClassVar[int]
     sides: ClassVar[Sides]  # (right, left) beginnings of the names of joints and actuators
     contact: ClassVar[Contact] = "mujoco"
-    touchdown = False  # hard soles chatter, and then the slopes of their touching down are noise
     substeps = 4
     control_dt = 0.02
     episode_length = 500  # 10 s
