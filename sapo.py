@@ -43,10 +43,10 @@ PER_TASK = {
     "g1_track":     ((256, 128),    (512, 256), "silu", 2e-3, 1e-3, 0.9,  -2.0, -1.0, -2.0,  1, 1024,  700,  8),
 }
 PER_TASK["humanoid_imitation"] = PER_TASK["humanoid"]
-# Integrators that replace the papers' with --accuracy default.
+# Integrations that replace the papers' with --accuracy default.
 INTEGRATION = {name: TASKS[name].integration("fast") for name in ("hopper", "half_cheetah")}
-INTEGRATION |= {"ant": Integration("implicit", 8)}
-INTEGRATION |= {name: Integration("implicit", 16) for name in ("humanoid", "humanoid_mtu")}
+INTEGRATION |= {"ant": Integration("soft", 8, implicit=True)}
+INTEGRATION |= {name: Integration("soft", 16, implicit=True) for name in ("humanoid", "humanoid_mtu")}
 # Robots that fall before they learn to walk
 BALANCING: dict[str, dict[str, Any]] = {"g1": {"horizon": 16, "adjoint_clip": 5.0}, "g1_track": {"horizon": 16}}
 CPU = {"num_envs": 64, "population": 1}  # at most, where environments cost time in proportion
@@ -122,7 +122,8 @@ class Args(WindowFlags):
             if self.device == "cpu":
                 values["num_envs"] = 4 * values["num_envs"]
         if (self.accuracy, self.contact) == ("default", "soft") and self.env in INTEGRATION:
-            values |= INTEGRATION[self.env]._asdict()
+            how = INTEGRATION[self.env]
+            values |= {"substeps": how.substeps, "implicit": how.implicit}
         return super().task_defaults() | values | BALANCING.get(self.env, {})
 
     @property

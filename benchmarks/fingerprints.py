@@ -3,7 +3,7 @@
 `python benchmarks/paper.py --same REVISION` compares a revision with this one on this machine; with --update-results
 it adds a link to results/fingerprints.csv. A result counts while each link from its revision to the newest one keeps
 the fingerprints that its training depends on, its learner's and those of its task, and while a preset that it was
-trained with (--accuracy) is the same. A link keeps a fingerprint that is
+trained with (--accuracy fast) is the same. A link keeps a fingerprint that is
 equal in both revisions, or that was meant to change (--reason) if all sentinels that depend on it, cells that were
 trained again, are within the published range.
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -49,8 +50,7 @@ CASES = {  # small trainings
     "humanoid_imitation": "shac --env humanoid_imitation --num-envs 16",
     "mujoco": "shac --env ant --contact mujoco --num-envs 16",
     "joystick": "shac --env go2 --num-envs 16",
-    "fast": "shac --env half_cheetah --integrator implicit --substeps 8 --num-envs 16",
-    "accurate": "shac --env half_cheetah --integrator extrapolated --substeps 16 --num-envs 16",
+    "fast": "shac --env half_cheetah --accuracy fast --num-envs 16",
 }
 SMALL = "--device {} --threads 1 --iterations 4 --stop-after 3 --eval-every 0 --quiet"
 TRAIN_AND_HASH = """
@@ -73,9 +73,7 @@ def depends(command: str) -> set[str]:
     script, *flags = command.split()
     task = flags[flags.index("--env") + 1] if "--env" in flags else ""
     physics = {"hopper": "shac"} | dict.fromkeys(("go1", "go2", "g1"), "joystick")
-    return {script, f"{script}_{task}", physics.get(task, task), *({"mujoco", "fast", "accurate"} & {*flags})} & {
-        *CASES
-    }
+    return {script, f"{script}_{task}", physics.get(task, task), *({"mujoco", "fast"} & {*flags})} & {*CASES}
 
 
 def fingerprint(checkout: Path, name: str, device: str = "cpu") -> str:
@@ -149,15 +147,15 @@ def keeps(link: Mapping[str, str], name: str) -> bool:
 
 
 @functools.cache
-def preset(revision: str, command: str) -> str:
-    """The line of a task's file that sets a training's --accuracy, at a revision; empty without that flag."""
+def preset(revision: str, command: str) -> list[str]:
+    """What a task's file sets for --accuracy fast at a revision: substeps, "implicit"; empty for another training."""
+    if "--accuracy fast" not in command:
+        return []
     words = command.split()
-    if "--accuracy" not in words:
-        return ""
-    task, accuracy = (words[words.index(flag) + 1] for flag in ("--env", "--accuracy"))
-    call = ["git", "show", f"{revision}:diffsim/tasks/{task}.py"]
+    call = ["git", "show", f"{revision}:diffsim/tasks/{words[words.index('--env') + 1]}.py"]
     lines = subprocess.run(call, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()
-    return next((line for line in lines if line.strip().startswith(f"{accuracy} = ")), "")
+    found = next((line for line in lines if line.strip().startswith("fast = ")), "")
+    return sorted(re.findall(r"\d+|\bimplicit\b", found))
 
 
 def counts(revision: str, command: str) -> bool:

@@ -25,16 +25,15 @@ import diffsim
 from diffsim.extra.tune import actor, subject
 from diffsim.extra.tune.extremes import stress
 from diffsim.extra.tune.front import Row as Measured
-from diffsim.extra.tune.front import choice, finest, measure, settings
+from diffsim.extra.tune.front import choice, finest, integrator, measure, settings
 from diffsim.extra.tune.motion import SPANS, Motion
-from diffsim.sim.integration import PASSES, Integration
+from diffsim.sim.integration import Integration
 from diffsim.tasks import Accuracy, find_task
 from diffsim.training import Count
 
 PartName = Literal["presets", "extremes", "promise"]
 ERROR, OTHERS = 0.01, 200  # that is asked for, and states on which it is measured again
 PROMISED = ("robot", "chosen", "error", "error on 200 others", "speed", "default's error")
-USUAL = f", {PASSES} passes"  # of all presets on MuJoCo's contact
 SHOWN = ("task", "preset", "setting", "speed", "state 0.5 s", "gradient 8", "gradient 32")
 
 
@@ -58,8 +57,7 @@ def motion_of(robot: str, states: int, seed: int = 0) -> Motion:
 
 def kind(how: Integration) -> str:
     """What it shares with those of other substeps."""
-    newton = f" to {how.tolerance:g}, {how.passes} passes"
-    return how.integrator + {"mujoco": newton, "implicit": f" {how.theta:g}"}.get(how.integrator, "")
+    return integrator(how) + (f" to {how.tolerance:g}" if how.contact == "mujoco" else "")
 
 
 def named(how: Integration) -> str:
@@ -89,7 +87,7 @@ def presets(rows: list[Cells]) -> list[Row]:
     lines = sorted(
         (row for row in labelled(rows) if row["preset"]), key=lambda row: get_args(Accuracy).index(row["preset"])
     )
-    lines = [row | {"setting": row["setting"].replace(USUAL, "").removesuffix(" substeps")} for row in lines]
+    lines = [row | {"setting": row["setting"].removesuffix(" substeps")} for row in lines]
     return [row for own in grouped(lines, "task").values() for row in own]
 
 

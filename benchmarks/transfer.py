@@ -6,7 +6,7 @@
 A policy acts from the same start states in several worlds, of which each step changes one thing:
 
     here         this simulator, as in training
-    finer        this simulator with finer steps, explicit ones unless its contact is MuJoCo's: the integration
+    finer        this simulator with finer steps, not implicit ones: the integration
     MuJoCo same  of contact mujoco: MuJoCo with the substeps and the elliptic cones of the training: the same law
     MuJoCo x1    MuJoCo with its own contact and limits, cones and timestep on the same file
     MuJoCo x0.5  and so on, with other friction
@@ -31,7 +31,7 @@ from tables import Row, grouped, middle, numbers
 from worlds import Here, Motion, MuJoCo, World, travel
 
 import diffsim
-from diffsim import DiffEnv, Integration, Simulator
+from diffsim import DiffEnv, Simulator
 from diffsim.training import Count, Positive, fail
 from diffsim.training.checkpoint import HOME
 from diffsim.training.evaluation import FINER
@@ -68,7 +68,7 @@ def in_mujoco(case: Case) -> dict[str, object]:
     env = case.env
     if "muscle" in env.scene.features:
         return {}
-    exact = env.sim.integration.constrained
+    exact = env.sim.integration.contact == "mujoco"
     world = MuJoCo(env.scene, env.num_envs, env.control_dt, own_friction=exact)
     return summary(travel(case, world, env.episode_length), env)
 
@@ -76,10 +76,8 @@ def in_mujoco(case: Case) -> dict[str, object]:
 def conditions(case: Case, args: Args) -> dict[str, World]:
     """The worlds, by the names that the csv gives them; the first is that of the training."""
     env, scene, n, how = case.env, case.env.scene, case.env.num_envs, case.env.sim.integration
-    exact, dt = how.constrained, env.control_dt
-    finer = Integration("semi_implicit", args.finer * env.task.substeps)
-    if exact:
-        finer = how._replace(substeps=args.finer * how.substeps)
+    exact, dt = how.contact == "mujoco", env.control_dt
+    finer = how._replace(substeps=args.finer * (how.substeps if exact else env.task.substeps), implicit=False)
     worlds: dict[str, World] = {SAME: MuJoCo(scene, n, dt, 1.0, exact, how.substeps)} if exact else {}
     worlds |= {"here": Here(env.sim), "finer": Here(Simulator(scene, n, finer, dt, device=env.device))}
     first = SAME if exact and case.saved.simulator != HOME else "here"
@@ -101,7 +99,7 @@ def measure(args: Args, path: Path) -> Iterator[Row]:
     for name, world in conditions(case, args).items():
         motion = travel(case, world, args.steps)
         row = case.about | {"trained in": case.saved.simulator, "condition": name}
-        row |= {"integrator": how.integrator, "substeps": how.substeps} | summary(motion, env)
+        row |= {"substeps": how.substeps} | summary(motion, env)
         if isinstance(value := row["speed"], float):
             own = value if math.isnan(own) else own
             row["kept"] = value / own

@@ -42,13 +42,11 @@ def make(
     device: str | torch.device = "cpu",
     seed: int | None = None,
     horizon: int = 32,
-    substeps: int | None = None,
-    integrator: str | None = None,
-    theta: float | None = None,
-    passes: int | None = None,
-    tolerance: float | None = None,
-    accuracy: Accuracy = "default",
     contact: Contact | None = None,
+    accuracy: Accuracy = "default",
+    substeps: int | None = None,
+    implicit: bool | None = None,
+    tolerance: float | None = None,
     penalty: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float32,
     terrain: ArrayLike | None = None,
@@ -79,11 +77,11 @@ def make(
         device: "cpu" or a CUDA device.
         seed: of the random start states, commands and noise; by default another one for each environment that is made.
         horizon: largest number of differentiable steps between two calls of DiffEnv.detach.
-        substeps, integrator, theta, passes, tolerance: replace parts of the preset, see Integration.
-        accuracy: preset of the integration, "fast" (soft contact only), "default" (the papers') or "accurate", see
-            docs/numerics.md.
         contact: "soft" (penalty law) or "mujoco" (MuJoCo's constraints). Default: the task's, "mujoco" for go1, go2,
             g1, g1_track and tasks of your own, "soft" for the others.
+        accuracy: preset of the integration, "fast" (soft contact only), "default" (the papers') or "accurate", see
+            docs/numerics.md.
+        substeps, implicit, tolerance: replace parts of the preset, see Integration.
         penalty: constants of the penalty law that replace the MJCF's, e.g. {"k_n": 1e5}, see docs/physics.md.
         dtype: torch.float32 or torch.float64.
         terrain: replaces the plane z = 0, or the task's own ground: vertices (x, z) [m] of one profile, (K, 2), or of
@@ -121,11 +119,10 @@ def make(
             raise ValueError(f"task {kind.name!r} has control steps of {task.control_dt:.4g} s, not {control_dt!r}")
         task.control_dt = control_dt
     scene = task.scene()
-    asked = dict(substeps=substeps, theta=theta, passes=passes, tolerance=tolerance)
-    integration = task.integration(accuracy, contact).replaced(integrator, **asked)
-    if contact == "mujoco" and not integration.check().constrained:
-        raise ValueError(f"integrator {integrator!r} is for soft contact, but the contact is mujoco")
-    if penalty and integration.constrained:
+    asked: Any = dict(substeps=substeps, implicit=implicit, tolerance=tolerance)
+    given = {name: value for name, value in asked.items() if value is not None}
+    integration = task.integration(accuracy, contact)._replace(**given)
+    if penalty and integration.contact == "mujoco":
         raise ValueError("penalty sets constants of the penalty law, but the contact is mujoco")
     scene = scene.with_penalty(penalty or {})
     if terrain is None:

@@ -273,17 +273,17 @@ class DiffEnv(VectorEnv):
 
         Returns:
             "episodes": how many ended; "return" and "length": sums over them; "nonfinite": environments that blew up;
-            "nonfinite_gradients": adjoints of control steps that were not finite; with the integrator mujoco only
+            "nonfinite_gradients": adjoints of control steps that were not finite; on MuJoCo's contact only
             "unconverged": control steps that ended above the tolerance, and "sim/residual": the mean of
             Simulator.residual in the last step.
         """
         parts = self._statistics | {"nonfinite_gradients": self.sim.nonfinite_gradients}
-        if self.sim.integration.constrained:
+        if self.sim.integration.contact == "mujoco":
             parts["unconverged"] = self.sim.unconverged
         sums = {name: part.sum() for name, part in parts.items()}
         for part in parts.values():
             part.zero_()
-        if self.sim.integration.constrained:
+        if self.sim.integration.contact == "mujoco":
             sums["sim/residual"] = self.sim.residual.mean()
         return sums
 

@@ -113,9 +113,7 @@ def mass_and_bias(scene: Scene, links: list[Link]) -> tuple[Array, Array]:
     return mass, bias
 
 
-def joint_forces(
-    scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float = 0.0, theta: float = 0.0
-) -> tuple[Array, Array]:
+def joint_forces(scene: Scene, qpos: Array, qvel: Array, ctrl: Array, h: float = 0.0) -> tuple[Array, Array]:
     """Motors, springs, dampers and limits (Eq. 4) at zero acceleration, and their (nv,) resistance to it."""
     force, resistance, motors = np.zeros(scene.nv), np.zeros(scene.nv), np.zeros(scene.nlink)
     resistance[: 6 * scene.floating] = h * scene.base_damping[0]
@@ -124,7 +122,7 @@ def joint_forces(
             motors[link] += scene.gear[motor] * ctrl[motor] + scene.motor_bias[motor]
     for i in range(1, scene.nlink):
         dof, qd = joint_dof(scene, i), qvel[joint_dof(scene, i)]
-        q = joint_position(scene, i, qpos) + theta * h * qd
+        q = joint_position(scene, i, qpos)
         servo = scene.servo_stiffness[i] * (scene.servo_ref[i] - q) - scene.servo_damping[i] * qd
         force[dof] += np.clip(motors[i] + servo, scene.force_low[i], scene.force_high[i])
         free = scene.force_low[i] < motors[i] + servo < scene.force_high[i]
@@ -135,8 +133,7 @@ def joint_forces(
         push = pushes * firmness * (bound - q)
         force[dof] += scene.stiffness[i] * (scene.spring_ref[i] - q) - scene.damping[i] * qd + push
         resistance[dof] = h * (scene.damping[i] + (pushes * scene.d_limit[i] * abs(bound - q) if beyond else 0.0))
-        resistance[dof] += theta * h**2 * (scene.stiffness[i] + pushes * scene.k_limit[i])
-        resistance[dof] += free * (h * scene.servo_damping[i] + theta * h**2 * scene.servo_stiffness[i])
+        resistance[dof] += free * h * scene.servo_damping[i]
     return force, resistance
 
 
@@ -151,7 +148,7 @@ def muscle_forces(scene: Scene, links: list[Link], ctrl: Array) -> Array:
     return -(scene.gear * ctrl + scene.motor_bias) @ slope
 
 
-def contact_law(scene: Scene, depth: float, velocity: Array, h: float = 0.0, theta: float = 0.0) -> tuple[Array, Array]:
+def contact_law(scene: Scene, depth: float, velocity: Array, h: float = 0.0) -> tuple[Array, Array]:
     """Eq. 3: force on a sphere of signed depth (negative inside) whose lowest point moves so, and its resistance."""
     normal = max((scene.k_d * velocity[2] - scene.k_n) * depth, 0.0)
     if depth >= 0 or normal == 0:
@@ -159,7 +156,7 @@ def contact_law(scene: Scene, depth: float, velocity: Array, h: float = 0.0, the
     slip = np.hypot(velocity[0], velocity[1])
     viscosity = min(scene.k_t * slip, scene.mu * normal) / slip if slip > 0 else scene.k_t
     force = np.array([-viscosity * velocity[0], -viscosity * velocity[1], normal])
-    return force, h * np.array([viscosity, viscosity, theta * h * scene.k_n - scene.k_d * depth])
+    return force, h * np.array([viscosity, viscosity, -scene.k_d * depth])
 
 
 class Touch(NamedTuple):
@@ -234,18 +231,16 @@ def acceleration(
     qvel: Array,
     ctrl: Array,
     h: float = 0.0,
-    theta: float = 0.0,
     forces: Array | None = None,
     profile: int = 0,
 ) -> Array:
     """qacc of mass @ qacc = forces - bias. The implicit step has forces that are linear in it: f - resistance * a.
 
-    h is the substep of the implicit integrator, 0 for the explicit one; theta how far ahead stiffness is evaluated;
-    profile says which environment's terrain it is.
+    h is the substep of the implicit integrator, 0 for the explicit one; profile says which environment's terrain it is.
     """
     links = kinematics(scene, qpos, qvel)
     mass, bias = mass_and_bias(scene, links)
-    force, resistance = joint_forces(scene, qpos, qvel, ctrl, h, theta)
+    force, resistance = joint_forces(scene, qpos, qvel, ctrl, h)
     mass, force = mass + np.diag(resistance), force - bias
     force = force + muscle_forces(scene, links, ctrl)
     if forces is not None:
@@ -254,7 +249,7 @@ def acceleration(
         velocity, jacobian, drift = link.point(lowest)
         # The law acts along the ground and along its normal.
         local, jacobian = frame.T @ velocity, frame.T @ jacobian
-        push, resistance = contact_law(scene, depth + theta * h * local[2], local, h, theta)
+        push, resistance = contact_law(scene, depth, local, h)
         # The law resists the change of the velocity field at a fixed place, so w x v of the moving point is not in it.
         drift = frame.T @ (drift - np.cross(link.angular_velocity, velocity))
         mass = mass + jacobian.T @ np.diag(resistance) @ jacobian
@@ -333,11 +328,10 @@ def step(
     profile: int = 0,
 ) -> tuple[Array, Array]:
     """One control step of one environment."""
-    integrator, substeps, theta = integration[:3]
-    h = control_dt / substeps
-    for _ in range(substeps):
-        implicit = h if integrator == "implicit" else 0.0
-        qvel = qvel + h * acceleration(scene, qpos, qvel, ctrl, implicit, theta, forces, profile)
+    h = control_dt / integration.substeps
+    for _ in range(integration.substeps):
+        implicit = h if integration.implicit else 0.0
+        qvel = qvel + h * acceleration(scene, qpos, qvel, ctrl, implicit, forces, profile)
         qpos = integrate(scene, qpos, qvel, h)
     return qpos, qvel
 

@@ -29,10 +29,9 @@ SOFT = [name for name, task in TASKS.items() if task.contact == "soft"]  # on th
 ROBOTS = [name for name in SOFT if TASKS[name].asset == f"{name}.xml"]  # one task of each
 # Together these have every feature of a task's robot: a kernel takes seconds to compile.
 DISTINCT = ("half_cheetah", "humanoid", "humanoid_mtu", "swimmer")
-INTEGRATORS = [("semi_implicit", 0.0), ("implicit", 0.0), ("implicit", 0.5)]  # and theta
 DISTINCT_CASES = [
-    pytest.param(name, *how, marks=[pytest.mark.slow] * (name != "half_cheetah" and how[0] == "implicit"))
-    for how in INTEGRATORS
+    pytest.param(name, implicit, marks=[pytest.mark.slow] * (name != "half_cheetah" and implicit))
+    for implicit in (False, True)
     for name in DISTINCT
 ]
 

@@ -10,7 +10,6 @@ import reference
 import torch
 import warp as wp
 from scenes import (
-    INTEGRATORS,
     acceleration,
     free_states,
     grounded_states,
@@ -30,7 +29,7 @@ from diffsim.robot.scene import FACTORS
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
-SETTINGS = [Integration("semi_implicit", 8), Integration("implicit", 8, 0.5)]
+SETTINGS = [Integration("soft", 8, implicit) for implicit in (False, True)]
 BOTH = {"factors": True, "forces": True}
 TREE = tree_scene("ball", 1)  # it floats, and some of its bodies are welded to others
 
@@ -70,11 +69,11 @@ def test_steps_are_the_references(integration, rng):
             np.testing.assert_allclose(value[e], end, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("integrator, theta", INTEGRATORS)
-def test_gradients_are_those_of_differences(integrator, theta, rng):
+@pytest.mark.parametrize("integration", SETTINGS)
+def test_gradients_are_those_of_differences(integration, rng):
     """Of every factor by itself; and in state, control and forces where the factors are not one."""
     scene, states = grounded_leg(16, rng)
-    check_gradients(scene, states, rng, given(scene, 16, rng), integration=Integration(integrator, 8, theta))
+    check_gradients(scene, states, rng, given(scene, 16, rng), integration=integration)
 
 
 def test_gradients_of_welded_bodies_are_those_of_differences(rng):
@@ -103,13 +102,12 @@ def test_each_environment_and_step_has_its_own(rng):
         assert torch.equal(torch.autograd.grad(a.sum() + b.sum(), start)[0], slope[e : e + 1])
 
 
-@pytest.mark.parametrize("integrator", ["semi_implicit", "extrapolated"])
-def test_gradients_reach_a_tensor_through_the_environment(integrator):
+def test_gradients_reach_a_tensor_through_the_environment():
     """A whole window's, in the logarithms of one set of factors, and one force on the torso, for all."""
     count = len(FACTORS)
 
     def total(given):
-        env = diffsim.make("hopper", 4, seed=0, horizon=4, dtype=torch.float64, integrator=integrator, **BOTH)
+        env = diffsim.make("hopper", 4, seed=0, horizon=4, dtype=torch.float64, **BOTH)
         torso = torch.eye(env.scene.nbody, dtype=torch.float64)[env.scene.mj_model.body("torso").id]
         env.sim.factors = given[:count].exp().expand(4, -1)
         env.sim.forces = (torso[:, None] * given[count:]).expand(4, -1, -1)

@@ -12,7 +12,6 @@ from scenes import (
     BOUNDED_SERVOS,
     COMPENSATED,
     DISTINCT_CASES,
-    INTEGRATORS,
     SHOULDER,
     acting_states,
     check_that_ground_and_limits_act,
@@ -85,12 +84,12 @@ def check_gradients(scene, states, rng, optional=None, **simulator):
             assert (error <= 1e-6 * size).all() and size.any(), f"gradient with respect to {name}"
 
 
-@pytest.mark.parametrize("name, integrator, theta", DISTINCT_CASES)
-def test_task_gradient_is_that_of_differences(name, integrator, theta, rng):
+@pytest.mark.parametrize("name, implicit", DISTINCT_CASES)
+def test_task_gradient_is_that_of_differences(name, implicit, rng):
     scene = task_scene(name)
     states = acting_states(scene, 8, rng)
     check_that_ground_and_limits_act(scene, *states[:2])
-    check_gradients(scene, states, rng, integration=Integration(integrator, TASKS[name].substeps, theta))
+    check_gradients(scene, states, rng, integration=Integration("soft", TASKS[name].substeps, implicit))
 
 
 @pytest.mark.parametrize(
@@ -108,14 +107,14 @@ def test_tree_gradient_is_that_of_differences(base, seed, rng):
     check_gradients(raise_ground(scene, qpos), (qpos, qvel, ctrl), rng, integration=Integration(substeps=16))
 
 
-@pytest.mark.parametrize("integrator, theta", [pytest.param(*INTEGRATORS[0], marks=pytest.mark.slow), *INTEGRATORS[1:]])
-def test_ball_joint_gradient_is_that_of_differences(integrator, theta, rng):
+@pytest.mark.parametrize("implicit", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_ball_joint_gradient_is_that_of_differences(implicit, rng):
     """Quaternions of any length and sign, and one turn of nothing, where the spring's rotation vector is zero."""
     scene = parse(SHOULDER)
     qpos, qvel, ctrl = free_states(scene, 8, rng)
     qpos[:, :4] *= np.linspace(0.5, -2.0, 8)[:, None]
     qpos[0, :4] = 1.0, 0.0, 0.0, 0.0
-    check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(integrator, theta=theta))
+    check_gradients(scene, (qpos, qvel, ctrl), rng, integration=Integration(implicit=implicit))
 
 
 @pytest.mark.parametrize("name", ["muscles", "fluid"])
@@ -124,21 +123,26 @@ def test_gradient_of_small_robots_is_that_of_differences(name, rng):
     check_gradients(scene, free_states(scene, 16, rng), rng, integration=Integration(substeps=8))
 
 
-@pytest.mark.parametrize(
-    "integrator, theta", [*(pytest.param(*how, marks=pytest.mark.slow) for how in INTEGRATORS[:2]), INTEGRATORS[2]]
-)
-def test_gradient_of_bounded_servos_is_that_of_differences(integrator, theta, rng):
+@pytest.mark.parametrize("implicit", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_gradient_of_bounded_servos_is_that_of_differences(implicit, rng):
     """At a bound the force depends on nothing; of the factors, it knows the motors' and the mass."""
     scene, factors = parse(BOUNDED_SERVOS), {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))}
-    check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=Integration(integrator, 8, theta))
+    check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=Integration("soft", 8, implicit))
 
 
-@pytest.mark.parametrize("integrator", [pytest.param("semi_implicit", marks=pytest.mark.slow), "implicit", "mujoco"])
-def test_gradient_under_gravity_compensation_is_that_of_differences(integrator, rng):
+@pytest.mark.parametrize(
+    "integration",
+    [
+        pytest.param(Integration("soft", 8), marks=pytest.mark.slow),
+        Integration("soft", 8, implicit=True),
+        Integration("mujoco", 8),
+    ],
+)
+def test_gradient_under_gravity_compensation_is_that_of_differences(integration, rng):
     """And in the factor of mass."""
     scene = parse(COMPENSATED)
-    factors = {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))} if integrator != "mujoco" else None
-    check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=Integration(integrator, 8))
+    factors = {"factors": rng.uniform(0.5, 2.0, (16, len(FACTORS)))} if integration.contact == "soft" else None
+    check_gradients(scene, free_states(scene, 16, rng), rng, factors, integration=integration)
 
 
 def test_quaternion_of_any_length(rng):

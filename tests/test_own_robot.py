@@ -67,7 +67,7 @@ def test_the_commands_run(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert re.fullmatch(r"run_forward__ppo_baseline__1__\d+", run.name)
     saved = checkpoint.load(run / "checkpoint.pt")
     assert saved["args"]["env"] == "examples/own_robot.py" and saved["iteration"] == 2
-    assert saved["args"]["contact"] == saved["args"]["integrator"] == "mujoco"
+    assert saved["args"]["contact"] == "mujoco"
     check, _, watch, judge, resume = COMMANDS
     diffsim_main(check[2:])
     assert "own_robot: can be simulated" in capsys.readouterr().out
@@ -120,8 +120,8 @@ def test_from_another_directory(
 def test_flags_of_an_own_task(home: Path) -> None:
     env = ["--env", str(home / "examples" / "own_robot.py")]
     args = parse(shac.Args, env)
-    assert (args.contact, args.integrator, args.substeps, args.horizon) == ("mujoco", "mujoco", 4, 8)
+    assert (args.contact, args.substeps, args.horizon) == ("mujoco", 4, 8)
     args = parse(shac.Args, [*env, "--contact", "soft"])
-    assert (args.contact, args.integrator, args.substeps, args.horizon) == ("soft", "semi_implicit", 16, 32)
+    assert (args.contact, args.substeps, args.horizon) == ("soft", 16, 32)
     args = parse(shac.Args, ["--env", "hopper"])
-    assert (args.contact, args.integrator) == ("soft", "semi_implicit")
+    assert (args.contact, args.implicit) == ("soft", False)

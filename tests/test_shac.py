@@ -145,7 +145,7 @@ def test_the_critic_is_fitted_to_the_returns_and_the_target_follows_slowly() -> 
     [
         "--num-envs 1 --horizon 1 --critic-minibatches 1",
         "--num-envs 3 --horizon 5 --critic-minibatches 7 --deterministic-policy --general-hyperparameters",
-        "--num-envs 2 --integrator extrapolated --substeps 2 --eval-every 2 --threads 1",
+        "--num-envs 2 --implicit --substeps 2 --eval-every 2 --threads 1",
     ],
 )
 def test_unusual_settings_train(arguments: str, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from diffsim.sim.elevation import Elevation
 from diffsim.sim.integration import Integration
 from diffsim.sim.simulator import Simulator
 
-IMPLICIT = Integration("implicit", 8, 0.5)  # of the ball; the hopper is explicit, so that two kernels do for all
+IMPLICIT = Integration("soft", 8, implicit=True)  # of the ball; the hopper is explicit, so that two kernels do for all
 # A valley, a ridge, a wall and a short segment; a ball of 0.1 m fits between all of them.
 HILLS = np.array([[-1.0, 0.2], [0.0, 0.0], [1.0, 0.4], [2.0, 0.1], [2.5, 0.1], [2.5, 0.5], [3.0, 0.5], [3.25, 0.6]])
 PLANE = np.array([[0.0, 0.0], [1.0, 0.0]])

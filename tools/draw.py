@@ -149,7 +149,7 @@ def motions(case: Case, steps: int, every: int, beside: bool) -> dict[str, Motio
     env, task, start, found, episode = case.env, in_double(case.env), starts(case.env, torch.float64), {}, -1
     worlds: dict[str, World] = {"diffsim": Here(env.sim)}
     if beside and "muscle" not in env.scene.features:
-        exact = env.sim.integration.constrained
+        exact = env.sim.integration.contact == "mujoco"
         worlds["MuJoCo"] = MuJoCo(env.scene, env.num_envs, env.control_dt, own_friction=exact)
     if isinstance(task, Joystick):
         start.memory[:, :3] = torch.tensor((FLOOR / stride(task), 0.0, 0.0))

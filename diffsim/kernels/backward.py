@@ -156,10 +156,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(DAMPED):
                 nodes[i].D = nodes[p].D + own.S * (load(ck.a, here.row, adr, here.e) - qdd)
             if wp.static(CLAMP):
-                ahead = own.q
-                if wp.static(IMPLICIT):
-                    ahead = ahead + here.theta * here.h * own.qd
-                nodes[i].free = joint.actuation_free(m, k, nodes[i].motor, ahead, own.qd)
+                nodes[i].free = joint.actuation_free(m, k, nodes[i].motor, own.q, own.qd)
 
     @wp.func
     def partials(
@@ -181,19 +178,16 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
     def joint_gain(m: Model, here: Lane, i: int, ck: Ck, link: Link, own: Node, adj_factors: Array):
         """Derivatives of the joint's force with respect to q and qd."""
         k = here.at + i
-        qi = link.q
         end_rate = link.qd
-        if wp.static(IMPLICIT):
-            qi = qi + here.theta * here.h * link.qd
-            if wp.static(LIMIT):
-                end_rate = end_rate + here.h * load(ck.a, here.row, VADR + link_of(m, k), here.e)
+        if wp.static(IMPLICIT and LIMIT):
+            end_rate = end_rate + here.h * load(ck.a, here.row, VADR + link_of(m, k), here.e)
         within = T(1.0)
         if wp.static(CLAMP):
             within = own.free
-        gain = joint.gain(m, here, k, qi, link.qd, end_rate, within)
+        gain = joint.gain(m, here, k, link.q, link.qd, end_rate, within)
         if wp.static(VARIED and LIMIT):
             if m.carried[k] == 1:  # of the lanes that have the joint
-                by = joint.limit_constants_gain(m, here, k, qi, link.qd, end_rate, here.theta * here.h)
+                by = joint.limit_constants_gain(m, here, k, link.q, link.qd, end_rate)
                 adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * by[0]
                 adj_factors[D_LIMIT] = adj_factors[D_LIMIT] - own.lam * by[1]
         if wp.static(CONSTRAINED):
@@ -202,8 +196,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
             if wp.static(VARIED):
                 if m.carried[k] == 1:
                     adj_factors[K_LIMIT] = adj_factors[K_LIMIT] - own.lam * of_held[2]
-        if wp.static(IMPLICIT):
-            gain[1] = gain[1] + here.theta * here.h * gain[0]
         return gain
 
     @wp.func
@@ -375,7 +367,6 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         m: Model,
         first: int,  # block of this launch
         seconds: t.U,  # of a substep
-        implicitness: t.U,
         substeps: int,
         # checkpoint in
         row0: int,
@@ -387,7 +378,7 @@ def backward_kernel(spec: KernelSpec) -> wp.Kernel:
         g: t.Batch,
         nonfinite_gradients: wp.array(dtype=int),
     ):
-        here = lane(m, first, wp.tid(), T(seconds), T(implicitness), batch.factors)
+        here = lane(m, first, wp.tid(), T(seconds), batch.factors)
         links = wp.zeros(shape=SLOTS, dtype=Link)
         nodes = wp.zeros(shape=SLOTS, dtype=Node)
         adj = wp.zeros(shape=SLOTS, dtype=Adjoint)

@@ -7,8 +7,8 @@ With depth d < 0, point velocity v and its normal component v_z (the rate of d),
 active where f_n > 0, so the ground never pulls: for k_d v_z >= k_n the sphere leaves faster than the ground can push.
 At zero slip c = k_t without a division.
 
-Implicit step: the law is linear in the acceleration a of the point, f = f(d + theta h v_z, v) - B a, with
-B = diag(h c, h c, theta h^2 k_n - h k_d d) and c lagged; the explicit law is B = 0, h_implicit = theta = 0.
+Implicit step: the law is linear in the acceleration a of the point, f = f(d, v) - B a, with
+B = h diag(c, c, -k_d d) and c lagged; the explicit law is B = 0.
 
 On a terrain (terrain.py) the law and its adjoint act in the frame E of the feature that the sphere touches.
 """
@@ -37,19 +37,13 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
 
     @wp.func
     def sphere_state(m: Model, here: Lane, c: int, link: Link, place: Place):
-        """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth (predicted
-        theta h ahead if implicit), E, and the ground's curvature in it."""
+        """Of contact sphere c the point p nearest to the ground, its velocity in the frame E, the depth, E, and the
+        ground's curvature in it."""
         centre = sp.on_link(link.R, link.x, m.contact_position[c])
         r = T(m.contact_radius[c])
-        reach = r
-        if wp.static(IMPLICIT and TERRAIN):
-            fastest = wp.length(point_velocity(link.V, centre)) + r * wp.length(wp.spatial_top(link.V))
-            reach = r + here.theta * here.h * fastest
-        depth, E, curvature = ground.distance(m, here, c, centre, place, reach)
+        depth, E, curvature = ground.distance(m, here, c, centre, place, r)
         p = centre - in_world(E, vec3(T(0.0), T(0.0), r))
         v = in_frame(E, point_velocity(link.V, p))
-        if wp.static(IMPLICIT):
-            depth = depth + here.theta * here.h * v[2]
         return p, v, depth, E, curvature
 
     @wp.func
@@ -75,11 +69,11 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def contact_resistance(here: Lane, d: T, c: T):
         """The diagonal of B."""
-        return vec3(here.h * c, here.h * c, here.theta * here.h * here.h * here.k_n - here.h * here.k_d * d)
+        return vec3(here.h * c, here.h * c, -here.h * here.k_d * d)
 
     @wp.func
     def contact_adjoint(here: Lane, d: T, v: vec3, a: vec3, g: vec3, h: T):
-        """(adjoint of v, adjoint of d at the start of the step) of g . f(d + theta h v_z, v, a); h = 0 if explicit."""
+        """(adjoint of v, adjoint of d) of g . f(d, v, a); h = 0 if explicit."""
         s = here.k_d * v[2] - here.k_n
         f_n = s * d
         c, sliding = friction_viscosity(here, f_n, v)
@@ -93,7 +87,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         gx = gx - g_c * c * v[0] / speed2
         gy = gy - g_c * c * v[1] / speed2
         g_d = g_n * s + g[2] * h * here.k_d * a[2]
-        return vec4(gx, gy, g_n * here.k_d * d + here.theta * h * g_d, g_d)
+        return vec4(gx, gy, g_n * here.k_d * d, g_d)
 
     @wp.func
     def contact_constants_adjoint(here: Lane, d: T, v: vec3, a: vec3, g: vec3, h: T):
@@ -105,8 +99,7 @@ def contact_law(spec: KernelSpec) -> SimpleNamespace:
         g_n = g[2] + sliding * g_c * here.mu / speed
         g_mu = sliding * g_c * f_n / speed
         g_c = (T(1.0) - sliding) * g_c
-        g_kn = -g_n * d - g[2] * here.theta * h * h * a[2]
-        return vec4(g_kn, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
+        return vec4(-g_n * d, d * (g_n * v[2] + g[2] * h * a[2]), g_c, g_mu)
 
     @wp.func
     def add_contacts(m: Model, here: Lane, k: int, link: Link, place: Place, load: t.Load):

@@ -23,7 +23,7 @@ def lane_of(spec: KernelSpec) -> wp.Function:
     THREADS_PER_ENV, SLOTS = spec.threads_per_env, spec.slots
 
     @wp.func
-    def lane_of(m: Model, first: int, thread: int, h: T, theta: T, factors: t.array2):
+    def lane_of(m: Model, first: int, thread: int, h: T, factors: t.array2):
         """What a thread computes in a launch from environment, or block, `first` on, and by which constants."""
         here = Lane()
         here.e = first + thread / THREADS_PER_ENV
@@ -34,7 +34,6 @@ def lane_of(spec: KernelSpec) -> wp.Function:
             here.n = m.count[here.lane]
         e = here.e
         here.h = h
-        here.theta = theta
         if wp.static(CONTACT and CONSTRAINED and VARIED):
             here.k_n = read(factors, e, K_N)  # of the time constant's inverse square
             here.k_d = read(factors, e, K_D)  # of D, and so of all of a contact's force for one motion

@@ -214,7 +214,6 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         m: Model,
         first: int,  # block of this launch
         seconds: t.U,  # of a substep
-        implicitness: t.U,
         substeps: int,
         passes: int,  # of Newton's method at most, and what it converges to: read with constraints
         tolerance: t.U,
@@ -227,7 +226,7 @@ def forward_kernel(spec: KernelSpec) -> wp.Kernel:
         nonfinite: wp.array(dtype=wp.bool),
         unconverged: wp.array(dtype=int),
     ):
-        here = lane(m, first, wp.tid(), T(seconds), T(implicitness), batch.factors)
+        here = lane(m, first, wp.tid(), T(seconds), batch.factors)
         links = wp.zeros(shape=SLOTS, dtype=Link)
         motions = wp.zeros(shape=SLOTS, dtype=Motion)
         loads = wp.zeros(shape=SLOTS, dtype=Load)

@@ -6,8 +6,8 @@ With q beyond a bound by x > 0, and the rate v at which it returns, a limit push
 
 as contact does: the damper grows with the depth, and a limit never pulls. With q' the rate and a the acceleration,
 
-Implicit step: f(q + theta h q', q') - B a with B = theta h^2 k + h (b + d_limit x), of the whole passive force; x is
-lagged. Where the limit lets go it has no part in B. The explicit law is B = 0, h = theta = 0.
+Implicit step: f(q, q') - B a with B = h (b + d_limit x), of the whole passive force; x is lagged. Where the limit lets
+go it has no part in B. The explicit law is B = 0, h = 0.
 
 Actuators with bounds push with motor + k (r - q) - b q', kept within them. At a bound the force is constant, and their
 spring and damper have no part in B; `free` is 0 there and 1 elsewhere.
@@ -114,8 +114,13 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         return force
 
     @wp.func
+    def force(m: Model, here: Lane, i: int, motor: T, q: T, qd: T):
+        """All of the joint's force."""
+        return actuation(m, i, motor, q, qd) + passive_force(m, here, i, q, qd)
+
+    @wp.func
     def resistance(m: Model, here: Lane, i: int, q: T, qd: T, free: T):
-        """The parts of B that theta h^2 and h multiply."""
+        """Minus the derivatives of the force with respect to q and qd, x being lagged; B is h times the second."""
         kq = T(0.0)
         kv = T(0.0)
         if wp.static(STIFFNESS):
@@ -144,12 +149,11 @@ def joint_law(spec: KernelSpec) -> SimpleNamespace:
         return vec2(kq, -resisted[1])
 
     @wp.func
-    def limit_constants_gain(m: Model, here: Lane, i: int, q: T, qd: T, end_rate: T, lead: T):
-        """d force / d factor of (k_limit, d_limit); lead is theta h, other arguments as of gain."""
+    def limit_constants_gain(m: Model, here: Lane, i: int, q: T, qd: T, end_rate: T):
+        """d force / d factor of (k_limit, d_limit); arguments as of gain."""
         way = way_back(m, i, q)
         k, d = limit_constants(m, here, i)
         on = pushes(k, d, way, qd)
-        by_k = T(m.k_limit[i]) * (way - lead * (end_rate - qd))
-        return on * vec2(by_k, -T(m.d_limit[i]) * wp.abs(way) * end_rate)
+        return on * vec2(T(m.k_limit[i]) * way, -T(m.d_limit[i]) * wp.abs(way) * end_rate)
 
     return functions(locals())

@@ -232,11 +232,11 @@ def types(spec: KernelSpec) -> SimpleNamespace:
         # what backward needs of each substep: qpos, qvel, qacc and the factor of the mass matrix
         "Checkpoint": dict.fromkeys("qvaf", array3),
         # a lane of an environment, or of a block of them, e; its n links are entries at, at + 1, ... of Model's arrays;
-        # rows of checkpoints: the substep's, and the factor's, which is kept if keep is 1; h: s, of a substep; theta:
-        # how implicit it is; constants of the laws, or factors of those that each link has its own of
-        # (k_limit to motor, read where they vary)
+        # rows of checkpoints: the substep's, and the factor's, which is kept if keep is 1; h: s, of a substep;
+        # constants of the laws, or factors of those that each link has its own of (k_limit to motor, read where they
+        # vary)
         "Lane": dict.fromkeys("e lane at n row factor keep".split(), int)
-        | of(T="h theta k_n k_d k_t mu k_limit d_limit mass motor"),
+        | of(T="h k_n k_d k_t mu k_limit d_limit mass motor"),
         # where a link is (about the carrier, in world axes), its joint's axis, its velocity, and its joint's state
         "Link": of(mat3="R", vec3="x", vec6="S V", T="q qd"),
         # what a link hands to its parent: its inertia [[a, b], [b', d]] and bias force

@@ -56,8 +56,7 @@ def newton_method(spec: KernelSpec) -> SimpleNamespace:
                 q = links[i].q
                 qd = links[i].qd
                 motions[i].iterate = motions[m.parent[k]].iterate + motions[i].C
-                push = joint.actuation(m, k, motions[i].motor, q, qd)
-                motions[i].force = push + joint.passive_force(m, here, k, q, qd)
+                motions[i].force = joint.force(m, here, k, motions[i].motor, q, qd)
                 if wp.static(LIMIT):
                     motions[i].stop = constraint.stop(m, here, k, q, qd)
                 if wp.static(HELD):

@@ -117,15 +117,12 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
     @wp.func
     def joint_force(m: Model, here: Lane, k: int, phase: int, link: Link, motion: Motion, d: T):
         """(force of a joint, d with what its laws resist acceleration by)."""
-        q = link.q
-        if wp.static(IMPLICIT):
-            q = q + here.theta * here.h * link.qd
         free = T(1.0)
         if wp.static(CLAMP):
-            free = joint.actuation_free(m, k, motion.motor, q, link.qd)
+            free = joint.actuation_free(m, k, motion.motor, link.q, link.qd)
         if wp.static(IMPLICIT):
-            resistance = joint.resistance(m, here, k, q, link.qd, free)
-            d = d + here.theta * here.h * here.h * resistance[0] + here.h * resistance[1]
+            resistance = joint.resistance(m, here, k, link.q, link.qd, free)
+            d = d + here.h * resistance[1]
         if wp.static(CONSTRAINED):
             if phase == SOLVE:
                 damper = here.h * joint.damping(m, k, free)
@@ -135,8 +132,7 @@ def articulated(spec: KernelSpec) -> SimpleNamespace:
                 d = d + motion.firm
                 f = motion.force + motion.held - T(m.armature[k]) * motion.rate
         else:
-            f = joint.actuation(m, k, motion.motor, q, link.qd)
-            f = f + joint.passive_force(m, here, k, q, link.qd)
+            f = joint.force(m, here, k, motion.motor, link.q, link.qd)
         return f, d
 
     @wp.func

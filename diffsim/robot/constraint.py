@@ -24,7 +24,7 @@ def constrained(scene: Scene, seconds: float) -> Scene:
     """A copy with MuJoCo's constraints in substeps of that length; raises SceneError for what of the file they lack."""
     m = scene.mj_model
     if found := list(_obstacles(scene)):
-        raise SceneError(f"{scene.name}: with the integrator mujoco {'; '.join(found)}")
+        raise SceneError(f"{scene.name}: on MuJoCo's contact {'; '.join(found)}")
     fastest = 0.0 if "refsafe" in disabled_flags(m) else 2 * seconds
     ground = ground_pairs(m)[0][0] if len(scene.spheres.geom) else 0
     contact = [_contact(m, ground, geom, fastest) for geom in scene.spheres.geom.tolist()]

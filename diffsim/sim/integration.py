@@ -1,64 +1,47 @@
-"""How a control step is integrated: the choice of integrator and the number of its steps."""
+"""How a control step is integrated: the contact model, the number of its substeps and how they are taken."""
 
 from __future__ import annotations
 
 from numbers import Integral, Real
-from typing import Any, NamedTuple, TypeGuard
+from typing import Literal, NamedTuple, TypeGuard, get_args
 
-INTEGRATORS = ("semi_implicit", "implicit", "extrapolated", "mujoco")
-MOST_SUBSTEPS, MOST_PASSES = 1_000_000, 1000
-PASSES, TOLERANCE = 30, 1e-4  # as measured in docs/physics.md
+Contact = Literal["soft", "mujoco"]
+MOST_SUBSTEPS = 1_000_000
+TOLERANCE = 1e-4  # as measured in docs/physics.md
 
 
 class Integration(NamedTuple):
     """How the simulator takes a control step; docs/physics.md has the equations.
 
     Attributes:
-        integrator: "semi_implicit" (Euler), "implicit" (linearly implicit in damping, friction and, scaled by theta,
-            stiffness), "extrapolated" (Richardson's, from two semi-implicit steps: second order at 1.5 times the cost)
-            or "mujoco" (MuJoCo's Euler and its own constraints for contact, limits and dry friction).
-        substeps: integration steps per control step; an even number for "extrapolated".
-        theta: 0 (velocity-implicit) to 1 (backward-Euler-like stiffness); 0 unless implicit.
-        passes: only "mujoco": most passes of Newton's method per substep.
-        tolerance: only "mujoco": residual that ends them, see Simulator.residual.
+        contact: "soft" (the SHAC paper's springs and dampers) or "mujoco" (MuJoCo's Euler and its own constraints for
+            contact, limits and dry friction).
+        substeps: integration steps per control step.
+        implicit: only "soft": damping and friction act at the end of a substep. Otherwise it is semi-implicit Euler.
+        tolerance: only "mujoco": residual that ends Newton's method, see Simulator.residual.
     """
 
-    integrator: str = "semi_implicit"
+    contact: str = "soft"
     substeps: int = 16
-    theta: float = 0.0
-    passes: int = PASSES
+    implicit: bool = False
     tolerance: float = TOLERANCE
-
-    @classmethod
-    def explicit(cls, kind: str, substeps: int) -> Integration:
-        """Euler's method, on MuJoCo's contact if a contact or an integrator of that kind is "mujoco", else on soft."""
-        return cls("mujoco" if kind == "mujoco" else "semi_implicit", substeps)
-
-    @property
-    def constrained(self) -> bool:
-        """Whether contact and limits are MuJoCo's constraints instead of springs and dampers."""
-        return self.integrator == "mujoco"
-
-    def replaced(self, integrator: str | None = None, **others: Any) -> Integration:
-        """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
-        same = integrator is None or integrator == self.integrator
-        new = self if same else Integration(str(integrator), self.substeps)
-        return new._replace(**{name: value for name, value in others.items() if value is not None})
 
     def check(self) -> Integration:
         """Itself, with plain ints; raises ValueError, with what is allowed, if it cannot be integrated so."""
-        if self.integrator not in INTEGRATORS:
-            raise ValueError(f"unknown integrator {self.integrator!r}; choose from {', '.join(INTEGRATORS)}")
-        substeps = check_count("substeps", self.substeps, MOST_SUBSTEPS)
-        if self.integrator == "extrapolated" and substeps % 2:
-            raise ValueError(f"substeps is {substeps}, must be even for the extrapolated integrator")
-        if not is_real(self.theta) or not 0 <= self.theta <= 1:
-            raise ValueError(f"theta is {self.theta!r}, must lie in [0, 1]")
-        if self.theta and self.integrator != "implicit":
-            raise ValueError(f"theta is {self.theta!r}, but only the implicit integrator has a theta")
+        check_contact(self.contact)
+        if not isinstance(self.implicit, bool):
+            raise ValueError(f"implicit is {self.implicit!r}, must be True or False")
+        if self.implicit and self.contact == "mujoco":
+            raise ValueError("implicit is True, but only soft contact has an implicit integrator")
         if not is_real(self.tolerance) or not 0 < self.tolerance < 1:
             raise ValueError(f"tolerance is {self.tolerance!r}, must lie between 0 and 1")
-        return self._replace(substeps=substeps, passes=check_count("passes", self.passes, MOST_PASSES))
+        return self._replace(substeps=check_count("substeps", self.substeps, MOST_SUBSTEPS))
+
+
+def check_contact(contact: str) -> None:
+    """Raise ValueError unless there is such a contact model."""
+    if contact not in get_args(Contact):
+        raise ValueError(f"unknown contact {contact!r}; choose from {', '.join(get_args(Contact))}")
 
 
 def is_real(value: object) -> TypeGuard[float]:

@@ -18,7 +18,7 @@ class Options(NamedTuple):
     """How a scene is simulated, whatever the number of its copies.
 
     Attributes:
-        integration: integrator, substeps and theta.
+        integration: contact model and substeps.
         device: "cpu" or a CUDA device.
         dtype: torch.float32 or torch.float64.
         threads: CPU threads of the kernels; default as many as have enough to do, up to all cores.

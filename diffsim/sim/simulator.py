@@ -7,7 +7,6 @@ import math
 from typing import Any, NoReturn
 
 import torch
-import torch.nn.functional as F
 import warp as wp
 from torch.autograd.forward_ad import unpack_dual
 
@@ -19,7 +18,8 @@ from diffsim.sim.modes import in_plain_mode
 from diffsim.sim.options import Options
 from diffsim.sim.tangent import Tangent
 
-DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # with the integrator mujoco
+DIVISORS = [FACTORS.index(name) for name in ("k_n", "k_d", "k_limit")]  # on MuJoCo's contact
+PASSES = 30  # of Newton's method in a substep, at most, as measured in docs/physics.md
 BACKWARD_ALONE = (
     "a simulated step has derivatives by backward() and torch.autograd.grad alone, for one gradient at a time: no "
     "torch.func, forward mode or is_grads_batched; Simulator.jacobians has the Jacobians of a batch"
@@ -36,7 +36,7 @@ class Simulator:
     Args:
         scene: the robot and its ground; a terrain has one profile for all copies, or one for each.
         num_envs: number of copies N.
-        integration: integrator, substeps and theta.
+        integration: contact model and substeps.
         control_dt: seconds of one control step.
         horizon: differentiable control steps that can be alive at once.
         **options: device, dtype, threads, factors, forces, block, division: see Options.
@@ -84,14 +84,14 @@ class Simulator:
         self.integration, self.dtype = self.options.integration, self.options.dtype
         self.device = torch.device(self.options.device)
         self.nq, self.nv, self.nu = scene.nq, scene.nv, scene.nu
-        n, how = num_envs, self.integration
+        n, how, hard = num_envs, self.integration, self.integration.contact == "mujoco"
         width, bodies = len(FACTORS) if self.options.factors else 0, scene.nbody if self.options.forces else 0
         # One buffer for qpos, qvel, ctrl, factors and forces side by side: torch copies it in one operation, and the
         # kernels see its parts. Each slot keeps those of its step; the last one serves steps without gradient.
         self._widths, slots = (scene.nq, scene.nv, scene.nu, width, 6 * bodies), horizon + 1
-        self._end_widths = scene.nq, scene.nv + how.constrained  # with constraints a column for the residual
+        self._end_widths = scene.nq, scene.nv + hard  # with constraints a column for the residual
         check_memory("states and actions", n, slots * sum(self._widths) * self.dtype.itemsize, self.device)
-        if how.constrained:
+        if hard:
             scene = constrained(scene, control_dt / how.substeps)
         else:
             check_soft(scene)
@@ -105,13 +105,6 @@ class Simulator:
         self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
         self._slot, self._last = 0, horizon  # of the next differentiable step, of the last step
         self._versions = [0] * horizon  # each slot serves a new step after each round of the ring
-        self._coarse: Simulator | None = None  # the other one of the two steps that are extrapolated
-        if how.integrator == "extrapolated":
-            half = Integration("semi_implicit", how.substeps // 2)
-            self._coarse = Simulator(self.scene, n, half, control_dt, horizon, **options)
-            self._coarse.nonfinite_gradients = self.nonfinite_gradients
-            ends = [range(k, k + 4) for k in scene.quaternion_adr]
-            self._quaternions = torch.tensor(ends, dtype=torch.int64, device=self.device)
 
     def _zeros(self, *size: int, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.zeros(size, dtype=dtype or self.dtype, device=self.device)
@@ -124,8 +117,7 @@ class Simulator:
     @property
     def nonfinite(self) -> torch.Tensor:
         """(N,) bool: environments whose last step was not finite or out of bounds, and was undone. See the class."""
-        bad = self._nonfinite[self._last]
-        return bad if self._coarse is None else bad | self._coarse.nonfinite
+        return self._nonfinite[self._last]
 
     @property
     def residual(self) -> torch.Tensor:
@@ -184,7 +176,7 @@ class Simulator:
         else:
             both = self._forward(self.horizon, *start)
         end: State = both.split(self._widths[:2], dim=1)
-        return end if self._coarse is None else self._extrapolate(self._coarse, start, end)
+        return end
 
     def _forward(self, slot: int, *start: torch.Tensor) -> torch.Tensor:
         """(N, nq + nv) the state after one control step from start = (qpos, qvel, ctrl, factors, forces)."""
@@ -192,17 +184,6 @@ class Simulator:
         self._last = slot
         self._launcher.launch(self._command("forward", slot))
         return self._end[:, : self.nq + self.nv].clone()
-
-    def _extrapolate(self, coarse: Simulator, start: tuple[torch.Tensor, ...], end: State) -> State:
-        """Richardson's extrapolation 2 end - coarse end, in which an error proportional to the substep cancels."""
-        coarse._factors, coarse._forces = self._factors, self._forces
-        coarse_end = coarse.advance(*start[:3])
-        qpos, qvel = (2.0 * b - a for a, b in zip(coarse_end, end, strict=True))
-        if len(self._quaternions):
-            unit = F.normalize(qpos[:, self._quaternions], dim=2)
-            qpos = qpos.index_copy(1, self._quaternions.flatten(), unit.flatten(1))
-        bad = self.nonfinite.unsqueeze(1)
-        return torch.where(bad, start[0].detach(), qpos), torch.where(bad, start[1].detach(), qvel)
 
     @in_plain_mode
     def jacobians(
@@ -226,8 +207,6 @@ class Simulator:
     def rewind(self, slot: int = 0) -> None:
         """Let the next differentiable step use a checkpoint, by default the first: the start of a new window."""
         self._slot = slot
-        if self._coarse is not None:
-            self._coarse.rewind(slot)
 
     def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
         key = (kernel, slot)
@@ -249,10 +228,10 @@ class Simulator:
             )
         )
         real, nonfinite = self._launcher.spec.dtype, wp.from_torch(self._nonfinite[slot])
-        scalars = [real(self.control_dt / how.substeps), real(how.theta), how.substeps]
+        scalars = [real(self.control_dt / how.substeps), how.substeps]
         missed, blown_up = wp.from_torch(self.unconverged), wp.from_torch(self.nonfinite_gradients)
         if kernel == "forward":
-            return [*scalars, how.passes, real(how.tolerance), batch, int(record), row0, rows, nonfinite, missed]
+            return [*scalars, PASSES, real(how.tolerance), batch, int(record), row0, rows, nonfinite, missed]
         return [*scalars, row0, rows, batch, nonfinite, gradients, blown_up]
 
     def __reduce__(self) -> NoReturn:
@@ -277,12 +256,12 @@ class Simulator:
         bad = ~torch.isfinite(value)
         if name == "factors":
             bad |= value < 0
-            if self.integration.constrained and size[0]:
+            if self._launcher.spec.constrained and size[0]:
                 bad[:, DIVISORS] |= value[:, DIVISORS] == 0
         if not bool(bad.any()):
             return value
         place = tuple(bad.nonzero()[0].tolist())
-        rest = " and not negative, with the integrator mujoco those of k_n, k_d and k_limit positive"
+        rest = " and not negative, on MuJoCo's contact those of k_n, k_d and k_limit positive"
         must = f"must be finite{rest if name == 'factors' else ''}"
         raise ValueError(f"{name}[{', '.join(map(str, place))}] is {value[place].item()}; {name} {must}")
 

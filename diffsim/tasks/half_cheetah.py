@@ -14,8 +14,7 @@ class HalfCheetah(Planar):
     name = "half_cheetah"
     asset, contact = "half_cheetah.xml", "soft"
     substeps = 16
-    fast = Integration("implicit", 8)
-    accurate = Integration("extrapolated", 32)
+    fast = Integration("soft", 8, implicit=True)
     obs_dim = 17
     num_random = 18
     start = (0.0, -0.2) + (0.0,) * 16

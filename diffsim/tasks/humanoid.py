@@ -15,8 +15,7 @@ class Humanoid(Locomotion):
     name = "humanoid"
     asset, contact = "humanoid.xml", "soft"
     substeps = 48
-    fast = Integration("implicit", 24)
-    accurate = Integration("extrapolated", 96)
+    fast = Integration("soft", 24, implicit=True)
     obs_dim = 76
     num_random = 55
     min_height = 0.74

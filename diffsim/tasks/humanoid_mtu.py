@@ -18,8 +18,7 @@ class HumanoidMTU(Locomotion):
     name = "humanoid_mtu"
     asset, contact = "humanoid_mtu.xml", "soft"
     substeps = 48
-    fast = Integration("semi_implicit", 24)
-    accurate = Integration("extrapolated", 96)
+    fast = Integration("soft", 24)
     obs_dim = 53
     num_random = 53
     min_height = 0.46

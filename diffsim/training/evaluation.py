@@ -21,7 +21,6 @@ from torch import Tensor, nn
 import diffsim
 from diffsim.env import DiffEnv
 from diffsim.robot.scene import Scene
-from diffsim.sim.integration import Integration
 from diffsim.training import checkpoint, graph
 from diffsim.training.checkpoint import SavedPolicy
 from diffsim.training.directory import check_writable, say
@@ -32,7 +31,7 @@ FILM = "diffsim.extra.render:film"
 GAIT = "diffsim.extra.gait:report"
 VIDEO_SECONDS = 10.0  # how much of an episode is filmed
 SEED = 1_000_000  # of the start states: the same for every policy, and far from those of training
-FINER = 4  # times the substeps, explicit: what a return must survive to be the robot's and not the integrator's
+FINER = 4  # times the substeps, without --implicit: a return counts only if it survives this finer integration
 ENOUGH = 0.97  # of the return, kept there
 LOOK_EVERY = 50  # control steps between two after which a GPU is waited for, to see whether all episodes have ended
 SETTINGS = OPTIONS | {"env", "device", "eval_episodes"}
@@ -217,7 +216,7 @@ def make_policy_env(saved: SavedPolicy, num_envs: int, forces: bool = False, **c
 def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | None = None) -> None:
     """What --evaluate does: print the evaluation of a saved policy, and write evaluation.json and the video.
 
-    Unless --no-finer is given, the policy must also keep its return at FINER times the substeps, explicitly integrated:
+    Unless --no-finer is given, the policy must also keep its return at FINER times the substeps, without --implicit:
     one that does not has learned to live on the integrator's errors.
 
     Args:
@@ -240,13 +239,11 @@ def evaluate_checkpoint(args: Args, learner: Callable[[Args, DiffEnv], Any] | No
     say(f"{args.env}, {args.eval_episodes} episodes: {evaluation}")
     if args.finer:
         substeps = FINER * args.substeps
-        explicit = Integration.explicit(args.integrator, substeps)
-        finer = dataclasses.replace(args, **{k: getattr(explicit, k) for k in ("integrator", "substeps", "theta")})
-        value = measure(finer).returns.median().item()
+        value = measure(dataclasses.replace(args, substeps=substeps, implicit=False)).returns.median().item()
         share = kept(evaluation.returns.median().item(), value)
         found["finer"] = {"substeps": substeps, "return": value, "kept": share}
         warning = "" if share >= ENOUGH else f"; less than {ENOUGH:.0%}: train with more substeps"
-        say(f"{finer.integrator} with {substeps} substeps: return median {value:.1f}, {share:.1%} retained{warning}")
+        say(f"{substeps} substeps: return median {value:.1f}, {share:.1%} retained{warning}")
     write_evaluation(args, evaluation, state["iteration"], **found)
 
 

@@ -11,16 +11,15 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 
 import tyro
 
-from diffsim.sim.integration import PASSES, TOLERANCE
 from diffsim.tasks import FILE, TASKS, Accuracy, Contact, base_name, find_task
 from diffsim.training import checkpoint, distributed
 from diffsim.training.errors import fail, in_one_line
-from diffsim.training.ranges import Count, Fraction, Natural, NonNegative, Range, Repeats, check_ranges, flag
+from diffsim.training.ranges import Count, Natural, NonNegative, Range, Repeats, check_ranges, flag
 
 FIXED = ("env", "seed", "num_envs", "control_dt")  # with --resume; what else must fit, `restore` tells
 # Flags that diffsim.make takes as they are; control_dt is one of gps.py.
-OPTIONS = {*"integrator substeps theta passes tolerance contact early_termination control_dt".split()}
-EVALUATED = OPTIONS - {"control_dt"} | {*"accuracy device eval_episodes evaluate finer quiet run_dir threads".split()}
+OPTIONS = {*"contact accuracy substeps implicit early_termination control_dt".split()}
+EVALUATED = OPTIONS - {"control_dt"} | {*"device eval_episodes evaluate finer quiet run_dir threads".split()}
 ENV = (
     f"task: {', '.join(TASKS)}, with options as in go2:rough=20 or g1_track:walk.npz (docs/tasks.md); "
     "or a file of your own, my_task.py or my_task.py:Class (docs/own_robot.md)"
@@ -55,26 +54,20 @@ class Flags:
     evaluate: Path | None = None
     """checkpoint, or directory of a run, to evaluate, e.g. with more --substeps; writes evaluation.json to --run-dir"""
     finer: bool = True
-    """with --evaluate, also measure the return at four times the substeps, explicitly integrated"""
+    """with --evaluate, also measure the return at four times the substeps, without --implicit"""
     track: bool = False
     """also log to Weights & Biases (pip install wandb)"""
     quiet: bool = False
     """no progress bar, and no messages until the end"""
     env: Annotated[str, tyro.conf.arg(aliases=["--env-id"], help=ENV)] = "ant"
-    accuracy: Accuracy = "default"
-    """preset of integrator, substeps and theta (docs/numerics.md); default: the papers' settings"""
-    integrator: Literal["semi_implicit", "implicit", "extrapolated", "mujoco"] = "semi_implicit"
-    """time integration (per task, --accuracy and --contact); mujoco includes MuJoCo's own contact and limits"""
-    substeps: Count = 16
-    """simulation steps per control step (per task and --accuracy)"""
-    theta: Fraction = 0.0
-    """how implicit the stiffness is with --integrator implicit (per task and --accuracy)"""
-    passes: Count = PASSES
-    """with --integrator mujoco: at most this many passes of Newton's method per substep"""
-    tolerance: Fraction = TOLERANCE
-    """with --integrator mujoco: residual that ends the passes (per --accuracy)"""
     contact: Contact = "soft"
     """contact and limits: the paper's springs, or MuJoCo's own (docs/transfer.md; per task)"""
+    accuracy: Accuracy = "default"
+    """preset of substeps and --implicit (docs/numerics.md); default: the papers' settings"""
+    substeps: Count = 16
+    """simulation steps per control step (per task, --contact and --accuracy)"""
+    implicit: bool = False
+    """on soft contact, damping and friction act at the end of a substep (per task and --accuracy)"""
     early_termination: bool = True
     """end episodes when the robot falls; otherwise they end only by time"""
     threads: Natural = 0
@@ -86,8 +79,8 @@ class Flags:
 
     def check(self) -> None:
         """Raises a ValueError where arguments do not fit together."""
-        if self.contact == "mujoco" and self.integrator != "mujoco":
-            fail(f"--integrator {self.integrator} is for --contact soft, and the contact is MuJoCo's")
+        if self.contact == "mujoco" and self.implicit:
+            fail("--implicit is for --contact soft, and the contact is MuJoCo's")
 
     @classmethod
     def script(cls) -> str:
@@ -190,9 +183,10 @@ def parse(kind: type[Args], argv: Sequence[str] | None = None) -> Args:
 def _presets(args: Flags) -> dict[str, Any]:
     """What --accuracy and --contact stand for."""
     try:
-        return find_task(args.env).integration(args.accuracy, args.contact)._asdict()
+        how = find_task(args.env).integration(args.accuracy, args.contact)
     except ValueError as error:
         fail(error)
+    return {"substeps": how.substeps, "implicit": how.implicit}
 
 
 def _continue(kind: type[Args], argv: list[str], given: Args, path: Path) -> Args:

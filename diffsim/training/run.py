@@ -39,7 +39,7 @@ Metrics = dict[str, Tensor]
 TOTALS = ("nonfinite", "nonfinite_gradients")  # of env.take_statistics, logged as running totals sim/...
 TOLD = {  # totals, and how a message tells that they have doubled
     "grad/skipped": "updates skipped so far because of their gradients: {:.0f}; if many, shorten --horizon",
-    "sim/unconverged": "control steps so far in which Newton's method did not converge: {:.0f}; give more --passes",
+    "sim/unconverged": "control steps so far in which Newton's method did not converge: {:.0f}; give more --substeps",
 }
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 RANK_SEED = 1_000_003  # between the seeds of two ranks

@@ -42,7 +42,7 @@ def test_a_training_depends_on_its_learner_its_task_and_its_flags():
         "shac --env ant": {"shac", "ant"},
         "sapo --env humanoid_mtu": {"sapo", "humanoid_mtu", "sapo_humanoid_mtu"},
         "ppo_baseline --contact mujoco --env go2": {"ppo_baseline", "mujoco", "joystick"},
-        "shac --accuracy accurate --env cartpole": {"shac", "cartpole", "accurate"},
+        "shac --accuracy fast --env cartpole": {"shac", "cartpole", "fast"},
     }.items():
         assert fingerprints.depends(command) == names
     for cell in paper.wanted(paper.Args()):  # none is without a fingerprint of its learner and of its task
@@ -73,15 +73,18 @@ def test_a_result_counts_while_each_link_keeps_what_it_depends_on(chain):
 
 def test_a_result_counts_while_its_preset_is_the_same(chain, monkeypatch):
     chain()
-    text = "class Ant:\n    fast = 8\n    accurate = {}\n"
-    files = {f"{at}:diffsim/tasks/ant.py": text.format(n) for at, n in (("a", 16), ("b", 32), ("HEAD", 32))}
+    text = "class Ant:\n    fast = Integration({})\n"
+    files = {
+        f"{at}:diffsim/tasks/ant.py": text.format(n)
+        for at, n in (("a", "8"), ("b", '"implicit", 8'), ("HEAD", '"soft", 8, implicit=True'))
+    }
 
     def show(call: list[str], **_: object) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(call, 0, files.get(call[-1], ""))
 
     monkeypatch.setattr(subprocess, "run", show)
     fingerprints.preset.cache_clear()
-    for flags, kept in (("--accuracy accurate", False), ("--accuracy fast", True), ("", True)):
+    for flags, kept in (("--accuracy fast", False), ("", True)):
         assert counts("a", f"shac {flags} --env ant") == kept and counts("b", f"shac {flags} --env ant")
     fingerprints.preset.cache_clear()
 

@@ -31,7 +31,7 @@ def test_the_worlds_agree_where_nothing_touches() -> None:
     """In flight and within the joints' ranges both solve the same equations, with the same motors at the same times."""
     env, qpos, qvel = states("hopper", 3)
     qpos[:, 1], qpos[:, 3:] = 5.0, torch.tensor([-0.5, -0.5, 0.0])
-    here = Simulator(env.scene, 3, Integration("semi_implicit", 64), DT, dtype=torch.float64)
+    here = Simulator(env.scene, 3, Integration(substeps=64), DT, dtype=torch.float64)
     ends = []
     for world in (worlds.Here(here), worlds.MuJoCo(env.scene, 3, DT)):
         q, v, drawn = qpos, qvel, torch.Generator().manual_seed(0)

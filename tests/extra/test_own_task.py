@@ -325,7 +325,7 @@ def test_own_tasks_have_mujocos_contact_and_the_shipped_ones_the_papers() -> Non
     class Soft(Own):
         contact = "soft"
 
-    hard, soft = (lambda n, kind=kind: diffsim.Integration(kind, n) for kind in ("mujoco", "semi_implicit"))
+    hard, soft = (lambda n, kind=kind: diffsim.Integration(kind, n) for kind in ("mujoco", "soft"))
     assert {name for name, task in TASKS.items() if task.contact == "mujoco"} == {"go1", "go2", "g1", "g1_track"}
     for kind, words, expected in (
         (Bare, ["default"], hard(4)),

@@ -170,6 +170,6 @@ def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(
     run(shac, tmp_path / "part", *flags.split(), "--stop-after", 2)
     part = run(shac, tmp_path / "part", "--resume", tmp_path / "part" / "checkpoint.pt", "--stop-after", 0, "--quiet")
     assert_same(part["modules"], whole["modules"])
-    assert whole["args"]["integrator"] == "mujoco"
+    assert whole["args"]["contact"] == "mujoco"
     saved = str(tmp_path / "part" / "checkpoint.pt")
     assert parse(shac.Args, ["--evaluate", saved, "--accuracy", "accurate"]).substeps == 16

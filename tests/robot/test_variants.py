@@ -11,6 +11,7 @@ from scenes import parse
 from diffsim import Integration, Scene, SceneError, Simulator, startup
 from diffsim.extra.report import approximations
 from diffsim.robot.constraint import constrained
+from diffsim.sim import simulator
 
 H = 0.002  # s
 # A sphere in the ground and a driven leg within its limits; a variant fills one of the places.
@@ -139,7 +140,7 @@ def test_so_many_variants_are_refused() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("place", "text"), CASES)
-def test_a_step_is_mujocos_or_the_file_says_why_not(place: str, text: str) -> None:
+def test_a_step_is_mujocos_or_the_file_says_why_not(place: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         scene = scene_of(place, text)
     except SceneError:
@@ -156,8 +157,9 @@ def test_a_step_is_mujocos_or_the_file_says_why_not(place: str, text: str) -> No
         mujoco.mj_integratePos(m, qpos, change, 1.0)
         states.append((qpos, 0.5 * rng.normal(size=m.nv)))
     qpos, qvel = (torch.tensor(np.array(x)) for x in zip(*states, strict=True))
+    monkeypatch.setattr(simulator, "PASSES", 300)
     with startup.quick_kernels(), torch.no_grad():
-        sim = Simulator(scene, 12, Integration("mujoco", 1, passes=300, tolerance=1e-12), H, 1, dtype=torch.float64)
+        sim = Simulator(scene, 12, Integration("mujoco", 1, tolerance=1e-12), H, 1, dtype=torch.float64)
         found = sim.step(qpos, qvel, torch.full((12, m.nu), 0.3, dtype=torch.float64))[1].numpy()
     low, high = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, (-1.0, 1.0)).T
     data, errors = mujoco.MjData(m), []

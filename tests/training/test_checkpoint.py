@@ -94,7 +94,7 @@ def test_weights_are_compared_before_layers_are_built(tmp_path, capsys):
         ("args critic_hidden", (b"x",)),
         ("args substeps", torch.Size([3])),
         ("args target_alpha", None),
-        ("args integrator", "explicit"),
+        ("args contact", "hard"),
         ("args check", 1),
         ("ranks 0 env", None),
         ("ranks 0 env qpos", math.nan),

@@ -127,8 +127,8 @@ def test_evaluate_a_checkpoint_with_other_substeps(
     assert own["speed"] is None and own["lengths"] == [240, 240]  # a robot without ground
     assert out.startswith(f"cartpole, 2 episodes: return median {own['return']:.1f}, mean ")
     assert finer["substeps"] == 16 and finer["kept"] == pytest.approx(own["return"] / finer["return"])
-    assert f"semi_implicit with 16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} retained" in out
-    explicit = found("explicit", *"--integrator semi_implicit --substeps 16 --no-finer".split())
+    assert f"\n16 substeps: return median {finer['return']:.1f}, {finer['kept']:.1%} retained" in out
+    explicit = found("explicit", *"--no-implicit --substeps 16 --no-finer".split())
     assert explicit["return"] == finer["return"] and "finer" not in explicit
     other = found("other", *"--substeps 16 --eval-episodes 4 --no-finer".split())["settings"]
     assert (other["substeps"], other["eval_episodes"], other["iteration"]) == (16, 4, 2)

@@ -73,7 +73,7 @@ def save(args: flags.Flags, **further: object) -> Path:
         (shac, "--actor-lr 1e+39", "finite in single precision"),
         (shac, "--critic-lr 0.0", "positive"),
         (ppo_baseline, "--value-coef -1.0", "at least 0"),
-        (shac, "--theta 1.5", "in [0, 1]"),
+        (bptt, "--gamma 1.5", "in [0, 1]"),
         (bptt, "--betas 0.9 1.0", "in [0, 1)"),
         (sac_baseline, "--hidden ()", "at least one number"),
     ],
@@ -90,14 +90,16 @@ def test_a_number_out_of_range_is_named_before_anything_is_written(script, argum
     ("arguments", "message"),
     [
         ("--env anty", "unknown task 'anty': choose from cartpole, hopper, half_cheetah, ant, humanoid"),
-        ("--env walker --accuracy fast", "task 'walker' has no preset 'fast' on soft contact; choose from default"),
+        (
+            "--env walker --accuracy fast",
+            "task 'walker' has no preset 'fast' on soft contact; choose from default, accurate",
+        ),
         ("--env cartpole:rough=10", "cartpole touches no ground, so it has no terrain"),
         ("--env ant:clip.npz", "task 'ant' has no option 'clip.npz': write rough=20, randomise=none or a range like"),
         ("--env humanoid_imitation:nowhere", "no such clip: nowhere; give an .npz or .csv file"),
         ("--env go2:rough=50", "'rough=50': the steepest slope must be above 0 and at most 45 degrees"),
         ("--env go2:push=2:1", "'push=2:1': must be from 0 to inf, the smaller one first"),
-        ("--substeps 5 --integrator extrapolated", "substeps is 5, must be even"),
-        ("--contact mujoco --integrator implicit", "--integrator implicit is for --contact soft, and the contact"),
+        ("--contact mujoco --implicit", "--implicit is for --contact soft, and the contact is MuJoCo's"),
         ("--device nonsense", "nonsense"),
         ("--device cuda", "device 'cuda' asked for, but PyTorch sees 0 CUDA GPUs here; choose cpu"),
         ("--run-dir {file}", "cannot write to run directory {file}: Not a directory"),
@@ -235,20 +237,20 @@ def test_defaults_are_the_tables(script):
             expected |= {name: min(expected.get(name, most), most) for name, most in script.CPU.items()}
             expected |= getattr(script, "ON_CPU", {}).get(env, {})
         preset = getattr(script, "INTEGRATION", {}).get(env) or diffsim.TASKS[env].integration("default")
-        if preset.integrator == "mujoco" and script.__name__ in ("shac", "sapo"):  # shorter windows of more
+        if preset.contact == "mujoco" and script.__name__ in ("shac", "sapo"):  # shorter windows of more
             expected |= {"num_envs": 4 * expected.get("num_envs", script.Args().num_envs)}
             assert args.horizon == (16 if env in ("g1", "g1_track") and script.__name__ in ("shac", "sapo") else 8)
-        expected |= dict(integrator=preset.integrator, substeps=preset.substeps, theta=preset.theta)
+        expected |= dict(contact=preset.contact, substeps=preset.substeps, implicit=preset.implicit)
         assert {name: getattr(args, name) for name in expected} == expected
 
 
 def test_the_command_line_is_before_the_task_is_before_the_class():
     args = parse(shac.Args, "--env-id cartpole --actor-lr 3e-3 --substeps 7".split())
     assert (args.env, args.actor_lr, args.critic_lr, args.gamma) == ("cartpole", 3e-3, 1e-3, 0.99)
-    assert (args.integrator, args.substeps) == ("semi_implicit", 7)
+    assert (args.implicit, args.substeps) == (False, 7)
     fast = diffsim.TASKS["humanoid"].integration("fast")
-    args = parse(shac.Args, "--env humanoid --accuracy fast --theta 0.25".split())
-    assert (args.integrator, args.substeps, args.theta) == (fast.integrator, fast.substeps, 0.25)
+    args = parse(shac.Args, "--env humanoid --accuracy fast --no-implicit".split())
+    assert (args.implicit, args.substeps) == (False, fast.substeps) and fast.implicit
     args = parse(shac.Args, ["--env", "cartpole", "--general-hyperparameters", "--num-envs", "3"])
     assert (args.iterations, args.num_envs, args.actor_hidden, args.target_alpha) == (500, 3, (256, 128), 0.995)
 
@@ -268,16 +270,16 @@ def test_accuracy_is_stored_and_can_be_replaced():
     fast, accurate = (diffsim.TASKS["cartpole"].integration(name) for name in ("fast", "accurate"))
     path = save(parse(shac.Args, "--env cartpole --accuracy fast".split()))
 
-    def numbers(*arguments: str) -> tuple[str, int, float]:
+    def integration(*arguments: str) -> diffsim.Integration:
         args = parse(shac.Args, ["--evaluate", str(path), *arguments])
-        assert make_env(args, 1).sim.integration.substeps == args.substeps
-        return args.integrator, args.substeps, args.theta
+        assert (how := make_env(args, 1).sim.integration).substeps == args.substeps
+        return how
 
-    assert numbers() == (fast.integrator, fast.substeps, fast.theta)
+    assert integration() == fast
     for words in (["--accuracy", "accurate"], ["--accuracy=accurate"]):
-        assert numbers(*words) == (accurate.integrator, accurate.substeps, accurate.theta)
-    assert numbers("--accuracy", "accurate", "--substeps", "2") == (accurate.integrator, 2, accurate.theta)
-    assert numbers("--substeps", "16", "--integrator", "semi_implicit") == ("semi_implicit", 16, 0.0)
+        assert integration(*words) == accurate
+    assert integration("--accuracy", "accurate", "--substeps", "2") == accurate._replace(substeps=2)
+    assert integration("--substeps", "16", "--no-implicit") == diffsim.Integration("soft", 16)
 
 
 def test_rough_ground_is_as_steep_as_the_option():
@@ -360,7 +362,7 @@ def test_help_shows_the_defaults_of_the_task_and_the_preset(capsys):
     assert (default(text, "--substeps"), default(text, "--target-alpha")) == ("48", "0.995")
     assert (default(text, "--actor-hidden"), default(text, "--critic-hidden")) == ("256 128", "128 128")
     text = help_of(shac, capsys, "--env", "humanoid", "--accuracy", "fast")
-    assert (default(text, "--integrator"), default(text, "--substeps")) == ("implicit", "24")
+    assert (default(text, "--substeps"), "--implicit, --no-implicit" in text) == ("24", True)
     text = help_of(bptt, capsys, "--env", "cartpole")
     assert (default(text, "--horizon"), default(text, "--hidden")) == ("64", "64 64")
     text = help_of(ppo_baseline, capsys, "--device", "cpu")

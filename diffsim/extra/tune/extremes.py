@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from diffsim.extra.tune.front import integrator
 from diffsim.extra.tune.motion import Motion
 from diffsim.robot.mjcf import load_scene
 from diffsim.sim.integration import Integration
@@ -34,10 +35,8 @@ def stress(motion: Motion, task: type[Task], contact: str) -> list[dict[str, str
     It fails where an environment is contained, or its kinetic energy passes twice the largest of a float64 reference.
     """
     how = task.integration("default", contact)
-    kinds = {how.integrator: how}
-    if not how.constrained:
-        kinds |= {f"implicit {theta:g}": Integration("implicit", how.substeps, theta) for theta in (0.0, 0.5)}
-        kinds["extrapolated"] = Integration("extrapolated", how.substeps + how.substeps % 2)
+    both = (how, how._replace(implicit=True)) if contact == "soft" else (how,)
+    kinds = {integrator(each): each for each in both}
     grounded = "contact" in motion.scene.features
     sweeps = [sweep for sweep in SWEEPS if grounded or sweep not in ("contact stiffness x", "drop (m)")]
     return [
@@ -51,7 +50,7 @@ def first_failure(motion: Motion, sweep: str, how: Integration) -> str:
     for value in SWEEPS[sweep]:
         case, own = extreme(motion, sweep, value), how
         if sweep == "substeps":
-            if value >= how.substeps or how.integrator == "extrapolated" and value % 2:
+            if value >= how.substeps:
                 continue
             own = how._replace(substeps=int(value))
         trail = case.replay(own)

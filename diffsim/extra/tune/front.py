@@ -11,14 +11,13 @@ import torch
 from tqdm import tqdm
 
 from diffsim.extra.tune.motion import HORIZONS, SPANS, Motion
-from diffsim.sim.integration import Integration
+from diffsim.sim.integration import TOLERANCE, Integration
 from diffsim.sim.simulator import Simulator
 from diffsim.tasks import Task
 
-FINER = 8  # the reference's substeps, in multiples of the most measured
+FINER = 16  # the reference's substeps, in multiples of the most measured
 TIMED, ROUNDS = 64, 15  # environments and turns of a timing; the fastest turn counts, the others were disturbed
 FACTORS = (0.125, 0.25, 0.5, 0.75, 1.0, 2.0, 4.0)  # substeps, in multiples of the default's
-ENDS = ((4, 1e-4), (8, 1e-4), (30, 1e-2), (30, 1e-3))  # of Newton's method on MuJoCo's contact: passes, tolerance
 
 
 class Row(NamedTuple):
@@ -44,34 +43,35 @@ class Row(NamedTuple):
 
 def flags(how: Integration) -> str:
     """What a script is given to integrate so."""
-    if how.constrained:
-        return f"--contact mujoco --substeps {how.substeps} --passes {how.passes} --tolerance {how.tolerance:g}"
-    theta = f" --theta {how.theta:g}" if how.integrator == "implicit" else ""
-    return f"--contact soft --integrator {how.integrator}{theta} --substeps {how.substeps}"
+    words = ["--contact", how.contact, "--substeps", str(how.substeps)]
+    if how.contact == "soft":
+        words.append("--implicit" if how.implicit else "--no-implicit")
+    elif how.tolerance < TOLERANCE:
+        words += ["--accuracy", "accurate"]
+    return " ".join(words)
+
+
+def integrator(how: Integration) -> str:
+    """The integrator's name."""
+    return "mujoco" if how.contact == "mujoco" else "implicit" if how.implicit else "semi_implicit"
 
 
 def settings(task: type[Task], contact: str) -> list[Integration]:
     """What is measured on a contact model: the task's presets, and others around its default."""
     presets = task.presets(contact)
     default = presets["default"]
-    factors = (*FACTORS, 8.0) if default.constrained else FACTORS  # whose default has fewer substeps
+    factors = (*FACTORS, 8.0) if contact == "mujoco" else FACTORS  # whose default has fewer substeps
     counts = sorted({max(1, round(factor * default.substeps)) for factor in factors})
-    if default.constrained:
-        ends = *ENDS, (default.passes, default.tolerance)
-        found = [default._replace(substeps=n, passes=passes, tolerance=end) for n in counts for passes, end in ends]
-    else:
-        found = [Integration("semi_implicit", n) for n in counts]
-        found += [Integration("implicit", n, theta) for theta in (0.0, 0.5) for n in counts]
-        found += [Integration("extrapolated", n) for n in counts if n % 2 == 0]
+    found = [default._replace(substeps=n) for n in counts]
+    if contact == "soft":
+        found += [default._replace(substeps=n, implicit=True) for n in counts]
     return [*dict.fromkeys((*found, *presets.values()))]
 
 
-def finest(found: Iterable[Integration]) -> Integration:
+def finest(found: Sequence[Integration]) -> Integration:
     """The reference of integrations on one contact model, to be computed in float64."""
-    how = max(found, key=lambda how: how.substeps)
-    if how.constrained:
-        return how._replace(substeps=FINER * how.substeps, passes=100, tolerance=1e-9)
-    return Integration("extrapolated", FINER * how.substeps)
+    most = max(how.substeps for how in found)
+    return found[0]._replace(substeps=FINER * most, implicit=False, tolerance=1e-9)
 
 
 class Reference:

@@ -78,7 +78,7 @@ class HumanoidImitation(Imitation):
     name = "humanoid_imitation"
     asset = Humanoid.asset
     contact: ClassVar[Contact] = Humanoid.contact
-    substeps, fast, accurate = Humanoid.substeps, Humanoid.fast, Humanoid.accurate
+    substeps, fast = Humanoid.substeps, Humanoid.fast
     obs_dim = 57
     num_memory = 1
     default_clip = "humanoid_run"
