@@ -120,7 +120,6 @@ class DiffEnv(VectorEnv):
         self._episode_return = torch.zeros(num_envs, dtype=self.dtype, device=self.device)
         self._statistics = {name: torch.zeros_like(self._episode_return) for name in STATISTICS}
         self.qpos, self.qvel, self._obs, self.memory = self._draw(1)[0]
-        self._recorded = 0  # differentiable steps since the window began
         self._pinned: State | None = None
         self._starts, self._time = self._draw(horizon), 0  # of the window: one batch of operations, not one per step
 
@@ -181,16 +180,8 @@ class DiffEnv(VectorEnv):
             rows = torch.isnan(action).any(1).nonzero().flatten().tolist()
             raise ActionError(f"action is NaN in environments {rows[:8]}; every action must be a number")
         action = action.clamp(-1.0, 1.0)
-        start = (self.qpos, self.qvel, action, self.sim.factors, self.sim.forces)
-        recorded = torch.is_grad_enabled() and any(part.requires_grad for part in start)
-        if recorded and self._recorded == self.horizon:
-            raise RuntimeError(
-                f"horizon of {self.horizon} differentiable steps exceeded: call env.detach() to start a new "
-                "window, step under torch.no_grad(), or make the environment with a larger horizon"
-            )
-        self._recorded += recorded
         self.qpos, self.qvel = self.sim.advance(self.qpos, *self.task.disturb(self.qvel, action, self.memory))
-        if recorded and self.adjoint_clip:
+        if self.adjoint_clip and self.qpos.requires_grad:
             self.qpos, self.qvel = ClipAdjoint.apply(self.adjoint_clip, self.qpos, self.qvel)
         nonfinite = self.sim.nonfinite.clone()
         if self.task.num_memory:
@@ -246,7 +237,6 @@ class DiffEnv(VectorEnv):
 
     def _cut(self) -> None:
         self._put(part.detach() for part in self._state())
-        self._recorded = 0
         self.sim.rewind()
 
     def pin(self) -> State:

@@ -40,6 +40,7 @@ def train(num_envs: int = 32, iterations: int = 150, seed: int = 0) -> list[floa
     adam = torch.optim.Adam(network.parameters(), lr=0.01)
     distances = []
     for iteration in range(iterations):
+        sim.rewind()
         goal = 2 * torch.rand(num_envs, 1) - 1
         qpos, qvel = drive(sim, network, goal)
         x, angle = qpos.unbind(-1)

@@ -51,6 +51,7 @@ def optimise(
     adam = torch.optim.Adam([ctrl], lr=0.1)
     history = []
     for iteration in range(iterations):
+        sim.rewind()
         qpos, qvel = simulate(sim, ctrl)
         costs = cost(qpos, qvel)
         adam.zero_grad()

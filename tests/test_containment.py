@@ -20,6 +20,7 @@ def leaves(*arrays, dtype=torch.float32):
 
 def step_and_gradients(sim, states):
     inputs = leaves(*states)
+    sim.rewind()
     outputs = sim.step(*inputs)
     gradients = torch.autograd.grad([output.sum() for output in outputs], inputs)
     return [x.detach() for x in outputs], list(gradients)
@@ -93,6 +94,7 @@ def four_steps(sim, given):
     sim.factors, sim.forces = inputs["factors"], inputs["forces"]
     state, states, lost = (inputs["qpos"], inputs["qvel"]), [], []
     sim.nonfinite_gradients.zero_()
+    sim.rewind()
     for _ in range(4):
         states += (state := sim.step(*state, inputs["ctrl"]))
         lost.append(sim.nonfinite.clone())
@@ -281,7 +283,11 @@ def test_overwritten_checkpoint_is_noticed(rng):
     scene = task_scene("hopper")
     sim = Simulator(scene, 2, horizon=2)
     states = leaves(*acting_states(scene, 2, rng))
-    first, second, third = (sim.step(*states)[0].sum() for _ in range(3))
+    first, second = (sim.step(*states)[0].sum() for _ in range(2))
+    with pytest.raises(RuntimeError, match=r"horizon of 2 .*rewind\(\)"):
+        sim.step(*states)
+    sim.rewind()
+    third = sim.step(*states)[0].sum()
     expected = torch.autograd.grad(second, states)
     torch.testing.assert_close(torch.autograd.grad(third, states), expected, rtol=0, atol=0)
     with pytest.raises(RuntimeError, match="overwritten.*2.*horizon"):

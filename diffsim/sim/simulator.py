@@ -30,15 +30,16 @@ State = tuple[torch.Tensor, torch.Tensor]  # qpos (N, nq), qvel (N, nv)
 class Simulator:
     """A batch of independent copies of one scene, stepped by control steps of equal length.
 
-    It stores up to `horizon` differentiable control steps in a ring. A backward pass must run before its steps are
-    overwritten, otherwise it raises RuntimeError. Steps without gradients store nothing.
+    Up to `horizon` differentiable control steps make a window, and `rewind` begins the next one. A backward pass must
+    run before the next window overwrites its steps, otherwise it raises RuntimeError. Steps without gradients store
+    nothing.
 
     Args:
         scene: the robot and its ground; a terrain has one profile for all copies, or one for each.
         num_envs: number of copies N.
         integration: contact model and substeps.
         control_dt: seconds of one control step.
-        horizon: differentiable control steps that can be alive at once.
+        horizon: largest number of differentiable control steps in a window.
         **options: device, dtype, threads, factors, forces, block, division: see Options.
 
     Raises:
@@ -103,8 +104,8 @@ class Simulator:
         self.nonfinite_gradients, self.unconverged = self._zeros(2, n, dtype=torch.int32)
         self._rows: Any = None  # what backward needs of each substep, of all slots
         self._commands: dict[tuple[str, int], list[wp.Launch]] = {}
-        self._slot, self._last = 0, horizon  # of the next differentiable step, of the last step
-        self._versions = [0] * horizon  # each slot serves a new step after each round of the ring
+        self._slot, self._last = 0, horizon  # of the window's next differentiable step, of the last step
+        self._versions = [0] * horizon  # each slot serves a new step in each window
 
     def _zeros(self, *size: int, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.zeros(size, dtype=dtype or self.dtype, device=self.device)
@@ -157,6 +158,7 @@ class Simulator:
         Raises:
             ValueError: an argument of the wrong shape, dtype or device; on the CPU, factors or forces that were changed
                 in place to what is not allowed.
+            RuntimeError: a differentiable step in a full window.
         """
         for name, value, width in zip(("qpos", "qvel", "ctrl"), (qpos, qvel, ctrl), self._widths, strict=False):
             self.check_tensor(name, value, width)
@@ -170,7 +172,12 @@ class Simulator:
                     self._check_given(name, given, *given.shape[1:])
         start = (qpos, qvel, ctrl, self._factors, self._forces.flatten(1))
         if torch.is_grad_enabled() and any(part.requires_grad for part in start):
-            slot, self._slot = self._slot, (self._slot + 1) % self.horizon
+            if self._slot == self.horizon:
+                raise RuntimeError(
+                    f"horizon of {self.horizon} differentiable steps exceeded: begin a new window by an environment's "
+                    "detach() or a simulator's rewind(), step under torch.no_grad(), or make it with a larger horizon"
+                )
+            slot, self._slot = self._slot, self._slot + 1
             self._versions[slot] += 1
             both = ControlStep.apply(self, slot, *start)
         else:
@@ -192,21 +199,21 @@ class Simulator:
         """A (N, 2 nv, 2 nv) and B (N, 2 nv, nu) of one control step: dx' = A dx + B dctrl, by 2 nv backward passes.
 
         x is qpos, then qvel, and differences of qpos are those of MuJoCo's mjd_transitionFD: a rotation changes by a
-        rotation vector in the body's frame. Arguments, factors and forces are as for `step`. If `horizon` steps are
-        stored already, it overwrites the oldest one. Rows of `nonfinite` environments are zero.
+        rotation vector in the body's frame. Arguments, factors and forces are as for `step`. It takes the place of the
+        window's next step for as long as it needs it. Rows of `nonfinite` environments are zero.
         """
         leaves, slot = [part.detach().clone().requires_grad_() for part in (qpos, qvel, ctrl)], self._slot
         with torch.enable_grad():
             end = torch.cat(self.step(*leaves), dim=1)
         cotangents = self.tangent.left_inverse(end.detach()).unbind(1)
         rows = [torch.autograd.grad(end, leaves, row, retain_graph=True) for row in cotangents]
-        self.rewind(slot)
+        self._slot = slot
         g_qpos, g_qvel, B = (torch.stack(part, dim=1) for part in zip(*rows, strict=True))
         return torch.cat((g_qpos, g_qvel), dim=2) @ self.tangent.basis(torch.cat(leaves[:2], dim=1).detach()), B
 
-    def rewind(self, slot: int = 0) -> None:
-        """Let the next differentiable step use a checkpoint, by default the first: the start of a new window."""
-        self._slot = slot
+    def rewind(self) -> None:
+        """Begin a new window of differentiable steps."""
+        self._slot = 0
 
     def _command(self, kernel: str, slot: int) -> list[wp.Launch]:
         key = (kernel, slot)
