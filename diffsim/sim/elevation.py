@@ -1,4 +1,4 @@
-"""The height of a terrain below a robot, so that a task that knows a plane only can be played on it."""
+"""Elevation: the height of the terrain below a robot, for tasks that are defined on a plane."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a control step is integrated: the choice of integrator and the number of its steps."""
+"""Integration: the choice of integrator and the number of its steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PASSES, TOLERANCE = 30, 1e-4  # as measured in docs/physics.md
 
 
 class Integration(NamedTuple):
-    """How the simulator takes a control step; docs/physics.md has the equations.
+    """Options of the integrator; docs/physics.md has the equations.
 
     Attributes:
         integrator: "semi_implicit" (Euler), "implicit" (linearly implicit in damping, friction and, scaled by theta,
@@ -33,22 +33,22 @@ class Integration(NamedTuple):
 
     @classmethod
     def explicit(cls, kind: str, substeps: int) -> Integration:
-        """Euler's method, on MuJoCo's contact if a contact or an integrator of that kind is "mujoco", else on soft."""
+        """Return Euler's method, on MuJoCo's contact if kind, a contact or an integrator, is "mujoco", else on soft."""
         return cls("mujoco" if kind == "mujoco" else "semi_implicit", substeps)
 
     @property
     def constrained(self) -> bool:
-        """Whether contact and limits are MuJoCo's constraints instead of springs and dampers."""
+        """Tell whether contact and limits are MuJoCo's constraints instead of springs and dampers."""
         return self.integrator == "mujoco"
 
     def replaced(self, integrator: str | None = None, **others: Any) -> Integration:
-        """A copy with what is given (not None) in place; an integrator does not inherit another one's theta."""
+        """Return a copy with the arguments that are not None; an integrator does not inherit another one's theta."""
         same = integrator is None or integrator == self.integrator
         new = self if same else Integration(str(integrator), self.substeps)
         return new._replace(**{name: value for name, value in others.items() if value is not None})
 
     def check(self) -> Integration:
-        """Itself, with plain ints; raises ValueError, with what is allowed, if it cannot be integrated so."""
+        """Return itself with plain ints; raises ValueError, with what is allowed, for an invalid field."""
         if self.integrator not in INTEGRATORS:
             raise ValueError(f"unknown integrator {self.integrator!r}; choose from {', '.join(INTEGRATORS)}")
         substeps = check_count("substeps", self.substeps, MOST_SUBSTEPS)
@@ -66,12 +66,12 @@ class Integration(NamedTuple):
 
 
 def is_real(value: object) -> TypeGuard[float]:
-    """Whether it is a number, be it NumPy's. True is none."""
+    """Tell whether it is a real number, of Python or NumPy; True is not."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def check_count(name: str, value: int, most: int = 2**63 - 1) -> int:
-    """The value as an int, be it NumPy's; raises ValueError unless it is an integer from 1 to `most`. True is none."""
+    """Return the value as an int; raises ValueError unless it is an integer from 1 to `most`, which True is not."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} is {value!r}, must be an integer of at least 1")
     if value > most:
