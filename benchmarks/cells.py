@@ -77,15 +77,15 @@ class Runner:
         self.args = args
         self.stop_at = math.inf if args.time_limit is None else time.monotonic() + args.time_limit
 
-    def train(self, case: Case, until: int = 0) -> bool:
-        """From where it stands to an iteration, 0: the last; whether it got there."""
+    def train(self, case: Case) -> bool:
+        """Train to the end from where it stands; whether it got there."""
         start: list[object] = ["--env", case.env, "--seed", case.seed, "--run-dir", case.folder, "--quiet", *case.flags]
         if (path := case.folder / "checkpoint.pt").is_file():
             state = checkpoint.load(path)
-            if state["iteration"] >= (until or state["args"]["iterations"]):
+            if state["iteration"] >= state["args"]["iterations"]:
                 return True
             start = ["--resume", path]
-        return self._call(case, *start, "--stop-after", until, *self.args.arguments)
+        return self._call(case, *start, *self.args.arguments)
 
     def evaluate(self, case: Case) -> bool:
         """Evaluate the checkpoint, with finer steps as well, if that is not done; whether it is now."""
