@@ -113,10 +113,10 @@ class ActorCritic(nn.Module):
         self.normalizer.mirror = mirror.obs
         for features in (self.features, self.own):
             if features is not None:
-                mirror_inputs(features, mirror)
+                mirror_inputs(features, mirror.obs)
         mirror_outputs(self.mean, mirror.action)
         mirror_outputs(self.value, mirror.value)
-        make_symmetric(self, "log_std", mirror)
+        make_symmetric(self, "log_std", mirror.action)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Of normalized observations: the mean (..., action_dim), the value (...) in units of its normalizer."""

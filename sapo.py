@@ -173,12 +173,12 @@ def make_alike(actor: Actor, critics: Ensemble, mirror: Mirror) -> None:
     """Treat left and right alike: mirrored states get mirrored actions with the same noise, and the same value."""
     actor.normalizer.mirror = mirror.obs
     for inputs in (actor.body, critics):
-        mirror_inputs(inputs.layers, mirror)
+        mirror_inputs(inputs.layers, mirror.obs)
     mirror_outputs(actor.mean.layers, mirror.action)
     mirror_outputs(critics.layers, mirror.value)
     if actor.spread is not None:
         mirror_outputs(actor.spread.layers, mirror.size)
-    make_symmetric(actor, "log_std", mirror)
+    make_symmetric(actor, "log_std", mirror.action)
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------

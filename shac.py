@@ -144,9 +144,9 @@ def make_alike(actor: Actor, critic: nn.Sequential, mirror: Mirror) -> None:
     """Treat left and right alike: mirrored states get mirrored actions, and the same value."""
     actor.normalizer.mirror = mirror.obs
     for network, output in ((actor.mean, mirror.action), (critic, mirror.value)):
-        mirror_inputs(network, mirror)
+        mirror_inputs(network, mirror.obs)
         mirror_outputs(network, output)
-    make_symmetric(actor, "log_std", mirror)
+    make_symmetric(actor, "log_std", mirror.action)
 
 
 # The algorithm --------------------------------------------------------------------------------------------------------

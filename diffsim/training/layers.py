@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from diffsim.extra.mirror import Mirror, Reflection
 from diffsim.training import distributed
 from diffsim.training.errors import fail
+
+
+class Reflection(Protocol):
+    """How numbers look in a mirror: a permutation with signs, its own inverse."""
+
+    @property
+    def index(self) -> Tensor: ...  # (n,) from where each number comes
+
+    @property
+    def sign(self) -> Tensor: ...  # (n,) 1 or -1, of each number after the permutation
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Return the mirror image (..., n) of x (..., n)."""
 
 
 class ObsNormalizer(nn.Module):
@@ -135,11 +148,11 @@ class First(nn.Module):
 class WithMirrorImage(nn.Module):
     """Rows (..., B, n), and then their mirror images: (..., 2 B, n)."""
 
-    def __init__(self, size: int, reflection: Reflection | None = None) -> None:
+    def __init__(self, size: int, index: Tensor | None = None, sign: Tensor | None = None) -> None:
         super().__init__()
         self.size = size  # n
-        self.index: Tensor = nn.Buffer(torch.arange(size) if reflection is None else reflection.index)
-        self.sign: Tensor = nn.Buffer(torch.ones(size) if reflection is None else reflection.sign)
+        self.index: Tensor = nn.Buffer(torch.arange(size) if index is None else index)
+        self.sign: Tensor = nn.Buffer(torch.ones(size) if sign is None else sign)
 
     def image(self, x: Tensor) -> Tensor:
         return x.index_select(-1, self.index) * self.sign
@@ -166,7 +179,7 @@ class SymmetricParameter(WithMirrorImage):
         return (x + x.index_select(-1, self.index)) / 2
 
 
-def mirror_inputs(network: nn.Sequential | nn.ModuleList, mirror: Mirror) -> None:
+def mirror_inputs(network: nn.Sequential | nn.ModuleList, reflection: Reflection) -> None:
     """Let a network of observations see their mirror images as well.
 
     Raises:
@@ -174,20 +187,21 @@ def mirror_inputs(network: nn.Sequential | nn.ModuleList, mirror: Mirror) -> Non
     """
     first = network[0] if len(network) else None
     columns = first.columns if isinstance(first, First) else None
-    index, sign = (part[:columns] for part in (mirror.obs.index, mirror.obs.sign))
+    index, sign = (part[:columns] for part in (reflection.index, reflection.sign))
     if (index >= len(index)).any():
         fail(f"--symmetric: the first {columns} numbers of an observation, which the actor sees, need others' images")
-    network.insert(0 if columns is None else 1, WithMirrorImage(len(index), Reflection(index, sign)))
+    network.insert(0 if columns is None else 1, WithMirrorImage(len(index), index, sign))
 
 
 def mirror_outputs(network: nn.Sequential | nn.ModuleList, reflection: Reflection) -> None:
     """Let a network after `mirror_inputs` end with the mean of its output and the image of that for the image."""
-    network.append(MirrorMean(len(reflection.index), reflection))
+    network.append(MirrorMean(len(reflection.index), reflection.index, reflection.sign))
 
 
-def make_symmetric(module: nn.Module, name: str, mirror: Mirror) -> None:
-    """Let a parameter (..., nu) that has no direction be equal on both sides."""
-    parametrize.register_parametrization(module, name, SymmetricParameter(len(mirror.action.index), mirror.action))
+def make_symmetric(module: nn.Module, name: str, reflection: Reflection) -> None:
+    """Let a parameter (..., n) that has no direction be equal on both sides."""
+    both = SymmetricParameter(len(reflection.index), reflection.index, reflection.sign)
+    parametrize.register_parametrization(module, name, both)
 
 
 def moments(x: Tensor) -> tuple[Tensor, Tensor]:

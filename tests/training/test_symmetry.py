@@ -14,7 +14,7 @@ from torch import Tensor, nn
 import diffsim
 import sapo
 import shac
-from diffsim.extra.mirror import Mirror, Reflection
+from diffsim.extra.mirror import Reflection
 from diffsim.tasks import TASKS
 from diffsim.training import ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
@@ -162,14 +162,13 @@ def test_who_is_symmetric(script: str, capsys: pytest.CaptureFixture[str]) -> No
 
 def test_what_the_actor_sees_needs_its_own_image(capsys: pytest.CaptureFixture[str]) -> None:
     swap = Reflection(torch.tensor([0, 2, 1]), torch.ones(3))
-    mirror = Mirror(swap, swap, swap, swap)
     for network in (nn.Sequential(First(1)), nn.Sequential(First(3)), nn.Sequential()):
-        mirror_inputs(network, mirror)
+        mirror_inputs(network, swap)
     message = "--symmetric: the first 2 numbers of an observation, which the actor sees, need others' images"
-    assert message in refusal(lambda: mirror_inputs(nn.Sequential(First(2)), mirror), capsys)
+    assert message in refusal(lambda: mirror_inputs(nn.Sequential(First(2)), swap), capsys)
     f = nn.Sequential(nn.Linear(3, 3))
     x = torch.randn(5, 3)
     expected = (f(x) + swap(f(swap(x)))) / 2
-    mirror_inputs(f, mirror)
+    mirror_inputs(f, swap)
     mirror_outputs(f, swap)
     torch.testing.assert_close(f(x), expected)
