@@ -66,7 +66,7 @@ def test_a_policy_that_tracks_takes_the_clip_as_an_input(tmp_path: Path) -> None
     torch.manual_seed(0)
     env = diffsim.make("g1_track:g1_jazz_walk", 3, seed=0)
     args = parse(shac.Args, "--env g1_track:g1_jazz_walk --device cpu --actor-hidden 16".split())
-    policy = shac.Actor(args, env, None).deterministic()
+    policy = shac.Actor(args, env).deterministic()
     kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
     save(path := tmp_path / "checkpoint.pt", "my_shac", Alone(policy), STATE | {"args": kept, "iteration": 7})
     model, told = export(path, tmp_path / "policy.onnx")
@@ -121,7 +121,8 @@ def test_onnx_takes_only_what_the_actor_sees(symmetric, tmp_path):
     env = diffsim.make("go1", 1)
     seen, whole = Go1.actor_dim, Go1.obs_dim
     args = parse(shac.Args, "--env go1 --device cpu --actor-hidden 16".split())
-    actor = shac.Actor(args, env, env.task.mirror if symmetric else None)
+    args.symmetric = symmetric
+    actor = shac.SHAC(args, env).actor
     actor.normalizer.update(3.0 + 2.0 * torch.randn(100, whole) * torch.rand(whole))
     kept = {name: value for name, value in vars(args).items() if not isinstance(value, Path)}
     policy = actor.deterministic()[:-1]  # without tanh: actions leave [-1, 1]
