@@ -162,8 +162,8 @@ def test_runs_that_vary_resume_bitwise_and_are_evaluated_on_the_files(
 
     monkeypatch.setattr(shac, "collect", watched)
     monkeypatch.setattr(variation, "REDRAW", 1)
-    flags = "--env hopper:mass=0.9:1.1,friction=0.5:2 --contact mujoco --num-envs 16 --horizon 8 --iterations 4 --eval-episodes 2"
-    flags += " --device cpu --critic-iterations 2 --threads 1 --quiet"
+    flags = "--env hopper:mass=0.9:1.1,friction=0.5:2 --contact mujoco --num-envs 16 --horizon 8 --iterations 4"
+    flags += " --eval-episodes 2 --device cpu --critic-iterations 2 --threads 1 --quiet"
     whole = run(shac, tmp_path / "whole", *flags.split())
     assert len(seen) == 4 and not any(torch.equal(a, b) for a, b in pairwise(seen))
     assert all((factors[:, FACTORS.index("mass")] != 1).all() for factors in seen)
