@@ -19,7 +19,7 @@ from diffsim.extra.robots.imitation.clip import Clip, read_clip
 from diffsim.extra.robots.imitation.tracking import G1Track
 from diffsim.extra.robots.joystick import Go1
 from diffsim.tasks.base import ASSETS
-from diffsim.training import Likeliest, ObsNormalizer, load_policy, make_policy_env, parse
+from diffsim.training import Likeliest, ObsNormalizer, load_policy, parse
 from diffsim.training.checkpoint import save
 
 STATE: dict[str, Any] = {"args": {"env": "cartpole"}, "iteration": 1}
@@ -108,7 +108,7 @@ def test_an_exported_policy_holds_a_clip_that_is_not_shipped_and_may_have_16_bit
         sizes.append(output.stat().st_size)
         monkeypatch.setattr(tasks, "_restored", {})
         saved = load_policy(output)
-        assert make_policy_env(saved, 1).task.clip == clip  # type: ignore[attr-defined]
+        assert tasks.find_task(saved.args["env"])().clip == clip  # type: ignore[attr-defined]
         assert (output.stat().st_size < 50_000) == (name == "g1_jazz_walk")
         wanted = policy[0].weight.half().float() if half else policy[0].weight
         assert torch.equal(saved.network[0].weight, wanted)

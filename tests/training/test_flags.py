@@ -155,7 +155,7 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tiny_run, tmp
         (
             mbpo,
             "--env ant:mass=0.9:1.1 --sample-enhance 1",
-            "takes Jacobians of one robot, but ant:mass=0.9:1.1 has ran",
+            "takes Jacobians of one robot, but ant:mass=0.9:1.1 has ranges",
         ),
         (mbpo, "--env ant:rough=5 --sample-enhance 1", "Jacobians of a robot on a plane, but ant:rough=5 is rough"),
     ],
@@ -240,6 +240,16 @@ def test_defaults_are_the_tables(script):
             assert args.horizon == (16 if env in ("g1", "g1_track") and script.__name__ in ("shac", "sapo") else 8)
         expected |= dict(contact=preset.contact, substeps=preset.substeps, implicit=preset.implicit)
         assert {name: getattr(args, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize("script", [*SCRIPTS.values(), gps, mbpo, pfpn_sac, pods, sac_baseline])
+def test_options_leave_the_defaults_of_the_task(script):
+    for env in ("walker", "ant", "go2", "g1_track"):
+        flags = ["--device", "cpu", *["--no-early-termination"] * (script is pods)]
+        if script in (gps, pods) and env in ("go2", "g1_track") or (script is gps and env == "ant"):
+            continue  # refused, whatever its options
+        plain, rough = (parse(script.Args, ["--env", name, *flags]) for name in (env, f"{env}:rough=20"))
+        assert dataclasses.replace(rough, env=env) == plain
 
 
 def test_the_command_line_is_before_the_task_is_before_the_class():

@@ -280,6 +280,16 @@ def test_a_run_goes_on_by_new_episodes_on_other_ground(tmp_path, monkeypatch):
         assert (rank["env"]["episode_step"] == length).all()
 
 
+def test_a_file_that_is_named_from_another_directory_continues_its_episodes(tmp_path, monkeypatch):
+    text = "from diffsim.tasks.cartpole import CartPole\nclass Mine(CartPole):\n    name = 'mine'\n"
+    (file := tmp_path / "mine.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    run(bptt, tmp_path / "run", *TINY, "--env", "mine.py", "--iterations", 2, "--stop-after", 1, "--quiet")
+    monkeypatch.chdir("/")
+    state = run(bptt, tmp_path / "run", "--resume", tmp_path / "run", "--env", file, "--stop-after", 2, "--quiet")
+    assert (state["ranks"][0]["env"]["episode_step"] == 16).all()
+
+
 def test_progress_and_messages(tmp_path, capsys):
     arguments = *TINY, "--iterations", 3, "--eval-every", 2
     run(bptt, tmp_path / "loud", *arguments)
